@@ -1,6 +1,7 @@
 """The command for sets of files: what it lists, prints, draws and writes."""
 
 import csv
+import re
 
 import numpy as np
 import pytest
@@ -278,7 +279,11 @@ def test_a_template_lists_every_recording_with_what_names_tell(tmp_path, capsys)
     assert [line["file"] for line in lines] == files
     assert (lines[1]["material"], lines[1]["trial"]) == ("oil paper-slip", "07")
     assert {line["label"] for line in lines} == {lines[0]["material"]} == {""}
-    assert "lists 3 recordings, 2 of them with what" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert (
+        "  day 2/x.csv: nothing\n  oil paper-slip_07.csv: material=oil paper-slip, trial=07" in out
+    )
+    assert "lists 3 recordings, 2 of them with what" in out
     with pytest.raises(ValueError, match=r"manifest\.csv is there already; move it away"):
         run("label_template", tmp_path)
     text = path.read_text().replace("x.csv,,,,,,,,", "x.csv,iron,,,1.5; 2,,,0-1,")
@@ -303,10 +308,46 @@ def test_a_template_lists_every_recording_with_what_names_tell(tmp_path, capsys)
         ("{label}/{material}_*", "slip/iron_x.h5", {"label": "slip", "material": "iron"}),
         ("{scene}/{material}{trial}", "iron_4.h5", {}),
         ("*_{material}.v1", "run7_oil paper.v1.csv", {"material": "oil paper"}),
+        (
+            "{material}_{scene:A|B|C}_*",
+            "plastic_cup_C_1.csv",
+            {"material": "plastic_cup", "scene": "C"},
+        ),
+        (
+            "{material:cup|plastic cup}{trial}*",
+            "plastic cup12b.csv",
+            {"material": "plastic cup", "trial": "12"},
+        ),
+        ("{material}*{trial}", "wood.csv", {}),
+        ("{material:wood}-{label}", "wood-non-slip.csv", {"material": "wood", "label": "non-slip"}),
     ],
 )
 def test_a_pattern_tells_what_names_mean(pattern, file, found):
     assert guessed(file, pattern) == found
+
+
+@pytest.mark.parametrize(
+    ("pattern", "file", "readings"),
+    [
+        (
+            "{material}_{scene}_*",
+            "plastic_cup_C_1.csv",
+            "material='plastic', scene='cup' or material='plastic_cup', scene='C'; list the texts "
+            "that can stand there, as {material:plastic|plastic_cup}, or rename the file",
+        ),
+        ("{material}_*", "day 2/oil_paper_1.csv", "material='oil' or material='oil_paper';"),
+        ("*{trial}*", "1a2a1.csv", "trial='1' or trial='2';"),
+        ("{material:a|a b}*", "a b.csv", "material='a' or material='a b';"),
+    ],
+)
+def test_a_name_that_can_be_read_in_two_ways_is_refused(pattern, file, readings, tmp_path):
+    place = tmp_path / file
+    place.parent.mkdir(exist_ok=True)
+    table(place, samples(1))
+    with pytest.raises(ValueError, match=re.escape(f"{pattern!r} can mean {readings}")) as raised:
+        write_template(tmp_path, pattern)
+    assert str(raised.value).startswith(f"{file}: pattern=")
+    assert not (tmp_path / "manifest.csv").exists()
 
 
 @pytest.mark.parametrize("pattern", ["", "wood", "{thing}", "{material}{material}", "{}"])

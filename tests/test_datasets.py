@@ -467,8 +467,8 @@ def test_what_is_worth_a_look_is_said(tables):
     manifest(tables, "0.csv,wood,0,,,", "1.csv,wood,1,0.5,0.5-1.5,")
     assert [str(w) for w in FileRecordings(tables).warnings] == [
         "manifest.csv:2: 0.csv: has no label, so no bin is taken from it",
-        "manifest.csv:3: 1.csv: slips at 0.5 s already; labels=whole_slide takes the second before "
-        "an onset",
+        "manifest.csv:3: 1.csv: slips at 0.5 s already; labels=whole_slide takes as non-slip the "
+        "second before an onset, as far as it was recorded",
     ]
 
 

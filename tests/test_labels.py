@@ -138,6 +138,78 @@ def test_a_recording_may_be_filled_by_its_stroke_or_hold_nothing():
     assert needed_windows(bins, 25, 3.0, RATE) == [(0.0, 2025 / RATE), (2575 / RATE, 3.0)]
 
 
+def test_nothing_is_laid_before_the_start_of_a_recording():
+    """An onset in the first second, or at once, has the non-slip bins that were recorded."""
+    for onset, num_before in ((0.46, 9), (0.005, 0)):
+        bins = lay(None, (onset,), ((onset, 3.0),), 3.0)
+        assert int(bins.starts.min()) >= 0
+        assert int((~bins.is_slip).sum()) == num_before
+        assert bins.position[bins.is_slip][0] == 0
+
+
+# Labels of windows ---------------------------------------------------------------------------
+
+
+def windows_by_hand(rule, onsets, slides, duration_s, rate, non_slip_s=(), slip_s=()):
+    """Start and label of every window of which each sample has a label, one by one."""
+    size, hop = (round(ms * rate / 1000) for ms in (rule.bin_ms, rule.hop_ms or rule.bin_ms))
+    label = [None] * round(duration_s * rate)
+    for is_slip, spans in ((False, non_slip_s), (True, slip_s)):
+        for start, end in spans:
+            for place in range(round(start * rate), round(end * rate)):
+                label[place] = is_slip
+    is_half, previous = rule.layout == "half_second", 0
+    for onset, (start, end) in zip(onsets, slides, strict=True):
+        lead, shift = (0.5, 0.0) if is_half else (1.0, 0.01)
+        edge, end = round((onset - shift) * rate), math.ceil(end * rate)
+        last = end  # of these slides a whole sample
+        for place in range(min(edge, int(start * rate)), end):
+            label[place] = None
+        for place in range(max(edge - round(lead * rate), previous), edge):
+            label[place] = False
+        for place in range(edge, min(last, edge + round(lead * rate)) if is_half else last):
+            label[place] = True
+        previous = end
+    found = []
+    for first in range(0, len(label) - size + 1, hop):
+        window = label[first : first + size]
+        if None not in window:
+            is_slip = window[-1] if rule.assign == "last" else sum(window) > size / 2
+            found.append((first, is_slip))
+    return found
+
+
+@pytest.mark.parametrize("assign", ["majority", "last"])
+@pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
+@pytest.mark.parametrize("hop_ms", [None, 10.0, 70.0])
+def test_windows_have_the_label_of_most_samples_or_of_the_last(assign, layout, hop_ms):
+    rule = LabelRule(layout=layout, hop_ms=hop_ms, assign=assign)
+    onsets, slides = (1.013, 3.5), ((1.013, 2.0), (3.5, 4.2))
+    told = {"non_slip_s": ((0.0, 0.5), (4.2, 5.0), (5.6, 5.8)), "slip_s": ((5.0, 5.6),)}
+    bins = lay(rule, onsets, slides, 6.0, 200.0, **told)
+    expected = windows_by_hand(rule, onsets, slides, 6.0, 200.0, **told)
+    found = zip(bins.starts.tolist(), bins.is_slip.tolist(), strict=True)
+    assert sorted(found) == expected
+    of_strokes = bins.stroke >= 0
+    assert bool((of_strokes.int().diff() <= 0).all())  # those of strokes first
+    assert bool((bins.position[~of_strokes] == NO_POSITION).all())
+    for number in range(2):
+        own = bins.stroke == number
+        assert bool((bins.starts[own].diff() > 0).all())
+        position = bins.position[own]
+        assert position.tolist() == list(range(int(position[0]), int(position[-1]) + 1))
+        assert bool(((position >= 0) == bins.is_slip[own]).all())
+
+
+def test_a_window_that_is_half_slip_is_not_slip_by_majority_and_is_by_its_last_sample():
+    stretches = {"non_slip_s": ((0.0, 1.025),), "slip_s": ((1.025, 2.0),)}
+    for assign, at_edge in (("whole", []), ("majority", [False]), ("last", [True])):
+        bins = lay(LabelRule(assign=assign), (), (), 2.0, **stretches)
+        assert bins.is_slip[bins.starts == 2000].tolist() == at_edge
+    short = lay(LabelRule(assign="last"), (), (), 0.02, non_slip_s=((0.0, 0.02),))
+    assert len(short.starts) == 0  # shorter than a bin
+
+
 def test_bins_that_need_missing_samples_are_left_out():
     bins = lay(None, (), (), 3.0, non_slip_s=((0.0, 3.0),))
     gap = (1.0, 1.0 + 1 / RATE)
@@ -234,6 +306,10 @@ def test_shuffled_labels_keep_their_number_and_depend_on_seed_and_place():
     ("change", "said"),
     [
         ({"layout": "nope"}, "labels.layout must be one of whole_slide, half_second, got 'nope'"),
+        (
+            {"assign": "first"},
+            "labels.assign must be one of whole, majority, last, got 'first'",
+        ),
         ({"onsets": "guessed"}, "labels.onsets must be one of annotated, exact, got 'guessed'"),
         ({"bin_ms": 0.0}, "labels.bin_ms must be positive, got 0.0"),
         ({"hop_ms": -50.0}, "labels.hop_ms must be positive, got -50.0"),
@@ -252,9 +328,8 @@ def test_a_bad_rule_is_refused(change, said):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"onsets": (1.005,), "slides": ((1.005, 3.0),)}, r"stroke 1 with its onset at 1.005 s"),
+        ({"onsets": (-0.1,), "slides": ((-0.1, 3.0),)}, r"stroke 1 with its onset at -0.100 s"),
         ({"duration_s": 15.1}, r"stroke 3 .* outside the recording of 15.100 s"),
-        ({"rule": HALF, "onsets": (0.4,), "slides": ((0.4, 3.0),)}, "stroke 1"),
         (
             {"rule": HALF, "onsets": (2.0,), "slides": ((2.0, 2.45),), "duration_s": 2.4},
             r"outside the recording of 2\.400 s",

@@ -33,6 +33,7 @@ from tactslip_torch.report.style import SIMULATED_LINE
 from tactslip_torch.runtime import __version__, in_processes
 
 FIGURE = Path("outputs/data_tool.png")
+_SHOWN = 5  # rows of a template
 
 
 def check(config: DictConfig) -> int:
@@ -140,10 +141,13 @@ def convert(config: DictConfig) -> list[Written]:
 def label_template(config: DictConfig) -> Path:
     """Write a manifest of all that can be read in a folder, to be filled in."""
     output = None if config.output is None else Path(str(config.output))
-    path, num_files, num_told = write_template(Path(str(config.root)), str(config.pattern), output)
+    path, told = write_template(Path(str(config.root)), str(config.pattern), output)
+    print(f"file, and what pattern={config.pattern} tells of it:")
+    for file, fields in list(told.items())[:_SHOWN]:
+        print(f"  {file}: {', '.join(f'{n}={v}' for n, v in fields.items() if v) or 'nothing'}")
     print(
-        f"{path} lists {num_files} recordings, {num_told} of them with what "
-        f"pattern={config.pattern} tells; fill in onsets_s, sliding_s, slip_s and non_slip_s "
+        f"{path} lists {len(told)} recordings, {sum(map(bool, told.values()))} of them with what "
+        "the pattern tells; fill in onsets_s, sliding_s, slip_s and non_slip_s "
         "(as 2.0; 9.0 and 2-7; 9-11.5) or label (slip, non-slip), then action=check"
     )
     return path

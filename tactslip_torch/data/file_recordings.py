@@ -600,8 +600,8 @@ def _doubts(recording: _File) -> list[str]:
         doubts.append("has no label, so no bin is taken from it")
     if times.onsets_s and times.onsets_s[0] < _BEFORE_ONSET_S:
         doubts.append(
-            f"slips at {times.onsets_s[0]:g} s already; labels=whole_slide takes the second before "
-            "an onset"
+            f"slips at {times.onsets_s[0]:g} s already; labels=whole_slide takes as non-slip the "
+            "second before an onset, as far as it was recorded"
         )
     for part in parts:
         if gaps := part.clock.gaps:

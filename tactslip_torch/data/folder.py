@@ -220,54 +220,92 @@ def write_manifest(folder: Path, written: Sequence[Written]) -> None:
 
 # Manifests to fill in ---------------------------------------------------------------------------
 
-_FIELDS = {"material": r"[^/]+?", "trial": r"\d+", "scene": r"[^/]+?", "label": r"[^/]+?"}
-"""What a pattern may name, and what each stands for."""
+_FIELDS = ("material", "trial", "scene", "label")
+"""What a pattern may name."""
 _TEMPLATE_COLUMNS = (
     *("file", "material", "trial", "scene"),
     *("onsets_s", "sliding_s", "slip_s", "non_slip_s", "label"),
 )
-_BETWEEN = "-_. "
+_BETWEEN = r"[-_. ]"
 
 
 def guessed(file: str, pattern: str) -> dict[str, str]:
     """What a pattern tells of a file by its name, or by its path if the pattern has a stroke.
 
-    A ``*`` stands for any text, and the ending is no part of a name. Blanks, dots, strokes and
-    underlines around a material or scene are no part of it.
+    A trial is a whole number. A material, scene or label is any text, or one of those listed:
+    ``{scene:taps|held}``. A ``*`` stands for any text, and the ending is no part of a name.
+    Blanks, dots, strokes and underlines around a material or scene are no part of it.
 
     Raises:
         ValueError: if the pattern names nothing, one twice, or something else than material,
-            trial, scene and label.
+            trial, scene and label; or if it can read the name in two ways.
 
     Example:
         >>> guessed("oil paper-slip_07.csv", "{material}{trial}")
         {'material': 'oil paper-slip', 'trial': '07'}
+        >>> guessed("plastic_cup_C_1.csv", "{material}_{scene:A|B|C}_*")
+        {'material': 'plastic_cup', 'scene': 'C'}
     """
-    parts = re.split(r"\{(\w*)\}", pattern)
-    names = parts[1::2]
-    if not names or set(names) - set(_FIELDS) or len(set(names)) < len(names):
+    parts = re.split(r"\{(\w*)(?::([^{}]*))?\}", pattern)
+    names, fixed = parts[1::3], parts[::3]
+    words = {n: t.split("|") if t else None for n, t in zip(names, parts[2::3], strict=True)}
+    if not names or set(names) - set(_FIELDS) or len(words) < len(names):
         raise ValueError(
             f"pattern must name each of {', '.join(f'{{{name}}}' for name in _FIELDS)} at most "
             f"once, as {{material}}_{{trial}}, got {pattern!r}"
         )
-    expression = ""
-    for place, part in enumerate(parts):
-        if place % 2:
-            between = f"[{re.escape(_BETWEEN)}]*" if part in ("material", "scene") else ""
-            expression += f"(?P<{part}>{_FIELDS[part]}){between}"
-        else:
-            expression += "[^/]*".join(re.escape(piece) for piece in part.split("*"))
     path = Path(file)
-    name = path.with_suffix("").as_posix() if "/" in pattern else path.stem
-    found = re.fullmatch(expression, name)
-    return found.groupdict() if found else {}
+    text = path.with_suffix("").as_posix() if "/" in pattern else path.stem
+
+    def read(**other: str) -> dict[str, str]:
+        """The fields of a reading, in which those of ``other`` are not these."""
+        expression = _literal(fixed[0])
+        for name, behind in zip(names, fixed[1:], strict=True):
+            expression += _field(name, words[name], other.get(name)) + _literal(behind)
+        found = re.fullmatch(expression, text)
+        return found.groupdict() if found else {}
+
+    found = read()
+    for name, value in found.items():
+        if another := read(**{name: value}):
+            one, two = (
+                ", ".join(f"{name}={value!r}" for name, value in each.items())
+                for each in (found, another)
+            )
+            raise ValueError(
+                f"{file}: pattern={pattern!r} can mean {one} or {two}; list the texts that can "
+                f"stand there, as {{{name}:{value}|{another[name]}}}, or rename the file"
+            )
+    return found
 
 
-def write_template(root: Path, pattern: str, path: Path | None = None) -> tuple[Path, int, int]:
+def _literal(text: str) -> str:
+    return "[^/]*?".join(re.escape(piece) for piece in text.split("*"))
+
+
+def _field(name: str, words: Sequence[str] | None, other: str | None) -> str:
+    """The expression of a field: one of the words, if given, and not ``other``."""
+    one = r"\d" if name == "trial" else "[^/]"
+    inner = f"{one}+?" if words is None else "|".join(map(re.escape, words))
+    if other is not None and words is None:
+        size = len(other)
+        inner = f"{one}{{{size + 1},}}|(?!{re.escape(other)}){one}{{{size}}}"
+        inner += f"|{one}{{1,{size - 1}}}" if size > 1 else ""
+    elif other is not None:
+        inner = "|".join(re.escape(word) for word in words or () if word != other) or "(?!)"
+    if name == "trial":
+        return rf"(?<!\d)(?P<trial>{inner})(?!\d)"
+    between = f"{_BETWEEN}*" if name in ("material", "scene") else ""
+    return f"{between}(?P<{name}>(?!{_BETWEEN})(?:{inner})(?<!{_BETWEEN})){between}"
+
+
+def write_template(
+    root: Path, pattern: str, path: Path | None = None
+) -> tuple[Path, dict[str, dict[str, str]]]:
     """Write a manifest of all recordings of a folder, its label columns empty.
 
     Returns:
-        Its path, how many files it lists, and of how many of them the pattern told anything.
+        Its path, and what the pattern told of each file.
 
     Args:
         root: the folder.
@@ -276,7 +314,8 @@ def write_template(root: Path, pattern: str, path: Path | None = None) -> tuple[
 
     Raises:
         FileNotFoundError: if there is no such folder.
-        ValueError: if there is a manifest already, no recording, or the pattern is none.
+        ValueError: if there is a manifest already, no recording, or the pattern is none or can
+            read a name in two ways.
     """
     there = [root / name for name in NAMES] if path is None else [path]
     for other in there:
@@ -290,4 +329,4 @@ def write_template(root: Path, pattern: str, path: Path | None = None) -> tuple[
     guesses = {file: guessed(file, pattern) for file in files}
     rows = [dict.fromkeys(_TEMPLATE_COLUMNS, "") | {"file": f, **own} for f, own in guesses.items()]
     write_table(path, _TEMPLATE_COLUMNS, rows)
-    return path, len(guesses), sum(map(bool, guesses.values()))
+    return path, guesses

@@ -5,6 +5,9 @@ of non-slip before each onset, the whole slide as slip, the onset moved 10 ms ea
 ``half_second`` is what the paper's text says: half a second on either side of each onset. Stretches
 in which the hand is handled without slip, which the paper did not record, are non-slip in both, and
 those that are known to be slip, but not since when, are slip in both.
+
+Bins that hold both labels are left out (``assign="whole"``), or get the label of most of their
+samples or of their last one, as sets of sliding windows are labelled.
 """
 
 from __future__ import annotations
@@ -12,13 +15,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
 Layout = Literal["whole_slide", "half_second"]
 OnsetSource = Literal["annotated", "exact"]
+Assign = Literal["whole", "majority", "last"]
 
 NO_POSITION = torch.iinfo(torch.int64).min
 """The position of a bin that belongs to no stroke."""
@@ -35,9 +39,14 @@ class LabelRule:
         hop_ms: distance between bins; ``None`` for no overlap, as in the paper.
         shuffle_seed: if given, labels are permuted within each recording. A sanity check: what
             is learned from such labels must score 50 % balanced accuracy.
+        assign: the label of a bin. ``"whole"``: that of all its samples; bins begin at the onset
+            or at the start of a stretch. ``"majority"`` (slip if more than half of its samples
+            are) or ``"last"`` (that of its last sample): bins begin at sample 0, a hop apart, and
+            those of which every sample has a label are kept.
 
     Raises:
-        ValueError: for an unknown layout or onset source, or a length that is not positive.
+        ValueError: for an unknown layout, onset source or assignment, or a length that is not
+            positive.
     """
 
     layout: Layout = "whole_slide"
@@ -45,9 +54,10 @@ class LabelRule:
     bin_ms: float = 50.0
     hop_ms: float | None = None
     shuffle_seed: int | None = None
+    assign: Assign = "whole"
 
     def __post_init__(self) -> None:
-        for name, kinds in (("layout", Layout), ("onsets", OnsetSource)):
+        for name, kinds in (("layout", Layout), ("onsets", OnsetSource), ("assign", Assign)):
             if getattr(self, name) not in get_args(kinds):
                 raise ValueError(
                     f"labels.{name} must be one of {', '.join(get_args(kinds))}, "
@@ -67,7 +77,7 @@ class LabelledBins:
         starts: ``[N]``, first sample of each bin, ascending within a stroke or stretch.
         is_slip: ``[N]``, bool.
         stroke: ``[N]``, index of the stroke each bin belongs to; -1 for bins of a stretch, which
-            are behind those of all strokes.
+            are behind those of all strokes, and for those that leave what is labelled of a stroke.
         position: ``[N]``, int64, place of the bin beside its onset: -1 is the last bin before it,
             0 the first slip bin. ``NO_POSITION`` where the stroke is -1.
         bin_samples: length of every bin.
@@ -91,10 +101,12 @@ def label_bins(
 ) -> LabelledBins:
     """Lay bins around the onsets of a recording, and in its stretches of slip or of none.
 
-    A slip bin lies wholly before the end of its slide, a non-slip bin wholly between the end of the
-    slide before and the onset, or wholly inside a stretch. Bins of a stretch start with it, a hop
-    apart; those that would meet a bin of a stroke, one of an earlier stretch, or a slide are left
-    out. A recording without onsets and stretches has no bins.
+    With ``rule.assign="whole"`` a slip bin lies wholly before the end of its slide, a non-slip bin
+    wholly between the end of the slide before and the onset, or wholly inside a stretch. Bins of a
+    stretch start with it, a hop apart; those that would meet a bin of a stroke, one of an earlier
+    stretch, or a slide are left out. With the other assignments the same samples have a label, and
+    bins are those of which all have one. Nothing is laid before the start of the recording. One
+    without onsets and stretches has no bins.
 
     Args:
         rule: the layout.
@@ -103,56 +115,138 @@ def label_bins(
         duration_s: length of the recording.
         sample_rate_hz: of the recording.
         non_slip_s: start and end of each stretch that is non-slip beside what is around onsets.
-        slip_s: the same of slip; its bins come last.
+        slip_s: the same of slip; its bins come last if bins are whole.
 
     Raises:
-        ValueError: if a bin would lie outside the recording, a stretch does, or a bin is no whole
-            number of samples.
+        ValueError: if a slide or stretch leaves the recording, or a bin is no whole number of
+            samples.
     """
     bin_samples = whole_samples(rule.bin_ms, sample_rate_hz, "labels.bin_ms")
     hop = bin_samples
     if rule.hop_ms is not None:
         hop = whole_samples(rule.hop_ms, sample_rate_hz, "labels.hop_ms")
-    lead_s, shift_s = (1.0, 0.010) if rule.layout == "whole_slide" else (0.5, 0.0)
     num_samples = round(duration_s * sample_rate_hz)
+    strokes = _strokes(rule, onsets_s, sliding_s, num_samples, sample_rate_hz)
+    told = [(stretch, False) for stretch in non_slip_s] + [(stretch, True) for stretch in slip_s]
+    stretches = [(*_samples_of(s, num_samples, sample_rate_hz), is_slip) for s, is_slip in told]
+    if rule.assign != "whole":
+        return _windows(rule, strokes, stretches, bin_samples, hop, num_samples)
+    lead = 0 if not strokes else strokes[0].edge - strokes[0].first
+    if strokes and lead < bin_samples:
+        raise ValueError(
+            f"labels.bin_ms={rule.bin_ms:g} is longer than the "
+            f"{1000 * lead / sample_rate_hz:g} ms before an onset that "
+            f"labels.layout={rule.layout} takes as non-slip"
+        )
     is_taken = torch.zeros(num_samples, dtype=torch.bool)  # by a bin or a slide
     parts = [_laid(torch.zeros(0, dtype=torch.int64), is_slip=False)]
-    previous_end = 0
-    for stroke, (onset_s, (start_s, end_s)) in enumerate(zip(onsets_s, sliding_s, strict=True)):
-        edge = round((onset_s - shift_s) * sample_rate_hz)
-        first = edge - round(lead_s * sample_rate_hz)
-        last = int(end_s * sample_rate_hz)
-        if rule.layout == "half_second":
-            last = min(last, edge + round(lead_s * sample_rate_hz))
-        if first < 0 or last > num_samples:
-            raise ValueError(
-                f"stroke {stroke + 1} with its onset at {onset_s:.3f} s needs samples from "
-                f"{first} to {last}, outside the recording of {duration_s:.3f} s"
-            )
-        if edge - first < bin_samples:
-            raise ValueError(
-                f"labels.bin_ms={rule.bin_ms:g} is longer than the {1000 * lead_s:g} ms before an "
-                f"onset that labels.layout={rule.layout} takes as non-slip"
-            )
+    for number, (first, free, edge, last, slide_start, slide_end) in enumerate(strokes):
         before = torch.arange(first, edge - bin_samples + 1, hop)
-        before = before[before >= previous_end]
+        before = before[before >= free]
         after = torch.arange(edge, max(last - bin_samples + 1, edge), hop)
+        after = after[after >= 0]
         position = torch.arange(-len(before), len(after))
-        parts.append(_laid(before, False, stroke, position[: len(before)]))
-        parts.append(_laid(after, True, stroke, position[len(before) :]))
-        previous_end = math.ceil(end_s * sample_rate_hz)
-        is_taken[min(edge, int(start_s * sample_rate_hz)) : previous_end] = True
+        parts.append(_laid(before, False, number, position[: len(before)]))
+        parts.append(_laid(after, True, number, position[len(before) :]))
+        is_taken[slide_start:slide_end] = True
     within = torch.arange(bin_samples)
     for starts, *_ in parts:
         is_taken[starts[:, None] + within] = True
-    told = [(stretch, False) for stretch in non_slip_s] + [(stretch, True) for stretch in slip_s]
-    for stretch, is_slip in told:
-        starts = _starts_inside(stretch, bin_samples, hop, duration_s, sample_rate_hz)
-        free = starts[~is_taken[starts[:, None] + within].any(-1)]
-        is_taken[free[:, None] + within] = True
-        parts.append(_laid(free, is_slip))
-    starts, is_slips, strokes, positions = map(torch.cat, zip(*parts, strict=True))
-    return LabelledBins(starts, is_slips, strokes, positions, bin_samples)
+    for start, stop, is_slip in stretches:
+        starts = torch.arange(start, max(stop - bin_samples + 1, start), hop)
+        starts = starts[~is_taken[starts[:, None] + within].any(-1)]
+        is_taken[starts[:, None] + within] = True
+        parts.append(_laid(starts, is_slip))
+    starts, is_slips, numbers, positions = map(torch.cat, zip(*parts, strict=True))
+    return LabelledBins(starts, is_slips, numbers, positions, bin_samples)
+
+
+class _Stroke(NamedTuple):
+    """What is labelled around an onset, in samples.
+
+    Args:
+        first: of the time before the onset that is non-slip; may lie before the recording.
+        free: the end of the slide before, or 0: from there on the time is non-slip.
+        edge: first sample of slip.
+        last: end of slip, exclusive.
+        slide_start: from here to ``slide_end`` no stretch gives a label.
+        slide_end: exclusive.
+    """
+
+    first: int
+    free: int
+    edge: int
+    last: int
+    slide_start: int
+    slide_end: int
+
+
+def _strokes(
+    rule: LabelRule,
+    onsets_s: Sequence[float],
+    sliding_s: Sequence[tuple[float, float]],
+    num_samples: int,
+    sample_rate_hz: float,
+) -> list[_Stroke]:
+    """What the layout labels around each onset."""
+    lead_s, shift_s = (1.0, 0.010) if rule.layout == "whole_slide" else (0.5, 0.0)
+    lead = round(lead_s * sample_rate_hz)
+    found: list[_Stroke] = []
+    for onset_s, (start_s, end_s) in zip(onsets_s, sliding_s, strict=True):
+        edge = round((onset_s - shift_s) * sample_rate_hz)
+        last = int(end_s * sample_rate_hz)
+        if rule.layout == "half_second":
+            last = min(last, edge + lead)
+        if onset_s < 0 or last > num_samples:
+            raise ValueError(
+                f"stroke {len(found) + 1} with its onset at {onset_s:.3f} s needs samples up to "
+                f"{last}, outside the recording of {num_samples / sample_rate_hz:.3f} s"
+            )
+        start = max(min(edge, int(start_s * sample_rate_hz)), 0)
+        free = found[-1].slide_end if found else 0
+        end = math.ceil(end_s * sample_rate_hz)
+        found.append(_Stroke(edge - lead, free, edge, last, start, end))
+    return found
+
+
+def _windows(
+    rule: LabelRule,
+    strokes: Sequence[_Stroke],
+    stretches: Sequence[tuple[int, int, bool]],
+    bin_samples: int,
+    hop: int,
+    num_samples: int,
+) -> LabelledBins:
+    """Bins from sample 0 on, a hop apart, each with the label of most of its samples or its last.
+
+    Shape:
+        - columns of the output: ``[N]``, bins whose ``bin_samples`` samples all have a label
+    """
+    label = torch.full((max(num_samples, bin_samples),), -1, dtype=torch.int8)  # 0, 1; -1: none
+    stroke = torch.full_like(label, -1, dtype=torch.int64)
+    for start, stop, kind in stretches:
+        label[start:stop] = int(kind)
+    for number, (first, free, edge, last, slide_start, slide_end) in enumerate(strokes):
+        first, edge = max(first, free), max(edge, 0)
+        label[slide_start:slide_end] = -1
+        label[first:edge] = 0
+        label[edge:last] = 1
+        stroke[first:last] = number
+    labels, strokes_of = (each.unfold(0, bin_samples, hop) for each in (label, stroke))  # [N, n]
+    is_known = (labels >= 0).all(-1)
+    labels, strokes_of = labels[is_known], strokes_of[is_known]
+    is_slip = labels[:, -1] == 1
+    if rule.assign == "majority":
+        is_slip = 2 * labels.sum(-1) > bin_samples
+    one = torch.where(strokes_of[:, 0] == strokes_of[:, -1], strokes_of[:, 0], -1)
+    position = torch.full_like(one, NO_POSITION)
+    for number in range(len(strokes)):
+        own = one == number
+        num_before = int((own & ~is_slip).sum())
+        position[own] = torch.arange(int(own.sum())) - num_before
+    starts = is_known.nonzero().flatten() * hop
+    order = (one < 0).int().argsort(stable=True)  # those of no stroke last
+    return LabelledBins(starts[order], is_slip[order], one[order], position[order], bin_samples)
 
 
 def _laid(
@@ -165,22 +259,18 @@ def _laid(
     return starts, is_slip_each, torch.full_like(starts, stroke), position
 
 
-def _starts_inside(
-    stretch: tuple[float, float],
-    bin_samples: int,
-    hop: int,
-    duration_s: float,
-    sample_rate_hz: float,
-) -> Tensor:
-    """First samples of the bins that lie wholly inside a stretch, from its start on."""
+def _samples_of(
+    stretch: tuple[float, float], num_samples: int, sample_rate_hz: float
+) -> tuple[int, int]:
+    """First sample that lies inside a stretch, and the end of those that do."""
     first = math.ceil(stretch[0] * sample_rate_hz - 1e-6)  # what was meant as a whole sample is one
-    last = math.floor(stretch[1] * sample_rate_hz + 1e-6)
-    if first < 0 or last > round(duration_s * sample_rate_hz):
+    stop = math.floor(stretch[1] * sample_rate_hz + 1e-6)
+    if first < 0 or stop > num_samples:
         raise ValueError(
             f"the stretch from {stretch[0]:.3f} s to {stretch[1]:.3f} s leaves the "
-            f"recording of {duration_s:.3f} s"
+            f"recording of {num_samples / sample_rate_hz:.3f} s"
         )
-    return torch.arange(first, max(last - bin_samples + 1, first), hop)
+    return first, stop
 
 
 def clear_of(
