@@ -346,6 +346,19 @@ def test_files_of_several_rates_are_brought_to_one(tmp_path):
         assert torch.allclose(read.samples[:, middle], expected[middle].expand(3, -1), atol=5e-3)
 
 
+def test_several_rates_are_one_problem_however_many_files_have_them(tmp_path):
+    for place, rate in enumerate((200.0, 200.0, 200.0, 500.0, 500.0, 50.0)):
+        table(tmp_path / f"{place}.csv", samples(place), rate)
+    manifest(tmp_path, *(f"{place}.csv,wood,{place},,,slip" for place in range(6)))
+    source = FileRecordings(tmp_path, strict=False)
+    assert lines_of(source) == [
+        "manifest.csv:5: 3.csv: is of 500 Hz, manifest.csv:2 of 200 Hz (in all 2 of 500 Hz, 1 of "
+        "50 Hz); data.resample_hz=... brings all to one"
+    ]
+    assert [name.cycle for name in source.ids] == [0, 1, 2]
+    assert len(FileRecordings(tmp_path, resample_hz=100.0).ids) == 6
+
+
 def test_truth_follows_the_clock_of_the_file(tmp_path):
     """A logger that counts 199.5 Hz is taken as 200 Hz; its fifth second is not ours."""
     rates = (199.5, 199.6, 200.2)
@@ -380,6 +393,112 @@ def test_streams_of_a_file_are_channels_of_one_hand(tables):
     rates["two"]["reading"]["sample_rate_hz"] = 100.0
     apart = FileRecordings(tables, streams=rates, resample_hz=50.0, strict=False)
     assert "its streams last 3 to 6 s; cut the longer" in lines_of(apart)[0]
+
+
+# Slip by its speed, and rows of several samples -----------------------------------------------
+
+SPEED = torch.cat([torch.zeros(300), torch.linspace(0, -0.02, 101), torch.zeros(199)]).double()
+
+
+def with_speed(path, name="speed"):
+    """Three channels at 200 Hz, and a speed in m/s that passes 5 mm/s at 1.625 s."""
+    content = samples(1, 600)
+    if path.suffix == ".csv":
+        table(path, torch.cat([content, SPEED[None]]), names=("t", *"abc", name))
+    elif path.suffix == ".npz":
+        columns = dict(zip("abc", content.numpy(), strict=True))
+        np.savez(path, t=np.arange(600) / 200.0, **{name: SPEED.numpy()}, **columns)
+    else:
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w") as file:
+            file["volts"] = content.numpy()
+            file[name], file["time"] = SPEED.numpy(), np.arange(600) / 200.0
+    return content
+
+
+@pytest.mark.parametrize(
+    ("name", "isolate"), [("a.csv", False), ("a.npz", False), ("a.h5", False), ("a.csv", True)]
+)
+def test_a_speed_above_a_threshold_is_slip(tmp_path, name, isolate):
+    content = with_speed(tmp_path / name)
+    manifest(tmp_path, f"{name},wood", columns="file,material")
+    reading = {"speed": "speed", "speed_unit": "m/s", "isolate": isolate}
+    source = FileRecordings(tmp_path, reading=reading, speed_over=5.0)
+    assert torch.allclose(first(source).double(), content)  # the speed is no channel
+    times = source.timeline(source.ids[0])
+    assert times.onsets_s == pytest.approx([1.625])  # 25 steps of 0.2 mm/s behind 1.5 s
+    assert np.array(times.sliding_s) == pytest.approx(np.array([[1.625, 2.00375]]), abs=5e-5)
+    assert times.speeds_mm_s in ((12.0,), (13.0,))
+    assert np.array(times.non_slip_s) == pytest.approx(
+        np.array([[0, 1.625], [2.00375, 3]]), abs=5e-5
+    )
+    manifest(tmp_path, f"{name},wood,0,0.5,,")  # who says more is believed
+    source = FileRecordings(tmp_path, reading=reading, speed_over=5.0)
+    assert source.timeline(source.ids[0]).onsets_s == (0.5,)
+
+
+def test_a_speed_that_is_not_there_is_one_line(tmp_path):
+    with_speed(tmp_path / "a.csv")
+    manifest(tmp_path, "a.csv,wood", columns="file,material")
+    refused(
+        r"labels\.speed_over=5 needs the column of speed: data\.reading\.speed",
+        tmp_path,
+        speed_over=5.0,
+    )
+    refused(r"a\.csv: has a column 'speed', which may be", tmp_path)
+    refused(r"no column 'v' that reading\.speed names", tmp_path, reading={"speed": "v"})
+    refused(r"reading\.speed_unit must be one of mm/s", tmp_path, reading={"speed_unit": "km/h"})
+
+
+def in_rows(path, order, names=True):
+    """Two channels of 600 samples at 300 Hz, three a row, with a gap of two rows."""
+    content = samples(2, 600)[:2].double()
+    cube = content.reshape(2, 200, 3)
+    cube = cube.permute(0, 2, 1) if order == "channel" else cube.permute(2, 0, 1)
+    columns = cube.reshape(6, 200)
+    called = [f"{c}_{k}" for c in "ab" for k in range(3)]
+    if order == "time":
+        called = [f"{c}_{k}" for k in range(3) for c in "ab"]
+    if not names:
+        called = list("uvwxyz")
+    times = torch.arange(200, dtype=torch.float64) / 100.0
+    times[150:] += 0.02
+    header = ",".join(["t", *called])
+    np.savetxt(
+        path, torch.cat([times[None], columns]).T.numpy(), delimiter=",", header=header, comments=""
+    )
+    return content
+
+
+@pytest.mark.parametrize("order", ["channel", "time"])
+@pytest.mark.parametrize("names", [True, False])
+def test_a_row_may_hold_several_samples_of_each_channel(tmp_path, order, names):
+    content = in_rows(tmp_path / "a.csv", order, names)
+    manifest(tmp_path, "a.csv,wood,0,,,slip")
+    reading = {"samples_per_row": 3, "row_order": None if names else order}
+    source = FileRecordings(tmp_path, reading=reading, gaps="missing")
+    assert source.sample_rate_hz == 300.0
+    assert source.hand.names == (("a", "b") if names else ("ch1", "ch2"))
+    assert np.array(source.timeline(source.ids[0]).missing_s) == pytest.approx(
+        np.array([[1.5, 1.52]])
+    )
+    read = first(source)
+    assert read.shape == (2, 606)
+    assert bool(read[:, 450:456].isnan().all())
+    assert torch.equal(torch.cat([read[:, :450], read[:, 456:]], 1), content)
+    part = source.load(source.ids[0], [(0.1, 0.25)]).samples  # begins and ends within a row
+    assert torch.equal(part[:, 31:75], content[:, 31:75])
+    stated = reading | {"time": None, "channels": list(range(1, 7)), "sample_rate_hz": 300.0}
+    assert FileRecordings(tmp_path, reading=stated).sample_rate_hz == 300.0
+
+
+def test_rows_that_do_not_show_their_samples_are_refused(tmp_path):
+    in_rows(tmp_path / "a.csv", "channel", names=False)
+    manifest(tmp_path, "a.csv,wood,0,,,slip")
+    refused("6 columns of samples, which is no multiple", tmp_path, reading={"samples_per_row": 4})
+    refused(r"say reading\.row_order=channel", tmp_path, reading={"samples_per_row": 3})
+    refused(r"samples_per_row must be a positive", tmp_path, reading={"samples_per_row": 0})
+    refused(r"row_order must be one of channel, time", tmp_path, reading={"row_order": "x"})
 
 
 # What is wrong -------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from tactslip_torch.data.labels import (
     label_bins,
     needed_windows,
     shuffled,
+    slip_by_speed,
 )
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
@@ -218,6 +219,29 @@ def test_bins_that_need_missing_samples_are_left_out():
         assert sorted(set(bins.starts.tolist()) - set(kept.starts.tolist())) == expected
         assert len(kept.starts) == len(kept.is_slip) == len(kept.stroke) == len(kept.position)
     assert 1900 in clear_of(bins, [(1.0 + 11 / RATE, 1.1)], 25, 11, RATE).starts.tolist()
+
+
+def test_a_speed_that_is_noisy_lost_or_begins_in_slip():
+    rate = 1000.0
+    speed = np.zeros(1000)
+    speed[:100] = 10.0  # slides already
+    speed[300:500] = -10.0  # either way
+    speed[400:410] = 0.0  # for 10 ms
+    speed[600:615] = 10.0  # for 15 ms
+    speed[700:750] = np.nan
+    speed[750:800] = 10.0  # since when is not known
+    found = slip_by_speed(speed, rate, 5.0)
+    assert np.array(found.slip_s) == pytest.approx(np.array([[0, 0.0995], [0.75, 0.7995]]))
+    assert np.array(found.sliding_s) == pytest.approx(np.array([[0.2995, 0.4995]]))
+    assert found.speeds_mm_s == (10.0,)
+    rest = [[0.0995, 0.2995], [0.4995, 0.7], [0.7995, 1.0]]
+    assert np.array(found.non_slip_s) == pytest.approx(np.array(rest))
+    assert slip_by_speed(np.zeros(0), rate, 5.0) == ((), (), (), ())
+
+
+def test_a_speed_is_wanted_of_recordings_that_have_one():
+    with pytest.raises(ValueError, match=r"labels\.speed_over=5 needs recordings with a column of"):
+        small_maker(SmallSet(), speed_over=5.0)
 
 
 # Of a feature maker ----------------------------------------------------------------------------

@@ -64,6 +64,12 @@ class Clock(NamedTuple):
     gaps: tuple[Gap, ...] = ()
     jitter_s: float = 0.0
 
+    def times(self, per_row: int) -> Clock:
+        """The clock of samples of which each of these stands for so many, one after the other."""
+        gaps = tuple(Gap(*(number * per_row for number in gap)) for gap in self.gaps)
+        rate_hz = self.sample_rate_hz * per_row
+        return Clock(rate_hz, self.num_samples * per_row, gaps, self.jitter_s)
+
 
 def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "times") -> Clock:
     """The clock of samples, from their time stamps.

@@ -41,6 +41,8 @@ from tactslip_torch.data.formats import (
     open_file,
     pieces,
 )
+from tactslip_torch.data.formats._reading import MM_S
+from tactslip_torch.data.labels import slip_by_speed
 from tactslip_torch.data.manifest import (
     MOMENTS,
     STRETCHES,
@@ -61,7 +63,10 @@ log = logging.getLogger(__name__)
 
 _NOWHERE = "unknown"
 """The finger and segment of a channel of which nobody said them."""
-_LABEL_NAMES = ("label", "labels", "slip", "is_slip", "contact", "trial", "material", "class")
+_LABEL_NAMES = (
+    *("label", "labels", "slip", "is_slip", "contact", "trial", "material", "class"),
+    *("speed", "slip_speed"),
+)
 """Names of columns, in small letters, that are no channel unless a person says so."""
 _UNIT = re.compile(r"\s*(?:\([^()]*\)|\[[^\[\]]*\])$")
 _RATE_ERROR = 0.01
@@ -191,6 +196,7 @@ class Stream:
         kind: of channels that have no row.
         adapting: of those; ``None`` as their kind does, if it is known, else slow.
         units: of samples of files that do not say it.
+        speed_over: the speed in mm/s above which slip is, by the column ``reading.speed``.
     """
 
     name: str = ""
@@ -199,6 +205,7 @@ class Stream:
     kind: str = "electrode"
     adapting: Adapting | None = None
     units: str = "V"
+    speed_over: float | None = None
 
 
 class _Part(NamedTuple):
@@ -213,6 +220,7 @@ class _Part(NamedTuple):
         units: of the samples.
         own: all but the samples of a file of ours.
         rate_hz: of the stream in its set; a measured one is that of the set if it is near.
+        by_speed: what the speed of slip tells, if it is wanted.
     """
 
     clock: Clock
@@ -223,6 +231,7 @@ class _Part(NamedTuple):
     units: str
     own: Archived | None
     rate_hz: float
+    by_speed: Truth | None = None
 
     @property
     def truth(self) -> Truth:
@@ -258,24 +267,36 @@ def _part_of(opened: Opened, path: Path, stream: Stream, stated_hz: float | None
     if own is None:
         stated = stated_hz or stated or stream.reading.sample_rate_hz
     stated = stated and snapped_rate(stated)
-    times = opened.times()
+    times, per_row = opened.times(), 1 if own else stream.reading.samples_per_row
     if times is not None:
-        clock = even_clock(times, stated, str(path))
+        rows = even_clock(times, stated and stated / per_row, str(path))
     elif stated is not None:
-        clock = Clock(stated, samples.num_samples)
+        rows = Clock(stated / per_row, samples.num_samples // per_row)
     else:
         raise ValueError(
             f"{path} says no rate and has no times; give reading.sample_rate_hz=..., or name "
             "the column of times as reading.time=..."
         )
     try:
-        hand, rows = _hand_of(opened, stream)
+        hand, places = _hand_of(opened, stream)
     except ValueError as error:
         raise ValueError(f"{path} {error}") from None
     units = own.recording.units if own else stream.units
     is_measured = times is not None and stated is None
-    rate = clock.sample_rate_hz
-    return _Part(clock, is_measured, samples.num_channels, hand, tuple(rows), units, own, rate)
+    clock = rows.times(per_row)
+    rate = stated or clock.sample_rate_hz
+    told = None
+    if stream.speed_over is not None and opened.speed is not None:
+        told = _by_speed(EvenSamples(opened.speed, rows), rows, stream)
+    num = samples.num_channels
+    return _Part(clock, is_measured, num, hand, tuple(places), units, own, rate, told)
+
+
+def _by_speed(speed: EvenSamples, clock: Clock, stream: Stream) -> Truth:
+    """What the column of speed tells of slip."""
+    mm_s = speed.exact(0, speed.num_samples)[0].double() * MM_S[stream.reading.speed_unit]
+    found = slip_by_speed(mm_s.numpy(), clock.sample_rate_hz, stream.speed_over or 0.0)
+    return Truth(tuple(start for start, _ in found.sliding_s), **found._asdict())
 
 
 def _hand_of(opened: Opened, stream: Stream) -> tuple[HandLayout, list[int]]:
@@ -536,8 +557,12 @@ def _with_rates(parts: Sequence[_Part]) -> list[_Part]:
     ]
 
 
-def _differences(parts: Sequence[_Part], places: Sequence[str], *, any_rate: bool) -> list[str]:
-    """Of each file in what it differs from most of the others; empty where it does not.
+def _differences(
+    parts: Sequence[_Part], places: Sequence[str], *, any_rate: bool
+) -> list[str | None]:
+    """Of each file in what it differs from most of the others; ``None`` where it does not.
+
+    Of rates the first file that differs says all, the others are empty.
 
     Args:
         parts: the same stream of every file.
@@ -547,16 +572,21 @@ def _differences(parts: Sequence[_Part], places: Sequence[str], *, any_rate: boo
     hand, at_hand = _most([part.hand for part in parts], places)
     rate, at_rate = _most([part.rate_hz for part in parts], places)
     units, at_units = _most([part.units for part in parts], places)
-    found = []
+    others = Counter(part.rate_hz for part in parts if part.rate_hz != rate and part.hand == hand)
+    found: list[str | None] = []
+    is_said = False
     for part in parts:
-        what = ""
+        what = None
         if part.hand != hand:
             what = f"{_difference(part.hand, hand)} as in {at_hand}"
         elif part.rate_hz != rate and not any_rate:
+            counts = ", ".join(f"{count} of {hz:g} Hz" for hz, count in others.items())
+            all_of_them = f" (in all {counts})" if others.total() > 1 else ""
             what = (
-                f"is of {part.rate_hz:g} Hz, {at_rate} of {rate:g} Hz; "
+                f"is of {part.rate_hz:g} Hz, {at_rate} of {rate:g} Hz{all_of_them}; "
                 "data.resample_hz=... brings all to one"
             )
+            what, is_said = "" if is_said else what, True
         elif part.units != units:
             what = f"is in {part.units}, {at_units} in {units}"
         found.append(what)
@@ -650,6 +680,8 @@ class FileRecordings:
         tare_s: start and end of the stretch whose mean is taken off each channel.
         skip_s: what a label of a whole recording leaves out at its start.
         slide_s: how long a slide lasts of which only the onset is known.
+        speed_over: the speed in mm/s above which slip is, by the column ``reading.speed`` (see
+            ``labels.slip_by_speed``), of recordings of which the manifest says nothing.
         streams: by name, sets of channels of each file that have a ``reading``, ``channels``,
             ``kind``, ``adapting`` or ``units`` of their own; ``None`` for one.
         skip_failed: leave out files that cannot be read or differ, with a warning each.
@@ -683,13 +715,22 @@ class FileRecordings:
         tare_s: Sequence[float] | None = None,
         skip_s: float = 0.0,
         slide_s: float = 0.5,
+        speed_over: float | None = None,
         streams: Mapping[str, Mapping[str, Any]] | None = None,
         skip_failed: bool = False,
         strict: bool = True,
     ) -> None:
         self.root = Path(root)
         shared = {"channels": channels, "kind": kind, "adapting": adapting, "units": units}
-        self._streams = _streams_of(shared, reading, streams)
+        if speed_over is not None:
+            check_number("labels.speed_over", speed_over)
+        self.speed_over = speed_over
+        self._streams = _streams_of({**shared, "speed_over": speed_over}, reading, streams)
+        if speed_over is not None and all(s.reading.speed is None for s in self._streams):
+            raise ValueError(
+                f"labels.speed_over={speed_over:g} needs the column of speed: "
+                "data.reading.speed=NAME"
+            )
         self._tare_s = _tare_of(tare_s, "data.tare_s")
         if gaps not in GAP_RULES:
             raise ValueError(f"data.gaps must be one of {', '.join(GAP_RULES)}, got {gaps!r}")
@@ -734,7 +775,7 @@ class FileRecordings:
         for parts in streams:
             differences = _differences(parts, places, any_rate=self._resample_hz is not None)
             for number, what in zip(seen, differences, strict=True):
-                if what and what not in wrong[number]:
+                if what is not None and what not in wrong[number]:
                     wrong[number].append(what)
         warnings = []
         for number, *own in zip(seen, *streams, strict=True):
@@ -745,7 +786,10 @@ class FileRecordings:
                     self._files[entry.recording] = file
                     warnings += [_at(entry, doubt) for doubt in _doubts(file)]
         problems = [
-            _at(entry, what) for entry, each in zip(entries, wrong, strict=True) for what in each
+            _at(entry, what)
+            for entry, each in zip(entries, wrong, strict=True)
+            for what in each
+            if what
         ]
         rates = [part.rate_hz for part in self._any.parts] if self._files else []
         if self._resample_hz is None and len(set(rates)) > 1:
@@ -790,7 +834,8 @@ class FileRecordings:
                 wrong.append(f"lasts {duration_s:.4g} s, tare_s wants {last_s:g} s")
             if any(start <= first_s and last_s <= end for start, end in missing_s):
                 wrong.append(f"nothing is there to tare on from {first_s:g} to {last_s:g} s")
-        truth = entry.truth or parts[0].truth
+        by_speed = next((part.by_speed for part in parts if part.by_speed), None)
+        truth = entry.truth or by_speed or parts[0].truth
         pace = parts[0].clock.sample_rate_hz / parts[0].rate_hz
         if parts[0].is_measured and abs(pace - 1) > _ROUNDING:  # a person read the file's own times
             truth = scaled(truth, pace)
@@ -799,7 +844,7 @@ class FileRecordings:
             duration_s,
             skip_s=self._skip_s,
             slide_s=self._slide_s,
-            slack_s=math.inf if entry.is_nominal else 1.0 / parts[0].rate_hz,
+            slack_s=math.inf if entry.is_nominal or by_speed else 1.0 / parts[0].rate_hz,
             missing_s=missing_s,
         )
         return _File(entry, parts, times), [*wrong, *misfits]
@@ -1020,7 +1065,7 @@ def _streams_of(
             f"adapting or units of its own, got {streams!r}"
         )
     made = []
-    options = [one.name for one in fields(Stream) if one.name != "name"]
+    options = [one.name for one in fields(Stream) if one.name not in ("name", "speed_over")]
     for name, own in each.items():
         if unknown := set(own) - set(options):
             raise ValueError(f"a stream has {', '.join(options)}, got {', '.join(sorted(unknown))}")

@@ -15,9 +15,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 Layout = Literal["whole_slide", "half_second"]
@@ -43,6 +46,8 @@ class LabelRule:
             or at the start of a stretch. ``"majority"`` (slip if more than half of its samples
             are) or ``"last"`` (that of its last sample): bins begin at sample 0, a hop apart, and
             those of which every sample has a label are kept.
+        speed_over: slip is where the speed of the recordings is above so many mm/s, as
+            ``slip_by_speed`` has it; for recordings of ``data=files`` with ``reading.speed``.
 
     Raises:
         ValueError: for an unknown layout, onset source or assignment, or a length that is not
@@ -55,6 +60,7 @@ class LabelRule:
     hop_ms: float | None = None
     shuffle_seed: int | None = None
     assign: Assign = "whole"
+    speed_over: float | None = None
 
     def __post_init__(self) -> None:
         for name, kinds in (("layout", Layout), ("onsets", OnsetSource), ("assign", Assign)):
@@ -63,7 +69,7 @@ class LabelRule:
                     f"labels.{name} must be one of {', '.join(get_args(kinds))}, "
                     f"got {getattr(self, name)!r}"
                 )
-        for name in ("bin_ms", "hop_ms"):
+        for name in ("bin_ms", "hop_ms", "speed_over"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"labels.{name} must be positive, got {value}")
@@ -271,6 +277,93 @@ def _samples_of(
             f"recording of {num_samples / sample_rate_hz:.3f} s"
         )
     return first, stop
+
+
+_SHORTEST_S = 0.02
+"""A speed that is above or below the threshold for less than that is noise."""
+
+_Stretch = tuple[float, float]
+
+
+class SpeedLabels(NamedTuple):
+    """Slip by its speed.
+
+    Args:
+        sliding_s: start and end of each slide whose onset was recorded, in seconds.
+        speeds_mm_s: the median speed of each of those to two digits, so that results by speed have
+            few rows.
+        slip_s: slides that had begun before the recording, or while the speed was not known.
+        non_slip_s: stretches in which the speed is not above the threshold.
+    """
+
+    sliding_s: tuple[_Stretch, ...]
+    speeds_mm_s: tuple[float, ...]
+    slip_s: tuple[_Stretch, ...]
+    non_slip_s: tuple[_Stretch, ...]
+
+
+def slip_by_speed(
+    speed_mm_s: NDArray[np.float64], sample_rate_hz: float, speed_over: float
+) -> SpeedLabels:
+    """Where a speed of slip, of any sign, is above a threshold.
+
+    Onsets and ends are where the straight line between two samples crosses the threshold. What is
+    above or below it for less than 20 ms belongs to what is around it.
+
+    Args:
+        speed_mm_s: of the contact against what it touches; NaN where it is not known, which is
+            neither slip nor non-slip.
+        sample_rate_hz: of the speed.
+        speed_over: the threshold in mm/s.
+
+    Shape:
+        - speed_mm_s: ``[T]``
+
+    Example:
+        >>> slip_by_speed(np.repeat([0.0, 10.0], 100), 1000.0, 5.0)[:2]
+        (((0.0995, 0.2),), (10.0,))
+    """
+    speed = np.abs(speed_mm_s)
+    state = np.where(np.isnan(speed), -1, speed > speed_over)
+    shortest = _SHORTEST_S * sample_rate_hz
+    for kind in (0, 1):
+        for before, (start, stop, value), behind in _neighbours(_runs(state)):
+            if value == kind and before == behind == 1 - kind and stop - start < shortest:
+                state[start:stop] = 1 - kind
+
+    def edge(place: int) -> float:
+        if not 0 < place < len(state) or min(state[place - 1 : place + 1]) < 0:
+            return place / sample_rate_hz
+        low, high = speed[place - 1], speed[place]
+        return float(place - 1 + (speed_over - low) / (high - low)) / sample_rate_hz
+
+    sliding, speeds, slip, rest = [], [], [], []
+    for before, (start, stop, value), _ in _neighbours(_runs(state)):
+        stretch = edge(start), edge(stop)
+        if value == 0:
+            rest.append(stretch)
+        elif value == 1 and before == 0:
+            sliding.append(stretch)
+            speeds.append(float(f"{np.median(speed[start:stop]):.2g}"))
+        elif value == 1:
+            slip.append(stretch)
+    return SpeedLabels(tuple(sliding), tuple(speeds), tuple(slip), tuple(rest))
+
+
+_Run = tuple[int, int, int]
+
+
+def _runs(state: NDArray[np.int64]) -> list[_Run]:
+    """Start, end and value of each run of equal values."""
+    edges = np.flatnonzero(np.diff(state)) + 1
+    bounds = [0, *edges.tolist(), len(state)]
+    return [(start, stop, int(state[start])) for start, stop in pairwise(bounds) if start < stop]
+
+
+def _neighbours(runs: Sequence[_Run]) -> list[tuple[int | None, _Run, int | None]]:
+    """Each run with the values of those before and behind it."""
+    values = [None, *(value for _, _, value in runs), None]
+    return list(zip(values[:-2], runs, values[2:], strict=True))
 
 
 def clear_of(

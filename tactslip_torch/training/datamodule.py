@@ -114,6 +114,11 @@ class FeatureMaker:
         bin_samples = whole_samples(rule.bin_ms, source.sample_rate_hz, "labels.bin_ms")
         if rule.hop_ms is not None:
             whole_samples(rule.hop_ms, source.sample_rate_hz, "labels.hop_ms")
+        if rule.speed_over is not None and getattr(source, "speed_over", None) != rule.speed_over:
+            raise ValueError(
+                f"labels.speed_over={rule.speed_over:g} needs recordings with a column of speed: "
+                "data=files data.reading.speed=NAME"
+            )
         if pool.bin_samples != bin_samples:
             raise ValueError(
                 f"the features expect bins of {pool.bin_samples} samples, labels.bin_ms="

@@ -37,6 +37,7 @@ from tactslip_torch.data.formats._reading import (
     header_of,
     opened_from,
     pieces,
+    unfolded,
 )
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
@@ -139,6 +140,11 @@ class Format:
             with guarded(path):
                 self._check(path)
                 opened = (_isolated if how.isolate else self._adapter.read)(path, how, stack)
+                if opened.archived is None and not how.isolate:
+                    if how.speed is not None and opened.speed is None:
+                        raise Refused(f"is of {self.name}, of which reading.speed is not read")
+                    if how.samples_per_row > 1:
+                        opened = unfolded(opened, how)
             yield opened
 
     @property
@@ -290,8 +296,11 @@ def _isolated(path: Path, how: Reading, stack: ExitStack) -> Opened:
     stamps = None
     if size and found["has_times"]:
         stamps = Samples(path, [np.memmap(folder / "times", "f8", "r")])
+    speed = None
+    if size and found["has_speed"]:
+        speed = Samples(path, [np.memmap(folder / "speed", "f8", "r")])
     names = None if found["names"] is None else tuple(found["names"])
-    return Opened(Samples(path, values), None, names, stamps, "s", found["sample_rate_hz"])
+    return Opened(Samples(path, values), None, names, stamps, "s", found["sample_rate_hz"], speed)
 
 
 def _read_for_parent() -> None:
@@ -334,6 +343,8 @@ def _written(opened: Opened, folder: Path) -> dict[str, Any]:
             file.write(piece.T.contiguous().numpy().data)
     if times is not None:
         times.tofile(folder / "times")
+    if opened.speed is not None:
+        opened.speed.read(0, opened.speed.num_samples).double().numpy().tofile(folder / "speed")
     header = None
     if archived is not None:
         header = header_of(archived.recording, archived.hand, archived.key)
@@ -345,5 +356,6 @@ def _written(opened: Opened, folder: Path) -> dict[str, Any]:
         "names": opened.names,
         "sample_rate_hz": opened.sample_rate_hz,
         "has_times": times is not None,
+        "has_speed": opened.speed is not None,
         "header": header,
     }

@@ -123,7 +123,8 @@ def chosen_columns(
         time = _position(names, num_columns, how.time, "time")
     if how.channels is not None:
         return time, [_position(names, num_columns, one, "channels") for one in how.channels]
-    beside = {time, *others, *stamps, *(called if time is not None else ())}
+    speed = speed_column(names, num_columns, how)
+    beside = {time, speed, *others, *stamps, *(called if time is not None else ())}
     channels = [place for place in range(num_columns) if place not in beside]
     if not channels:
         raise Refused(
@@ -131,6 +132,15 @@ def chosen_columns(
             "reading.sample_rate_hz if it holds samples"
         )
     return time, channels
+
+
+def speed_column(names: Sequence[str] | None, num_columns: int, how: Reading) -> int | None:
+    """The place of the column of speed, if one is said.
+
+    Raises:
+        Refused: if there is no such column.
+    """
+    return None if how.speed is None else _position(names, num_columns, how.speed, "speed")
 
 
 def _position(names: Sequence[str] | None, num_columns: int, wanted: str | int, what: str) -> int:
@@ -175,7 +185,10 @@ def choose(
     several = [array for array in arrays if math.prod(array.values.shape) > 1]
     within = several if how.samples is None else _named(how.samples, several, refused)
     times = [] if isinstance(how.time, int) else _times_of(several, refused, how)
-    singles = [array for array in within if array.is_column and array not in times]
+    speeds = _said(how.speed, several, refused) if isinstance(how.speed, str) else []
+    how = replace(how, speed=None) if speeds else how  # of the columns
+    beside = [*times, *speeds]
+    singles = [array for array in within if array.is_column and array not in beside]
     matrices = [array for array in within if not array.is_column]
     words = {word for single in singles for word in (single.name, single.leaf)}
     if matrices and (how.channels is None or not words.issuperset(how.channels)):
@@ -192,6 +205,11 @@ def choose(
         raise Refused(f"holds no samples{reasons}; say reading.samples if it does")
     if opened.stamps is None and times:
         opened = _with_times(path, opened, times, how)
+    if speeds:
+        if not speeds[0].is_column or speeds[0].length != opened.samples.num_samples:
+            length = opened.samples.num_samples
+            raise Refused(f"has speeds {_listed(speeds)} for {length} samples; say reading.speed")
+        opened = opened._replace(speed=Samples(path, [speeds[0].values]))
     rate = near.sample_rate_hz or _single_rate(arrays, near.name)
     return opened._replace(sample_rate_hz=rate)
 
@@ -204,9 +222,13 @@ def _times_of(
         return [a for a in several if a.is_column and _is_time_name(a.short_name)]
     if how.time is None:
         return []
-    wanted = str(how.time)
+    return _said(str(how.time), several, refused)
+
+
+def _said(wanted: str, several: Sequence[Array], refused: Mapping[str, str]) -> Sequence[Array]:
+    """The arrays of a name; none if it is that of a column of a matrix."""
     if any(wanted in labels for array in several for labels in array.labels):
-        return []  # a column of a matrix
+        return []
     return _named(wanted, several, refused)
 
 
@@ -236,6 +258,8 @@ def _of_matrix(
     used = None if rows == list(range(count)) else rows
     names = None if labels is None else tuple(labels[row] for row in rows)
     opened = Opened(Samples(path, matrix.values, axis, used), names=names)
+    if (speed := speed_column(labels, count, how)) is not None:
+        opened = opened._replace(speed=Samples(path, matrix.values, axis, [speed]))
     if time is None:
         return opened
     unit = unit_of_time(labels[time] if labels else None, how)
@@ -268,8 +292,9 @@ def _of_columns(
         return columns[_position(None, len(columns), wanted, what)]
 
     time = found(how.time, "time") if isinstance(how.time, int) else None
+    speed = found(how.speed, "speed") if how.speed is not None else None
     if how.channels is None:
-        chosen = [single for single in singles if single is not time]
+        chosen = [single for single in singles if single is not time and single is not speed]
     else:
         chosen = [found(wanted, "channels") for wanted in how.channels]
     if not chosen:
@@ -280,6 +305,8 @@ def _of_columns(
     if len(set(names)) < len(names):
         names = tuple(column.name for column in chosen)
     opened = Opened(Samples(path, [column.values for column in chosen]), names=names)
+    if speed is not None:
+        opened = opened._replace(speed=Samples(path, [speed.values]))
     return (opened if time is None else _with_times(path, opened, [time], how)), chosen[0]
 
 

@@ -13,7 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._choice import chosen_columns, rate_in, unit_of_time
+from tactslip_torch.data.formats._choice import (
+    chosen_columns,
+    rate_in,
+    speed_column,
+    unit_of_time,
+)
 from tactslip_torch.data.formats._reading import (
     MOST_CHANNELS,
     MOST_HEADER,
@@ -87,7 +92,8 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     if len(refused) == len(names):
         raise Refused(f"holds no samples ({names[0]!r} holds {str(schema.types[0])[:40]!r})")
     time, channels = chosen_columns(names, len(names), how, refused, stamps)
-    for place in [*channels, *([] if time is None else [time])]:
+    speed = speed_column(names, len(names), how)
+    for place in [*channels, *(place for place in (time, speed) if place is not None)]:
         if place in refused:
             raise Refused(f"holds {str(schema.types[place])[:40]!r} in column {names[place]!r}")
     said: dict[str, float] = {}
@@ -99,6 +105,8 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         names=tuple(names[place] for place in channels),
         sample_rate_hz=rate_in(said),
     )
+    if speed is not None:
+        opened = opened._replace(speed=Samples(path, _columns(file, [names[speed]])))
     if time is None:
         return opened
     unit = schema.types[time].unit if time in stamps else unit_of_time(names[time], how)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -111,6 +112,9 @@ def needs(module: str, what: str) -> ModuleType:
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 SECONDS: dict[TimeUnit, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SpeedUnit = Literal["mm/s", "cm/s", "m/s", "um/s"]
+MM_S: dict[SpeedUnit, float] = {"mm/s": 1.0, "cm/s": 10.0, "m/s": 1000.0, "um/s": 1e-3}
+RowOrder = Literal["channel", "time"]
 
 
 @dataclass(frozen=True)
@@ -118,7 +122,7 @@ class Reading:
     """How to read files that do not say it themselves; files of ours need none of it.
 
     Args:
-        sample_rate_hz: of files without times.
+        sample_rate_hz: of files without times: samples a second of each channel.
         time: the column, dataset, variable or field of times, by name or by number from 0.
             ``"auto"``: what is called ``time``, ``t``, ``timestamp`` or the like; of a table
             without names the first column, unless the rate is given. ``None``: there is none.
@@ -127,6 +131,14 @@ class Reading:
         samples: the dataset, variable or topic that holds samples; ``None``: the only one that can.
         time_first: whether arrays are ``[T, C]``; ``None``: the longer axis is time.
         delimiter: between columns of text; ``None``: found from the first lines.
+        speed: the column or array of the speed of slip, which is no channel; ``None``: there is
+            none.
+        speed_unit: of that speed.
+        samples_per_row: how many samples of each channel, one behind the other in time, a row of
+            the table or array holds. Its time is that of the first.
+        row_order: of the columns of such a row. ``"channel"``: all samples of the first channel,
+            then those of the second; ``"time"``: the first sample of all channels, then the second.
+            ``None``: as names such as ``a_0, a_1, b_0, b_1`` tell.
         isolate: whether to read in a process of its own, for files from strangers: a file that
             takes too much memory or time, or ends the process, is then refused in one line.
         isolate_gib: of memory that process may take beyond its libraries.
@@ -143,6 +155,10 @@ class Reading:
     samples: str | None = None
     time_first: bool | None = None
     delimiter: str | None = None
+    speed: str | int | None = None
+    speed_unit: SpeedUnit = "mm/s"
+    samples_per_row: int = 1
+    row_order: RowOrder | None = None
     isolate: bool = False
     isolate_gib: float = 2.0
     isolate_s: float = 120.0
@@ -151,7 +167,9 @@ class Reading:
         for name in ("sample_rate_hz", "isolate_gib", "isolate_s"):
             if (value := getattr(self, name)) is not None or name != "sample_rate_hz":
                 check_number(f"reading.{name}", value)
+        check_number("reading.samples_per_row", self.samples_per_row, whole=True)
         units, columns, mark = get_args(TimeUnit), self.channels, self.delimiter
+        speeds, orders = get_args(SpeedUnit), get_args(RowOrder)
         is_list = isinstance(columns, Sequence) and not isinstance(columns, str) and bool(columns)
         is_mark = mark is None or (isinstance(mark, str) and len(mark) == 1)
         for name, is_right, wanted in (
@@ -160,6 +178,9 @@ class Reading:
             ("time_first", self.time_first in (True, False, None), "true, false or null"),
             ("isolate", isinstance(self.isolate, bool), "true or false"),
             ("time", self.time is None or _is_column(self.time), "a name, a number or null"),
+            ("speed", self.speed is None or _is_column(self.speed), "a name, a number or null"),
+            ("speed_unit", self.speed_unit in speeds, f"one of {', '.join(speeds)}"),
+            ("row_order", self.row_order in (*orders, None), f"one of {', '.join(orders)}, null"),
             ("delimiter", is_mark, "one character"),
             (
                 "channels",
@@ -260,6 +281,71 @@ class Samples:
         return values if self._rows is None else values[self._rows]
 
 
+class RowSamples(Samples):
+    """Samples of which each row of a table holds several of every channel.
+
+    Args:
+        rows: ``[C * k, T]``, as the table has them.
+        per_row: ``k``.
+        order: of the columns of a row.
+
+    Shape:
+        - what is read: ``[C, n]`` of ``[C, T * k]``
+    """
+
+    def __init__(self, rows: Samples, per_row: int, order: RowOrder) -> None:
+        self._inner, self._per_row, self._order = rows, per_row, order
+        self.num_channels = rows.num_channels // per_row
+        self.num_samples, self.dtype = rows.num_samples * per_row, rows.dtype
+
+    def stored(self, first: int, stop: int) -> NDArray[Any]:
+        """As ``read``, in the numbers that the file has."""
+        first = min(first, self.num_samples)
+        stop = max(min(stop, self.num_samples), first)
+        begin, num, k = first // self._per_row, self.num_channels, self._per_row
+        rows = self._inner.stored(begin, -(-stop // k))  # [C * k, n]
+        if self._order == "channel":
+            cube = rows.reshape(num, k, -1).transpose(0, 2, 1)
+        else:
+            cube = rows.reshape(k, num, -1).transpose(1, 2, 0)
+        return cube.reshape(num, -1)[:, first - begin * k : stop - begin * k]
+
+
+_INDEX = re.compile(r"[\s_.\-\[(]*\d+[\])]?$")
+
+
+def unfolded(opened: Opened, how: Reading) -> Opened:
+    """An open file whose rows hold several samples of each channel; times and speed are of rows.
+
+    Raises:
+        Refused: if the columns are no such number, or their order is not known.
+    """
+    k, num = how.samples_per_row, opened.samples.num_channels
+    if num % k:
+        raise Refused(
+            f"has {num} columns of samples, which is no multiple of reading.samples_per_row={k}; "
+            "list the columns that are channels as reading.channels"
+        )
+    stems = [_INDEX.sub("", name) for name in opened.names or ()]
+    groups: dict[RowOrder, list[list[str]]] = {
+        "channel": [stems[place : place + k] for place in range(0, len(stems), k)],
+        "time": [stems[place :: num // k] for place in range(num // k) if stems],
+    }
+    named: dict[RowOrder, tuple[str, ...]] = {}
+    for order, columns in groups.items():
+        names = tuple(column[0] for column in columns if len(set(column)) == 1)
+        if len(set(names)) == len(names) == num // k and all(names):
+            named[order] = names
+    found = how.row_order or next(iter(named), None)
+    if found is None and num != k:
+        raise Refused(
+            f"does not show how its rows hold {k} samples of each channel; say "
+            "reading.row_order=channel (a_0, a_1, b_0, b_1) or time (a_0, b_0, a_1, b_1)"
+        )
+    order = found or "channel"
+    return opened._replace(samples=RowSamples(opened.samples, k, order), names=named.get(order))
+
+
 def _along(column: Any, part: slice) -> NDArray[Any]:
     """A stretch of an array along its longest axis, ``[n]``."""
     axis = int(np.argmax(column.shape))
@@ -293,9 +379,11 @@ class Opened(NamedTuple):
         samples: all of them.
         archived: all else of a file of ours, around no samples; ``None`` for other files.
         names: of the channels, if the file says.
-        stamps: when the samples were taken, in the only channel, if the file says.
+        stamps: when the samples were taken, in the only channel, if the file says. Of rows with
+            several samples, when the first of each was.
         time_unit: of the stamps.
         sample_rate_hz: if the file says; what a person says is not here.
+        speed: of slip, in the only channel, at the same times as ``stamps``.
     """
 
     samples: Samples
@@ -304,6 +392,7 @@ class Opened(NamedTuple):
     stamps: Samples | None = None
     time_unit: TimeUnit = "s"
     sample_rate_hz: float | None = None
+    speed: Samples | None = None
 
     def times(self) -> NDArray[np.float64] | None:
         """Seconds since the first sample, ``[T]``; ``None`` if the file does not say.

@@ -21,7 +21,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._choice import chosen_columns, unit_of_time
+from tactslip_torch.data.formats._choice import chosen_columns, speed_column, unit_of_time
 from tactslip_torch.data.formats._reading import (
     FORM,
     MOST_HEADER,
@@ -123,6 +123,8 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     time, columns = chosen_columns(names, layout.num_columns, how, counts)
     chosen = tuple(names[column] for column in columns) if names is not None else None
     opened = Opened(Samples(path, table, 0, columns), None, chosen)
+    if (speed := speed_column(names, layout.num_columns, how)) is not None:
+        opened = opened._replace(speed=Samples(path, table, 0, [speed]))
     if time is not None and not (layout.is_time_empty and time == 0):
         unit = unit_of_time(names[time] if names else None, how)
         opened = opened._replace(stamps=Samples(path, table, 0, [time]), time_unit=unit)
