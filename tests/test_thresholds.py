@@ -10,17 +10,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import beta, chi2
-from test_rules import by_hand, drawn_times, drawn_values
-from torch import Tensor
+from test_rules import drawn_times, drawn_values
 
 from tactslip_torch.onset import thresholds
-from tactslip_torch.onset.rules import Cusum, KOfN, Rule, latch
+from tactslip_torch.onset.rules import KOfN, latch
 from tactslip_torch.onset.thresholds import (
-    AlarmRate,
     Budget,
-    alarm_counts,
     alarm_rate,
-    choose_threshold,
     false_alarms,
     lowest_threshold,
     poisson_interval,
@@ -141,186 +137,6 @@ def test_coverage_on_clustered_streams(
         assert np.mean([low <= total <= high for low, high in ends]) < covered - 0.1
 
 
-# ------------------------------------------------------------------------------- the threshold
-def smooth(noise: Tensor, memory: int) -> Tensor:
-    """Means over so many neighbours, of unit variance: ``[*, T + memory - 1] -> [*, T]``."""
-    sums = torch.nn.functional.pad(noise, (1, 0)).double().cumsum(-1)
-    return ((sums[..., memory:] - sums[..., :-memory]) / math.sqrt(memory)).float()
-
-
-def brute(statistics: list[list[float]], allowed: int, how: dict[str, int]) -> tuple[float, int]:
-    """The definition: every value tried, from the top, until one raises too many."""
-    values = {x for row in statistics for x in row}
-    top = max(values)
-    tried = sorted(values)
-    best, alarms = float(np.nextafter(np.float32(top), np.float32(np.inf))), 0
-    for threshold in reversed(tried):
-        found = sum(sum(by_hand(row, threshold, **how)[0]) for row in statistics)
-        if found > allowed:
-            break
-        best, alarms = threshold, found
-    return best, alarms
-
-
-@given(
-    recordings=st.lists(drawn_values, min_size=1, max_size=4),
-    allowed=st.integers(0, 8),
-    how=drawn_times,
-)
-def test_threshold_is_that_of_brute_force(recordings, allowed: int, how) -> None:
-    # whole numbers, so that many values are equal
-    lengths = list(map(len, recordings))
-    statistics = [torch.tensor(row, dtype=torch.float32) for row in recordings]
-    hop_s = 3600 / sum(lengths)  # an hour in all
-    found = choose_threshold(statistics, RAW, hop_s, allowed + 0.5, **how)
-    assert (found.value, found.rate.alarms) == brute(recordings, allowed, how)
-    assert found.reached
-    assert found.target_per_hour == allowed + 0.5
-    assert found.rate.hours == pytest.approx(1)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_threshold_in_long_streams(dtype: torch.dtype) -> None:
-    # alarms of some hundred decisions each, so that the search needs several passes
-    source = torch.Generator().manual_seed(0)
-    statistics = list(smooth(torch.randn(8, 4299, generator=source), 300).to(dtype))
-    how = {"rearm": 60, "refractory": 90}
-    hop_s, target = 3600 / 32_000, 40
-    found = choose_threshold(statistics, RAW, hop_s, target, **how)
-    top = torch.cat(statistics).max()
-    every = torch.cat(statistics).unique()
-    tried = every[(every >= found.value) & (every <= top)]
-    assert len(tried) > 1000
-    hours = sum(map(len, statistics)) * hop_s / 3600
-    for level in tried[:: len(tried) // 10].tolist():
-        assert int(alarm_counts(statistics, level, **how).sum()) <= target * hours
-    assert found.rate.per_hour <= target
-    below = float(every[every < found.value][-1])
-    assert int(alarm_counts(statistics, below, **how).sum()) > target * hours
-
-
-def test_a_lower_threshold_with_fewer_alarms_is_not_taken() -> None:
-    # at 1 the two peaks are one alarm, at 2 two
-    statistics = [torch.tensor([0.0, 2, 1, 2, 0, 0, 0, 0])]
-    hop_s = 3600 / 8
-    assert [alarm_counts(statistics, at, **PLAIN).tolist() for at in (1.0, 2.0)] == [[1], [2]]
-    found = choose_threshold(statistics, RAW, hop_s, 1, **PLAIN)
-    assert found.value == np.nextafter(np.float32(2), np.float32(3))
-    assert found.rate.alarms == 0
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_threshold_above_a_statistic_that_never_rises_is_a_normal_number(
-    dtype: torch.dtype,
-) -> None:
-    found = choose_threshold([torch.zeros(8, dtype=dtype)], RAW, 3600 / 8, 0.1, **PLAIN)
-    assert found.value == np.finfo(np.float32).tiny  # its ceiling is another number in float32
-    assert found.rate.alarms == 0
-
-
-def test_too_few_hours_allow_none_and_say_what_that_proves() -> None:
-    source = torch.Generator().manual_seed(0)
-    statistics = [torch.randn(360, generator=source) for _ in range(10)]  # 36 s in all
-    found = choose_threshold(statistics, RAW, 0.01, 1.0, **PLAIN)
-    assert found.value > max(float(row.max()) for row in statistics)
-    assert (found.rate.alarms, found.reached) == (0, True)
-    assert found.rate.high == pytest.approx(math.log(40) / 0.01)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_constant_streams(dtype: torch.dtype) -> None:
-    statistics = [torch.full((50,), 0.3, dtype=dtype)] * 4
-    hop_s = 3600 / 200
-    found = choose_threshold(statistics, RAW, hop_s, 3, **PLAIN)  # each would raise one
-    assert found.value > float(statistics[0][0])
-    assert found.value == pytest.approx(0.3)
-    assert (found.rate.alarms, found.reached) == (0, True)
-    found = choose_threshold(statistics, RAW, hop_s, 4, **PLAIN)
-    assert (found.value, found.rate.alarms) == (float(statistics[0][0]), 4)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_ceiling_that_is_too_low_is_said(dtype: torch.dtype) -> None:
-    rule = Cusum(ceiling=3.1)  # which is no float32
-    ceiling = float(torch.tensor(3.1, dtype=dtype))
-    llr = torch.tensor([5.0, -9, 5, -9, 5, -9, 5, -9, 1, -9, 1, -9], dtype=dtype)
-    statistics = [rule.scan(llr, rule.start(llr[0]))[0]] * 2
-    found = choose_threshold(statistics, rule, 3600 / 24, 7, **PLAIN)
-    assert (found.reached, found.value) == (False, ceiling)
-    assert (found.rate.alarms, found.rate.per_hour) == (8, 8)
-    found = choose_threshold(statistics, rule, 3600 / 24, 8, **PLAIN)  # itself a threshold
-    assert (found.reached, found.value, found.rate.alarms) == (True, ceiling, 8)
-
-
-def test_calibration_may_set_a_ceiling_that_the_rule_does_not_know() -> None:
-    statistics = [torch.tensor([2.0, 0, 2, 0, 1, 0])]
-    found = choose_threshold(statistics, RAW, 600.0, 1, **PLAIN, ceiling=2.0)
-    assert (found.value, found.reached, found.rate.alarms) == (2.0, False, 2)
-    found = choose_threshold(statistics, RAW, 600.0, 1, **PLAIN, ceiling=4.0)
-    assert found.reached
-
-
-def test_busy_streams_of_which_not_all_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = torch.Generator().manual_seed(0)
-    statistics = list(torch.randn(6, 500, generator=source).cumsum(-1))
-    args = (statistics, RAW, 3600 / 3000, 40)
-    exact = choose_threshold(*args, rearm=2, refractory=3)
-    monkeypatch.setattr(thresholds, "_TRIED_ONE_BY_ONE", 64)
-    found = choose_threshold(*args, rearm=2, refractory=3)
-    assert found.rate.alarms <= 40
-    assert found.value == pytest.approx(exact.value, abs=5)  # of a range of about 60
-
-
-@pytest.mark.parametrize(
-    ("statistics", "hop_s", "target", "said"),
-    [
-        ([], 0.01, 1.0, "no decision to count alarms in; give at least one recording"),
-        ([torch.zeros(2, 3)], 0.01, 1.0, r"recording 0 must be a row .* got shape \(2, 3\)"),
-        ([torch.tensor([math.nan])], 0.01, 1.0, "recording 0 must be a row of finite numbers"),
-        ([torch.zeros(3)], 0.0, 1.0, "hop_s must be positive, got 0.0"),
-        ([torch.zeros(3)], 0.01, 0.0, "false_alarms_per_hour must be positive, got 0.0"),
-        ([torch.zeros(3)], 0.01, math.nan, "false_alarms_per_hour must be positive"),
-    ],
-)
-def test_what_no_threshold_can_be_set_on(statistics, hop_s, target, said: str) -> None:
-    with pytest.raises(ValueError, match=said) as error:
-        choose_threshold(statistics, RAW, hop_s, target, **PLAIN)
-    assert "\n" not in str(error.value)
-
-
-# ------------------------------------------------------------------------------- fresh streams
-HOW = {"rearm": 5, "refractory": 20}
-
-
-@pytest.mark.parametrize(
-    ("rule", "memory"),
-    [
-        (RAW, 1),
-        (Cusum(0.0, 0.2, 40.0), 10),
-    ],
-    ids=str,
-)
-def test_fresh_streams_have_the_target_rate(rule: Rule, memory: int) -> None:
-    # 30 recordings of 20 s to choose on and 30 fresh ones, 40 times over; a decision shares what it
-    # saw with ``memory`` neighbours. Ten alarms are allowed, so the threshold as well as the fresh
-    # count have some 3 of noise: the interval of a fresh count need not hold the target in 95 of
-    # 100, and was seen to in 88 to 93, with means of 59 to 66 an hour.
-    source = torch.Generator().manual_seed(memory)
-    llr = 2 * smooth(torch.randn(40, 60, 1999 + memory, generator=source), memory) - 2
-    statistics, _ = rule.scan(llr, rule.start(llr[..., 0]))
-    fresh: list[AlarmRate] = []
-    for chosen_on, others in zip(statistics[:, :30], statistics[:, 30:], strict=True):
-        found = choose_threshold(list(chosen_on), rule, 0.01, 60.0, **HOW)
-        assert found.reached
-        assert found.rate.alarms <= 10
-        counts = alarm_counts(list(others), found.value, **HOW)
-        fresh.append(alarm_rate(counts, torch.full((30,), 20 / 3600)))
-    assert sum(one.low <= 60 <= one.high for one in fresh) >= 30
-    mean = np.mean([one.per_hour for one in fresh])
-    assert mean == pytest.approx(60, abs=13)  # a standard error is 60 sqrt(2 / 10 / 40) = 4
-
-
-# --------------------------------------------------------------------------------------- budgets
 @pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
 def test_bounds_are_those_of_garwood_and_of_clopper_and_pearson(confidence: float) -> None:
     rate, share = Budget("held", 1.0, False, confidence), Budget("taps", 0.1, True, confidence)

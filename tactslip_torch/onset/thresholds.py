@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 from scipy.special import betaincinv, gammainccinv, gammaincinv
 from torch import Tensor
 
-from tactslip_torch.onset.rules import Rule
-
 _NUM_RESAMPLES = 2000
 _TRIED_ONE_BY_ONE = 500  # thresholds, the highest
 _MOST_TRIED = 200_000  # values of a score, the highest
@@ -49,24 +47,6 @@ class AlarmRate:
     low: float
     high: float
     level: float
-
-
-@dataclass(frozen=True)
-class Threshold:
-    """A threshold for a target rate, and what it gave on the recordings it was chosen on.
-
-    Attributes:
-        value: at which the statistic raises an alarm.
-        target_per_hour: false alarms an hour that were asked for.
-        rate: what the calibration recordings had at ``value``.
-        reached: whether they had at most as many as asked for; False only if ``value`` is the
-            ceiling, and even that too low.
-    """
-
-    value: float
-    target_per_hour: float
-    rate: AlarmRate
-    reached: bool
 
 
 def poisson_interval(count: float, level: float = 0.95) -> tuple[float, float]:
@@ -141,26 +121,6 @@ def alarm_rate(
         ends.append((low, high))
     low, high = min(end[0] for end in ends) / length, max(end[1] for end in ends) / length
     return AlarmRate(total, length, total / length, low, high, level)
-
-
-def alarm_counts(
-    statistics: Sequence[Tensor], threshold: float, *, rearm: int, refractory: int
-) -> Tensor:
-    """How many alarms each recording has at a threshold: ``[R]``, int64.
-
-    Exactly what ``latch`` raises from its start in recordings ``[T_r]``, all of one dtype; made of
-    the few decisions at or above the threshold.
-
-    Raises:
-        ValueError: if there is no decision, a statistic is not a row of finite numbers, or
-            rearm or refractory is negative.
-    """
-    if rearm < 0 or refractory < 0:
-        raise ValueError(f"rearm and refractory must not be negative, got {rearm} and {refractory}")
-    _check(statistics)
-    above = [s.detach().cpu() >= torch.tensor(threshold, dtype=s.dtype) for s in statistics]
-    places = (np.flatnonzero(row.numpy()) for row in above)
-    return torch.tensor([len(_alarms(place, rearm, refractory)) for place in places])
 
 
 def _alarms(above: NDArray[np.int64], rearm: int, refractory: int) -> NDArray[np.int64]:
@@ -310,83 +270,3 @@ def _lowest(falling: NDArray[Any], above: float, keeps: Callable[[float], bool])
         else:
             most = step // 2
     return value
-
-
-def choose_threshold(
-    statistics: Sequence[Tensor],
-    rule: Rule,
-    hop_s: float,
-    false_alarms_per_hour: float,
-    *,
-    rearm: int,
-    refractory: int,
-    ceiling: float = math.inf,
-    level: float = 0.95,
-) -> Threshold:
-    """The lowest threshold that keeps recordings without slip at or below a target rate.
-
-    It and every higher one tried raise at most ``floor(target * hours)`` alarms; fewer need not
-    follow from higher, as a lower threshold may join two alarms into one. Tried are the values at
-    which the count can change: those of the statistic, from the highest, one by one; beyond the
-    highest 500 in steps of a five hundredth of them, and the last step by halves. Of the thresholds
-    between two values, which raise the same alarms, the upper one is taken: then fresh recordings
-    have about as many in the mean, and not one more. Where none is allowed it is the next number
-    above all, at least the least normal float32 above 0.
-
-    With too few hours for the target (less than one alarm allowed) none is allowed; ``rate.high``
-    tells what that proves.
-
-    Args:
-        statistics: of each recording ``[T_r]``, all of one dtype; nothing slips in them.
-        rule: that made them; its ceiling counts.
-        hop_s: distance of two decisions.
-        false_alarms_per_hour: the target.
-        rearm: decisions in a row below the threshold that re-arm.
-        refractory: shortest distance of two alarms, in decisions.
-        ceiling: what the statistic cannot exceed, where calibration bounds it but not the rule.
-        level: of the interval of the rate.
-
-    Raises:
-        ValueError: if there is no decision, a statistic is not a row of finite numbers, or the hop
-            or the target is not positive.
-    """
-    if not 0 < false_alarms_per_hour < math.inf:
-        raise ValueError(f"false_alarms_per_hour must be positive, got {false_alarms_per_hour}")
-    if not 0 < hop_s < math.inf:
-        raise ValueError(f"hop_s must be positive, got {hop_s}")
-    _check(statistics)
-    hours = torch.tensor([s.numel() * hop_s / 3600 for s in statistics], dtype=torch.float64)
-    allowed = math.floor(false_alarms_per_hour * float(hours.sum()) * (1 + 1e-9))
-    flat = torch.cat([statistic.detach() for statistic in statistics]).cpu().numpy()
-    sizes = [len(statistic) for statistic in statistics]
-    apart = np.repeat(np.arange(len(sizes)), sizes) * (rearm + refractory + 2)
-    places = np.arange(len(flat)) + apart  # so far apart that no latch remembers
-    ranked = np.sort(flat)[::-1]
-    value = float(np.nextafter(ranked[0], np.inf, dtype=flat.dtype))
-    if 0 < value < (least := float(np.finfo(np.float32).tiny)):
-        value = least  # denormal numbers have no digits to tell a threshold from its ceiling
-
-    def keeps(threshold: float) -> bool:
-        return len(_alarms(places[flat >= threshold], rearm, refractory)) <= allowed
-
-    value = _lowest(ranked, value, keeps)
-    value = min(value, float(torch.tensor(min(rule.ceiling, ceiling), dtype=statistics[0].dtype)))
-    counts = alarm_counts(statistics, value, rearm=rearm, refractory=refractory)
-    rate = alarm_rate(counts, hours, level)
-    return Threshold(value, false_alarms_per_hour, rate, int(counts.sum()) <= allowed)
-
-
-def _check(statistics: Sequence[Tensor]) -> None:
-    """Refuse what are no statistics of recordings.
-
-    Raises:
-        ValueError: if there is no decision, or a statistic is not a row of finite numbers.
-    """
-    if not sum(statistic.numel() for statistic in statistics):
-        raise ValueError("no decision to count alarms in; give at least one recording without slip")
-    for number, statistic in enumerate(statistics):
-        if statistic.ndim != 1 or not bool(statistic.isfinite().all()):
-            raise ValueError(
-                f"the statistic of recording {number} must be a row of finite numbers, "
-                f"got shape {tuple(statistic.shape)}; invalid decisions enter a rule as NEUTRAL"
-            )

@@ -33,7 +33,6 @@ from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.calibration import (
     Calibration,
-    Isotonic,
     Platt,
     fit_isotonic,
     fit_platt,
@@ -64,9 +63,7 @@ from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN, Rule, rule_from
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.onset.thresholds import (
     Budget,
-    Threshold,
     alarm_rate,
-    choose_threshold,
     false_alarms,
     lowest_threshold,
 )
@@ -644,7 +641,7 @@ class CalibratedAlarm:
     ) -> dict[str, tuple[str, AlarmSettings]]:
         """By name whose scores, and what makes alarms of them.
 
-        ``JOINT``; the rule on bins alone, as published, at the rate that ``slip_free`` may have;
+        ``JOINT``; the rule on bins alone, as published, within the budget of ``slip_free``;
         the paper's own rule, ``FIRST_TRANSITION``; and a threshold on the score of each baseline.
 
         The paper's rule makes every change of the score to slip an alarm, one decision a bin: there
@@ -662,7 +659,7 @@ class CalibratedAlarm:
         ours, timing = streams[OURS], timings[OURS]
         calibration = FITS[self.calibration](*labelled(ours, timing))
         rule = self.made_rule(timing.bin_samples)
-        methods = {JOINT: (OURS, self.joined(rule, calibration, onset, ours, timing))}
+        methods = {JOINT: (OURS, self.calibrated(rule, calibration, ours, timing, onset))}
         alone = self.calibrated(rule, calibration, ours, timing)
         methods[rule.name] = OURS, alone
         if timing.bin_samples % timing.hop_samples == 0:
@@ -672,43 +669,50 @@ class CalibratedAlarm:
         for name in streams:
             if name != OURS:
                 settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timings[name].hop_samples)
-                scored = self._scored(streams[name], settings, timings[name])
+                scored = self._scored(streams[name], settings, timings[name], self.budgets)
                 settings = replace(settings, threshold=self._lowest(scored, settings, "statistic"))
                 methods[name] = name, self._told(settings, scored)
         return methods
 
-    def joined(
+    def calibrated(
         self,
         rule: Rule,
         calibration: Calibration,
-        onset: OnsetClassifier,
         streams: Sequence[Stream],
         timing: Timing,
+        onset: OnsetClassifier | None = None,
     ) -> AlarmSettings:
-        """Settings with both thresholds.
+        """Settings with their thresholds.
+
+        With an onset classifier both thresholds, which together keep every budget; of bins alone,
+        as published, the one that keeps that of ``slip_free``. A threshold that the rule cannot
+        reach is infinite.
 
         A ``Cusum`` without ceiling gets one above its threshold. A sum that is capped is sooner low
         again, so what was one alarm can be two; the threshold is raised until budgets are kept.
         """
-        settings = self._settings(rule, calibration, timing.hop_samples)
-        settings = replace(settings, onset=onset)
-        scored = self._scored(streams, settings, timing)
-        value = self._lowest(scored, settings, "statistic", of_allowed=_OF_BINS)
-        value = max(value, _ABOVE_NEUTRAL) / _STEP  # at 0 a sum would stand for ever
+        budgets = [x for x in self.budgets if onset or x.scene == self.slip_free]
+        settings = replace(self._settings(rule, calibration, timing.hop_samples), onset=onset)
+        scored = self._scored(streams, settings, timing, budgets)
+        value = self._lowest(scored, settings, "statistic", of_allowed=_OF_BINS if onset else 1.0)
+        value = max(value, _ABOVE_NEUTRAL)  # at 0 a sum would stand for ever
         while True:
-            value *= _STEP
-            made = rule
-            if isinstance(rule, Cusum) and rule.ceiling == math.inf and value > 0:
+            value, made = value if value <= rule.ceiling else math.inf, rule
+            if isinstance(rule, Cusum) and rule.ceiling == math.inf:
                 made = replace(rule, ceiling=_CEILING * value)
             settings = replace(settings, rule=made, threshold=value)
-            scored = self._scored(streams, settings, timing)
-            threshold = self._lowest(scored, settings, "onset_score")
-            settings = replace(settings, onset=replace(onset, threshold=threshold))
+            scored = self._scored(streams, settings, timing, budgets)
+            if onset:
+                threshold = self._lowest(scored, settings, "onset_score")
+                settings = replace(settings, onset=replace(onset, threshold=threshold))
             settings = self._told(settings, scored)
             rows = settings.metadata["budget"]
             if all(row["alarms"] <= row["allowed"] for row in rows):
                 break
+            value *= _STEP
         lead_s = _lead_s(streams, replace(settings, onset=None), timing)
+        if settings.onset is None:
+            return replace(settings, lead_s=lead_s)
         leads = [
             alarm_s - onset_s
             for stream, made in decide(streams, settings, timing)
@@ -720,49 +724,8 @@ class CalibratedAlarm:
             )
             if first_s <= alarm_s <= onset_s + EventRules().found_within_s
         ]
-        assert settings.onset is not None
         joint = replace(settings.onset, lead_s=statistics.median(leads) if leads else 0.0)
         return replace(settings, onset=joint, lead_s=lead_s)
-
-    def calibrated(
-        self, rule: Rule, calibration: Calibration, streams: Sequence[Stream], timing: Timing
-    ) -> AlarmSettings:
-        """A rule on bins alone, with the threshold for the rate that ``slip_free`` may have.
-
-        A ``Cusum`` without ceiling gets one, as ``joined`` gives it.
-        """
-        settings = self._settings(rule, calibration, timing.hop_samples)
-        quiet = [stream for stream in streams if stream.recording.scene == self.slip_free]
-        target = self.budget[self.slip_free]
-        highest = math.inf  # of a statistic that is itself a ratio, what the calibration gives
-        if isinstance(rule, KOfN) and isinstance(calibration, Isotonic):
-            highest = max(calibration.llrs)
-        threshold = choose_threshold(
-            [made.statistic for _, made in decide(quiet, settings, timing)],
-            rule,
-            timing.hop_s,
-            target,
-            rearm=settings.decisions(self.rearm_s, timing.sample_rate_hz),
-            refractory=settings.decisions(self.refractory_s, timing.sample_rate_hz),
-            ceiling=highest,
-            level=self.level,
-        )
-        settings = replace(settings, threshold=threshold.value)
-        if isinstance(rule, Cusum) and rule.ceiling == math.inf and threshold.value > 0:
-            allowed = math.floor(target * threshold.rate.hours)
-            counts, value = [allowed + 1], threshold.value / _STEP
-            while sum(counts) > allowed:
-                value *= _STEP
-                capped = replace(rule, ceiling=_CEILING * value)
-                settings = replace(settings, rule=capped, threshold=value)
-                made = [decisions for _, decisions in decide(quiet, settings, timing)]
-                counts = [int(decisions.is_alarm.sum()) for decisions in made]
-            hours = [len(decisions.number) * timing.hop_s / 3600 for decisions in made]
-            rate = alarm_rate(counts, hours, self.level)
-            threshold = replace(threshold, value=value, rate=rate)
-        metadata = {"slip_free": self.slip_free, "calibrated": asdict(threshold)}
-        lead_s = _lead_s(streams, settings, timing)
-        return replace(settings, lead_s=lead_s, metadata=metadata)
 
     def _settings(self, rule: Rule, calibration: Calibration, hop_samples: int) -> AlarmSettings:
         """Without a threshold yet."""
@@ -778,12 +741,16 @@ class CalibratedAlarm:
         )
 
     def _scored(
-        self, streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
+        self,
+        streams: Sequence[Stream],
+        settings: AlarmSettings,
+        timing: Timing,
+        budgets: Sequence[Budget],
     ) -> dict[Budget, _Scores]:
         """What thresholds are set on."""
         settle_s = (timing.bin_samples + timing.look_ahead) / timing.sample_rate_hz + _SETTLE_S
         found = dict[Budget, _Scores]()
-        for budget in self.budgets:
+        for budget in budgets:
             own = [stream for stream in streams if stream.recording.scene == budget.scene]
             scores = found[budget] = _Scores()
             for stream, made in decide(own, settings, timing):
@@ -840,8 +807,11 @@ class CalibratedAlarm:
                 rate = alarm_rate(alarms, [own / self._rate_per_h for own in hours], self.level)
                 onset = settings.onset
                 value = settings.threshold if onset is None else onset.threshold
-                reached = sum(alarms) <= rows[-1]["allowed"]
-                calibrated = asdict(Threshold(value, budget.limit, rate, reached))
+                calibrated = {
+                    "value": value,
+                    "target_per_hour": budget.limit,
+                    "rate": asdict(rate),
+                }
         metadata = {"slip_free": self.slip_free, "budget": rows, "calibrated": calibrated}
         return replace(settings, metadata=metadata | {"confidence": self.confidence})
 
