@@ -69,8 +69,8 @@ QUICK_TRAINING = (
     "split.seen=[M1,M6]",
     "split.unseen=[iron]",
     "split.train_fraction=0.5",
-    *(f"extra_scenes.{scene}.cycles=2" for scene in ("held", "knocked", "arm_motion")),
-    *(f"extra_scenes.{scene}.tail_s=2" for scene in ("held", "knocked")),
+    *(f"extra_scenes.{scene}.cycles=2" for scene in ("held", "knocked", *_SCENES)),
+    *(f"extra_scenes.{scene}.tail_s=2" for scene in ("held", "knocked", *_SCENES[1:])),
     "recipe.num_features=20",
     "recipe.penalties=[0.003]",
 )
