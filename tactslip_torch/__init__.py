@@ -1,4 +1,7 @@
-"""Slip detection for robot hands that feel, in PyTorch (He et al. 2026, and beyond)."""
+"""Slip detection from tactile sensors, in PyTorch (He et al. 2026, and beyond)."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.features.names import FeatureName
@@ -10,7 +13,13 @@ from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.runtime import __version__ as __version__
-from tactslip_torch.simulation import Scene, simulate
+
+if TYPE_CHECKING:
+    from tactslip_torch.simulation.scene import Scene
+    from tactslip_torch.simulation.simulate import simulate
+
+_LATER = {"Scene": "simulation", "simulate": "simulation"}
+"""Names that are imported when first asked for, so that the import takes little more than torch."""
 
 __all__ = [
     "AlarmSettings",
@@ -26,3 +35,13 @@ __all__ = [
     "SufficientStats",
     "simulate",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_LATER[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -13,7 +13,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from scipy.optimize import isotonic_regression
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, softplus
 
@@ -182,6 +181,8 @@ def fit_isotonic(scores: Tensor, is_slip: Tensor, weights: Tensor | None = None)
     for end in (0, -1):
         mass[end] += _END_WEIGHT * torch.stack([share, 1 - share])
     weight = mass.sum(-1).cpu().numpy()
+    from scipy.optimize import isotonic_regression  # a tenth of what torch takes to import
+
     rates = isotonic_regression(mass[:, 0].cpu().numpy() / weight, weights=weight).x
     is_rise = np.diff(rates) > 1e-12 * rates[1:]  # equal but for rounding is one step
     steps = np.flatnonzero([True, *is_rise, True])

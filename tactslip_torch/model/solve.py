@@ -21,7 +21,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import torch
-from scipy.linalg.lapack import dpocon
 from torch import Tensor
 
 log = logging.getLogger(__name__)
@@ -282,6 +281,8 @@ def _truncated(
 
 def _condition(factor: Tensor, norm: float) -> float:
     """Estimate from a lower Cholesky factor, column-major, and the 1-norm of the matrix."""
+    from scipy.linalg.lapack import dpocon  # as long to import as a fifth of torch
+
     reciprocal, _ = dpocon(factor.cpu().numpy(), norm, uplo="L")
     return 1 / reciprocal if reciprocal > 0 else math.inf
 
