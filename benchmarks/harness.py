@@ -4,6 +4,7 @@ A subject is a class derived from ``Benchmark`` in a file of its own; ``python -
 measures it, prints its tables, and writes ``NAME.json``, ``NAME.png`` and its section of
 BENCHMARKS.md between ``<!-- NAME -->`` and ``<!-- /NAME -->``. ``--quick`` measures very little, to
 see that it runs, and touches no tracked file; ``--render`` writes the same from the kept JSON.
+``sizes.NAME=value`` on the command line changes how much is measured.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from importlib import metadata
 from pathlib import Path
 from statistics import mean, median, quantiles, stdev
@@ -34,6 +35,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
+from omegaconf import OmegaConf
 from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[import-untyped]
 
 from benchmarks import RESULTS, ROOT
@@ -608,7 +610,8 @@ class Benchmark(ABC, Generic[S]):
         parser.add_argument("--render", action="store_true", help="show the kept numbers again")
         text = "of numbers, figure and, if quick, the page (benchmarks/results, quick: outputs)"
         parser.add_argument("--out", type=Path, metavar="FOLDER", help=text)
-        text = "passed on to the commands that are run"
+        names = ", ".join(field.name for field in fields(self.sizes))  # type: ignore[arg-type]
+        text = f"passed on to the commands that are run; sizes.NAME=value, of {names}: how much"
         parser.add_argument("overrides", nargs="*", metavar="key=value", help=text)
         given = parser.parse_intermixed_args(arguments)
         outputs = ROOT / "outputs" / "benchmarks"
@@ -625,9 +628,9 @@ class Benchmark(ABC, Generic[S]):
             return 0
         runs = (folder / "runs" if given.quick else outputs) / self.name
         sizes = self.quick if given.quick else self.sizes
-        job = Job(sizes, runs, tuple(given.overrides), given.quick)
         try:
-            report = self._report(job)
+            sizes, overrides = _resized(sizes, given.overrides)
+            report = self._report(Job(sizes, runs, overrides, given.quick), given.overrides)
         except KeyboardInterrupt:
             return EXIT_INTERRUPTED
         except (FileNotFoundError, ValueError, RuntimeError) as error:
@@ -639,7 +642,7 @@ class Benchmark(ABC, Generic[S]):
         self.publish(report, folder)
         return 0
 
-    def _report(self, job: Job[S]) -> dict[str, Any]:
+    def _report(self, job: Job[S], overrides: Sequence[str]) -> dict[str, Any]:
         machine = machine_description()  # before the load of the measurement
         numbers = self.measure(job)
         return {
@@ -649,6 +652,22 @@ class Benchmark(ABC, Generic[S]):
             "machine": machine,
             "versions": versions(self.libraries),
             "settings": asdict(job.sizes),  # type: ignore[call-overload]
-            "overrides": list(job.overrides),
+            "overrides": list(overrides),
             "numbers": numbers,
         }
+
+
+def _resized(sizes: S, overrides: Sequence[str]) -> tuple[S, tuple[str, ...]]:
+    """Sizes after ``sizes.NAME=value``, and the other overrides.
+
+    Raises:
+        ValueError: if there is no such size.
+    """
+    own = [text.removeprefix("sizes.") for text in overrides if text.startswith("sizes.")]
+    given: Any = OmegaConf.to_container(OmegaConf.from_dotlist(own))
+    names = [field.name for field in fields(sizes)]  # type: ignore[arg-type]
+    if unknown := [name for name in given if name not in names]:
+        raise ValueError(f"no size is called {unknown[0]!r}; there are {', '.join(names)}")
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
+    others = tuple(text for text in overrides if not text.startswith("sizes."))
+    return replace(sizes, **values), others  # type: ignore[type-var]
