@@ -3,23 +3,37 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from tactslip_torch.data.recording import Recording
-from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import Prediction
-from tactslip_torch.model.moments import SufficientStats
-from tactslip_torch.onset.decisions import AlarmSettings
-from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.runtime import __version__ as __version__
-
 if TYPE_CHECKING:
-    from tactslip_torch.simulation.scene import Scene
-    from tactslip_torch.simulation.simulate import simulate
+    from tactslip_torch.data.recording import Recording as Recording
+    from tactslip_torch.features.names import FeatureName as FeatureName
+    from tactslip_torch.features.pool import FeaturePool as FeaturePool
+    from tactslip_torch.hand import Channel as Channel
+    from tactslip_torch.hand import HandLayout as HandLayout
+    from tactslip_torch.model.detector import SlipDetector as SlipDetector
+    from tactslip_torch.model.missing_channels import Prediction as Prediction
+    from tactslip_torch.model.moments import SufficientStats as SufficientStats
+    from tactslip_torch.onset.decisions import AlarmSettings as AlarmSettings
+    from tactslip_torch.onset.streaming import StreamingDetector as StreamingDetector
+    from tactslip_torch.runtime import __version__ as __version__
+    from tactslip_torch.simulation import Scene as Scene
+    from tactslip_torch.simulation import simulate as simulate
 
-_LATER = {"Scene": "simulation", "simulate": "simulation"}
-"""Names that are imported when first asked for, so that the import takes little more than torch."""
+_MODULES = {
+    "AlarmSettings": "onset.decisions",
+    "Channel": "hand",
+    "FeatureName": "features.names",
+    "FeaturePool": "features.pool",
+    "HandLayout": "hand",
+    "Prediction": "model.missing_channels",
+    "Recording": "data.recording",
+    "Scene": "simulation",
+    "SlipDetector": "model.detector",
+    "StreamingDetector": "onset.streaming",
+    "SufficientStats": "model.moments",
+    "__version__": "runtime",
+    "simulate": "simulation",
+}
+"""Where each name is imported from when it is first asked for: ``--help`` needs no torch."""
 
 __all__ = [
     "AlarmSettings",
@@ -38,9 +52,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LATER:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_LATER[name]}"), name)
+    found = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    globals()[name] = found
+    return found
 
 
 def __dir__() -> list[str]:

@@ -18,7 +18,7 @@ COMMANDS = {
     "crossval": "every choice of held-out materials",
     "pareto": "the most accurate detector within a deadline",
     "certify": "what float32 does to a detector",
-    "calibrate": "set the free parameters of the simulator",
+    "calibrate-simulator": "set the free parameters of the simulator",
 }
 
 
@@ -31,7 +31,7 @@ def main() -> None:
     given, *rest = sys.argv[1:] or ["--help"]
     if given in ("-h", "--help"):
         print("usage: tactslip COMMAND [key=value ...]; tactslip COMMAND --help tells its keys\n")
-        print("\n".join(f"  {name:12}{what}" for name, what in COMMANDS.items()))
+        print("\n".join(f"  {name:22}{what}" for name, what in COMMANDS.items()))
         return
     if given not in COMMANDS:
         near = get_close_matches(given, COMMANDS, 1)
@@ -40,7 +40,9 @@ def main() -> None:
         raise SystemExit(2)
     sys.argv = [f"tactslip {given}", *rest]
     # as __main__, so that Lightning finds what to start again in further processes
-    runpy.run_module(f"tactslip_torch.commands.{given}", run_name="__main__", alter_sys=True)
+    runpy.run_module(
+        f"tactslip_torch.commands.{given.replace('-', '_')}", run_name="__main__", alter_sys=True
+    )
 
 
 if __name__ == "__main__":

@@ -115,7 +115,8 @@ def test_further_scenes_are_those_of_their_files_and_any_knob_can_be_set():
 
 
 @pytest.mark.parametrize(
-    "name", ["train", "evaluate", "generate", "certify", "crossval", "pareto", "calibrate"]
+    "name",
+    ["train", "evaluate", "generate", "certify", "crossval", "pareto", "calibrate_simulator"],
 )
 def test_every_entry_point_on_recordings_takes_further_scenes(name):
     assert not composed(name=name).data.extra_scenes

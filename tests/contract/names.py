@@ -64,7 +64,7 @@ COMMANDS = {
     "crossval": f"-m {PACKAGE} crossval",
     "pareto": f"-m {PACKAGE} pareto",
     "certify": f"-m {PACKAGE} certify",
-    "calibrate": f"-m {PACKAGE} calibrate",
+    "calibrate": f"-m {PACKAGE} calibrate-simulator",
 }
 BATCH_FIT = "examples/batch_fit.py"
 """In the place of the command ``stats`` of 0.1.0."""

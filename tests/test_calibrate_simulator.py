@@ -6,8 +6,8 @@ from types import MappingProxyType
 import pytest
 from test_commands import composed
 
-from tactslip_torch.commands import calibrate as command
-from tactslip_torch.commands.calibrate import best_point, calibrate, parameters_at, search
+from tactslip_torch.commands import calibrate_simulator as command
+from tactslip_torch.commands.calibrate_simulator import best_point, calibrate, parameters_at, search
 from tactslip_torch.commands.train import train
 from tactslip_torch.report import published
 from tactslip_torch.report.calibration import calibration_table
@@ -26,7 +26,7 @@ SMALL = (
 
 def tiny(*overrides):
     few = ("seeds=[1000]", "check_cycles=1", "most_points=2", "step=1.5")
-    return composed(*SMALL, *few, *overrides, name="calibrate")
+    return composed(*SMALL, *few, *overrides, name="calibrate_simulator")
 
 
 # --- the search ---------------------------------------------------------------------------------
@@ -100,7 +100,7 @@ def test_the_line_begins_at_the_starting_values_and_gets_harder():
     assert presliding[::-1] == sorted(presliding)
     assert bursts[::-1] == sorted(bursts)
     assert [high / low for low, high in presliding] == pytest.approx([10.0] * 4, rel=1e-3)
-    for difficulty in composed(name="calibrate").bounds:
+    for difficulty in composed(name="calibrate_simulator").bounds:
         paper_scenes(cycles=1, materials=["M1"], **parameters_at(difficulty))
 
 
@@ -223,9 +223,9 @@ def test_the_published_test_accuracy_is_the_target(tmp_path, monkeypatch, put_in
 
 
 def test_write_freezes_the_values_that_parameters_then_take(tmp_path, put_in):
-    calibrate(composed("most_points=1", name="calibrate"), tmp_path)
+    calibrate(composed("most_points=1", name="calibrate_simulator"), tmp_path)
     assert not put_in.path.exists()
-    content = calibrate(composed("write=true", name="calibrate"), tmp_path)
+    content = calibrate(composed("write=true", name="calibrate_simulator"), tmp_path)
     assert put_in.path.read_bytes() == (tmp_path / "calibration.json").read_bytes()
     frozen = {
         n: list(v) if isinstance(v, tuple) else v for n, v in read_calibrated(put_in.path).items()
@@ -236,7 +236,7 @@ def test_write_freezes_the_values_that_parameters_then_take(tmp_path, put_in):
 def test_checks_that_fail_at_the_start_freeze_nothing(tmp_path, put_in):
     put_in(holds=False)
     with pytest.raises(ValueError, match=r"^the signal checks loud do not hold at the starting"):
-        calibrate(composed("write=true", name="calibrate"), tmp_path / "results")
+        calibrate(composed("write=true", name="calibrate_simulator"), tmp_path / "results")
     assert not put_in.path.exists()
 
 
@@ -251,7 +251,9 @@ def test_checks_that_fail_at_the_start_freeze_nothing(tmp_path, put_in):
 )
 def test_another_protocol_is_not_frozen(tmp_path, put_in, override, section):
     with pytest.raises(ValueError, match=f"^write=true freezes .*, and {section} differ from it"):
-        calibrate(composed("write=true", override, name="calibrate"), tmp_path / "results")
+        calibrate(
+            composed("write=true", override, name="calibrate_simulator"), tmp_path / "results"
+        )
     assert not (tmp_path / "results").exists()
     assert not put_in.path.exists()
 

@@ -1,4 +1,4 @@
-"""Calibrate the simulated hand: ``python -m tactslip_torch calibrate``.
+"""Calibrate the simulated hand: ``tactslip calibrate-simulator``.
 
 Three parameters move together along one line of difficulty (``simulation.scene``) until the
 test accuracy on seen materials is the published one, but no further than the signal checks hold.
@@ -179,7 +179,7 @@ def calibrate(config: DictConfig, folder: Path) -> dict[str, Any]:
     """Search the line of difficulty; write every point that was tried and the one that is kept.
 
     Args:
-        config: composed from ``conf/calibrate.yaml``.
+        config: composed from ``conf/calibrate_simulator.yaml``.
         folder: where results go.
 
     Returns:
@@ -242,14 +242,14 @@ def _check(config: DictConfig) -> None:
         check_number(name, config[name], whole=True)
     if config.write and (changed := _changed_sections(config)):
         raise ValueError(
-            f"write=true freezes what the protocol of conf/calibrate.yaml finds, and "
+            f"write=true freezes what the protocol of conf/calibrate_simulator.yaml finds, and "
             f"{', '.join(changed)} differ from it; leave those overrides out, or write=true"
         )
 
 
 def _changed_sections(config: DictConfig) -> list[str]:
-    """Groups of the configuration that are not as ``conf/calibrate.yaml`` composes them."""
-    default: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "calibrate.yaml"))
+    """Groups of the configuration that are not as ``calibrate_simulator.yaml`` composes them."""
+    default: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "calibrate_simulator.yaml"))
     options = {k: v for entry in default["defaults"] if entry != "_self_" for k, v in entry.items()}
     groups: Any = {k: OmegaConf.load(conf_dir() / k / f"{v}.yaml") for k, v in options.items()}
     whole: Any = OmegaConf.to_container(OmegaConf.merge(groups, default))
@@ -267,7 +267,7 @@ def _content(
     return {
         "simulated": True,
         "provenance": (
-            "python -m tactslip_torch calibrate: test accuracy on simulated seen materials held "
+            "tactslip calibrate-simulator: test accuracy on simulated seen materials held "
             "against the published one, and the signal checks; nothing else"
         ),
         "values": kept["parameters"],
@@ -321,7 +321,7 @@ def _failed(point: Point) -> list[str]:
     return [check["name"] for check in point["signal_checks"] if not check["holds"]]
 
 
-main = entry_point("calibrate", calibrate)
+main = entry_point("calibrate_simulator", calibrate)
 
 if __name__ == "__main__":
     main()
