@@ -13,7 +13,11 @@ HEAVY = "lightning hydra omegaconf matplotlib onnx onnxruntime sklearn scipy ten
 
 
 def test_importing_the_package_loads_little() -> None:
-    code = f"import sys, tactslip_torch; print(*set('{HEAVY}'.split()) & set(sys.modules))"
+    code = (
+        "import sys, tactslip_torch as t; assert 'torch' not in sys.modules; "
+        "t.FeaturePool, t.SlipDetector, t.StreamingDetector, t.SufficientStats; "
+        f"print(*set('{HEAVY}'.split()) & set(sys.modules))"
+    )
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (loaded.returncode, loaded.stdout, loaded.stderr) == (0, "\n", "")
 
