@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from tactslip_torch.onset.decisions import AlarmSettings as AlarmSettings
     from tactslip_torch.onset.streaming import StreamingDetector as StreamingDetector
     from tactslip_torch.runtime import __version__ as __version__
-    from tactslip_torch.simulation import Scene as Scene
-    from tactslip_torch.simulation import simulate as simulate
+    from tactslip_torch.simulation.scene import Scene as Scene
+    from tactslip_torch.simulation.simulate import simulate as simulate
 
 _MODULES = {
     "AlarmSettings": "onset.decisions",
