@@ -31,12 +31,13 @@ def batch_of(
     recording=None,
     roles=None,
     released_s=(),
+    slip_s=(),
     **rule,
 ):
     """What the learner sees of a recording without disturbances, features left out."""
     rule = LabelRule(**rule)
     slides = tuple(zip(onsets, ends, strict=True))
-    bins = label_bins(rule, onsets, slides, 12.0, RATE_HZ, stretches)
+    bins = label_bins(rule, onsets, slides, 12.0, RATE_HZ, stretches, slip_s)
     num = len(bins.starts)
     speeds = (20.0, 40.0, 60.0)
     return RecordingFeatures(
@@ -189,6 +190,18 @@ def test_a_hop_longer_than_a_bin_watches_no_time_twice():
     batch = batch_of(stretches=((4.0, 4.25), (4.3, 4.6)), hop_ms=150.0)
     events = events_of(batch, batch.is_slip)
     assert events["first_transition"].quiet_s < 12.0
+
+
+def test_stretches_of_slip_and_of_none_are_watched_in_the_order_of_time():
+    batch = batch_of((9.0,), (10.0,), ((1.0, 3.0), (5.0, 7.0)), slip_s=((0.5, 1.0), (3.0, 5.0)))
+    in_stretches = batch.ends_s[batch.stroke < 0]
+    assert (in_stretches.diff() < 0).any()  # labels have them by class
+    for events in events_of(batch, batch.is_slip).values():
+        assert seen(events) == [("found", 1)]
+        # each slip of which no onset is known is one alarm, and the second one ends at 5 s
+        assert len(events.false_alarms_s) == 2
+        # 0.5 to 7 s are unbroken, before the onset 1.01 s; the last 0.2 s of it are early
+        assert events.quiet_s == pytest.approx(6.5 + 1.01 - LATENCY.look_ahead_s - 0.2)
 
 
 def test_where_no_decision_speaks_for_slip_there_is_no_first():

@@ -158,13 +158,15 @@ def event_numbers(
 def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Watched:
     """A recording as the detector saw it through an alarm of k of the last n decisions.
 
-    It starts anew with every stroke and every unbroken stretch of bins of no stroke. Watched is
-    from one hop before the first decision of such a stretch to the last one.
+    It starts anew with every stroke and every unbroken stretch of bins of no stroke, whatever order
+    their labels put them in. Watched is from one hop before the first decision of such a stretch to
+    the last one.
     """
     bins, times = part.bins, part.bins.times
-    available_s = (bins.ends_s + latency.look_ahead_s).numpy()
-    says_slip, stroke = part.says_slip.numpy(), bins.stroke.numpy()
-    is_apart = np.diff(bins.ends_s.numpy()) > bins.hop_s + 1e-6
+    order = np.lexsort((bins.ends_s.numpy(), bins.stroke.numpy() < 0))
+    available_s = (bins.ends_s + latency.look_ahead_s).numpy()[order]
+    says_slip, stroke = part.says_slip.numpy()[order], bins.stroke.numpy()[order]
+    is_apart = np.diff(available_s) > bins.hop_s + 1e-6
     is_new = (np.diff(stroke) != 0) | ((stroke[1:] < 0) & is_apart)
     stretches = np.split(np.arange(len(stroke)), np.flatnonzero(is_new) + 1)
     alarms: list[tuple[float, float]] = []
