@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tactslip_torch.data.recording import Recording as Recording
+    from tactslip_torch.estimators import SlipClassifier as SlipClassifier
+    from tactslip_torch.estimators import TactileFeatures as TactileFeatures
     from tactslip_torch.features.names import FeatureName as FeatureName
     from tactslip_torch.features.pool import FeaturePool as FeaturePool
     from tactslip_torch.hand import Channel as Channel
@@ -27,9 +29,11 @@ _MODULES = {
     "Prediction": "model.missing_channels",
     "Recording": "data.recording",
     "Scene": "simulation",
+    "SlipClassifier": "estimators",
     "SlipDetector": "model.detector",
     "StreamingDetector": "onset.streaming",
     "SufficientStats": "model.moments",
+    "TactileFeatures": "estimators",
     "__version__": "runtime",
     "simulate": "simulation",
 }
@@ -44,9 +48,11 @@ __all__ = [
     "Prediction",
     "Recording",
     "Scene",
+    "SlipClassifier",
     "SlipDetector",
     "StreamingDetector",
     "SufficientStats",
+    "TactileFeatures",
     "simulate",
 ]
 

@@ -261,7 +261,7 @@ def candidates(recipe: Recipe, num_bins: int) -> list[Structure]:
 
 def choose_model(
     recipe: Recipe,
-    pool: FeaturePool,
+    pool: FeaturePool | None,
     sample: SampledBins,
     allowed: Tensor | None = None,
     *,
@@ -272,7 +272,7 @@ def choose_model(
 
     Args:
         recipe: with ``validation="nested"``.
-        pool: the features of the sampled bins.
+        pool: the features of the sampled bins; ``None`` for others, which are not pooled.
         sample: of the training bins.
         allowed: which features may be used, ``[F]``, bool; by default those the recipe allows.
         is_nested: whether to evaluate the choice itself by leaving out two groups.
@@ -321,14 +321,14 @@ def choose_model(
 
 def fitted_selection(
     recipe: Recipe,
-    pool: FeaturePool,
+    pool: FeaturePool | None,
     sample: SampledBins,
     structure: Structure,
     allowed: Tensor | None = None,
 ) -> FeatureSelection:
     """Compression, ranking and scaling of a structure, learned from a sample of training bins.
 
-    ``allowed`` as in ``choose_model``.
+    ``pool`` and ``allowed`` as in ``choose_model``.
     """
     bins = _Bins(recipe, pool, sample, allowed)
     columns = _Columns(bins, torch.ones_like(bins.is_slip), bins.is_slip | True, structure.parts)
@@ -336,7 +336,7 @@ def fitted_selection(
     names = columns.names(structure.parts)
     names = [names[place] for place in places.tolist()]
     scaler, layer = columns.scaler(structure, places), columns.pooling
-    index = {name: place for place, name in enumerate(pool.names)}
+    index = {name: place for place, name in enumerate(_names_of(pool, sample))}
     if layer is None or not any(name.is_pooled for name in names):
         return FeatureSelection(tuple(index[name] for name in names), scaler)
     if structure.use == "both":
@@ -372,18 +372,24 @@ def group_scores(columns: Tensor, is_slip: Tensor, groups: Tensor) -> Tensor:
     return torch.where(square > 0, found, 0.0)
 
 
+def _names_of(pool: FeaturePool | None, sample: SampledBins) -> Sequence[Any]:
+    """Names of the features of sampled bins; without a pool their places."""
+    return range(sample.features.shape[1]) if pool is None else pool.names
+
+
 class _Bins:
     """The sampled bins of the features that may be used, in their validation groups."""
 
     def __init__(
-        self, recipe: Recipe, pool: FeaturePool, sample: SampledBins, allowed: Tensor | None
+        self, recipe: Recipe, pool: FeaturePool | None, sample: SampledBins, allowed: Tensor | None
     ) -> None:
-        self.recipe, self.hand = recipe, pool.hand
+        self.recipe, self.hand = recipe, None if pool is None else pool.hand
         self.is_slip, self.weights = sample.is_slip, sample_weight(recipe, sample)
         self.groups, self.names = sample_groups(sample)
-        allowed = recipe.allowed(pool) if allowed is None else allowed
-        places = torch.arange(len(pool.names)) if allowed is None else allowed.nonzero().flatten()
-        self.feature_names = [pool.names[place] for place in places.tolist()]
+        allowed = recipe.allowed(pool) if allowed is None and pool is not None else allowed
+        names = _names_of(pool, sample)
+        places = torch.arange(len(names)) if allowed is None else allowed.nonzero().flatten()
+        self.feature_names = [names[place] for place in places.tolist()]
         self.features = sample.features[:, places]
         self.is_kept = torch.ones_like(sample.is_slip)
         self.scores: dict[frozenset[int], dict[int, dict[Candidate, Tensor]]] = {}
@@ -464,6 +470,7 @@ class _Columns:
         if "pooled" in parts:
             setting = bins.recipe.pooling
             assert setting is not None  # recipe
+            assert bins.hand is not None  # plan_detector
             own = features[self.train]
             layer = ChannelPooling.fit(bins.hand, bins.feature_names, own, setting)
             place = {name: index for index, name in enumerate(bins.feature_names)}
@@ -754,7 +761,7 @@ class Plan:
 
 def plan_detector(
     recipe: Recipe,
-    statistics: TrainingStatistics,
+    statistics: TrainingStatistics | SampledBins,
     pool: FeaturePool | None = None,
     selection: FeatureSelection | None = None,
     *,
@@ -769,8 +776,9 @@ def plan_detector(
 
     Args:
         recipe: what to choose from, and how.
-        statistics: statistics of the training bins.
+        statistics: statistics of the training bins; for a nested validation the bins serve.
         pool: of the features; only without it may every feature be selected whatever its name.
+            Features that are pooled over channels need it.
         selection: features that were ranked and scaled elsewhere.
         is_settled: whether to validate a single choice too.
         is_nested: whether to evaluate a nested choice itself.
@@ -779,21 +787,21 @@ def plan_detector(
     Raises:
         ValueError: if a class is absent, a solve fails, or the recipe needs the pool.
     """
-    sample = statistics.sample.bins()
+    sample = statistics if isinstance(statistics, SampledBins) else statistics.sample.bins()
     allowed = None if pool is None else recipe.allowed(pool)
     fractions, bin_weight = class_fractions(recipe, sample), 1.0
     num_bins = number_of_bins(recipe, sample)
     nested, most_gaussian = None, math.inf
     if recipe.validation == "nested" and selection is None:
-        if pool is None:
-            raise ValueError("recipe.validation=nested needs the pool; hand it over as pool=")
+        if pool is None and set(recipe.uses) != {"channel"}:
+            raise ValueError("recipe.use=pooled needs the pool of features; hand it over as pool=")
         most_gaussian = MOST_GAUSSIAN
         if len(sample_groups(sample)[1]) > 1:
             choice = choose_model(recipe, pool, sample, is_nested=is_nested, show=show)
             structure, penalty = choice.structure, choice.penalty
             rows, nested = choice.rows, choice.nested
             if choice.edge:
-                log.warning("%s", choice.edge)
+                log.info("%s", choice.edge)
         else:
             penalties = recipe.penalties_ascending
             structure, penalty = candidates(recipe, num_bins)[0], penalties[len(penalties) // 2]
@@ -802,7 +810,10 @@ def plan_detector(
         kernel: Kernel = structure.kernel
         selection = fitted_selection(recipe, pool, sample, structure)
     else:
-        selection = selection or select_features(recipe, statistics, allowed)
+        if selection is None:
+            if isinstance(statistics, SampledBins):
+                raise ValueError("recipe.validation=held needs statistics of all training bins")
+            selection = select_features(recipe, statistics, allowed)
         rows, size, kernel, penalty = choose_held(
             recipe, selection, sample, is_settled=is_settled, show=show
         )
