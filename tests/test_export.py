@@ -9,12 +9,11 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from small_detector import HAND, alarming_detector, certified, raw_bins, small_detector
+from small_detector import HAND, alarming_detector, certified, small_detector
 
 from tactslip_torch.commands import export as export_command
 from tactslip_torch.deploy import export
 from tactslip_torch.deploy.bins import RawBin
-from tactslip_torch.deploy.check import simulated_stream
 from tactslip_torch.deploy.export import (
     CERTIFICATE_FORMAT,
     export_detector,
@@ -25,7 +24,6 @@ from tactslip_torch.deploy.export import (
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import KEY, AlarmSettings
 from tactslip_torch.onset.rules import Cusum
-from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.training import experiment
 
 pytestmark = pytest.mark.onnx
@@ -62,20 +60,6 @@ def test_an_export_leaves_its_files_and_nothing_else(exported):
     assert sorted(path.name for path in exported[0].parent.iterdir()) == names
     for path in exported:
         onnx.checker.check_model(onnx.load(path), full_check=True)
-
-
-def test_the_files_score_bins_and_raise_alarms_as_the_detector(detector, exported):
-    bins = raw_bins(7).float()
-    raw = RawBin.of(detector)
-    start = detector.context_before - raw.before
-    got = run(exported[0], samples=bins[..., start : start + raw.length].numpy())
-    expected = detector.predict_raw(bins.double()).score
-    np.testing.assert_allclose(got["score"], expected, atol=1e-3 * float(expected.std()))
-    samples = simulated_stream(HAND, 2000.0, torch.float32).T.contiguous()
-    made = StreamingDetector(detector, dtype=torch.float64).push(samples)
-    got = run(exported[1], samples=samples.numpy(), **BEGIN)
-    assert made.is_alarm.any()
-    assert np.array_equal(got["alarm"], made.is_alarm)
 
 
 def test_a_model_says_of_itself_what_its_sidecar_says(detector, exported):

@@ -116,14 +116,6 @@ def test_the_hosts_agree_about_every_decision(room, shot):
         assert_same(each, expected)
 
 
-def test_bins_are_scored_a_line_each(room):
-    lines = [
-        json.loads(each) for each in run(room / "python", command("python", "score")).splitlines()
-    ]
-    assert len(lines) == (len(slipping_stream()) - 110) // 100 + 1  # a bin and its context
-    assert {tuple(line) for line in lines} == {("start_s", "score", "valid", "probability")}
-
-
 def test_the_page_is_served_with_what_was_given(room):
     words = ["bash", "-c", f"exec {command('web', 'serve')}"]
     with subprocess.Popen(

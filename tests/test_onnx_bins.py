@@ -117,16 +117,6 @@ def test_every_head_and_scaler_comes_through(variant, precision):
     assert_scores(detector, precision, noise(24))
 
 
-def test_features_whose_range_is_a_point_weigh_nothing():
-    detector = small_detector()
-    low, high = detector.scaler.minimum.clone(), detector.scaler.maximum.clone()
-    high[3] = low[3]
-    of_signal = (detector.pool, detector.channel_filter, detector.selected)
-    assert_scores(
-        SlipDetector(*of_signal, FeatureScaler(low, high), detector.head), "float64", raw_bins(30)
-    )
-
-
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_a_sensor_that_fails_is_replaced_as_in_torch(precision):
     detector = small_detector()

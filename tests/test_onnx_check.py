@@ -18,10 +18,8 @@ from tactslip_torch.deploy.check import (
     check_bins,
     check_model,
     check_stream,
-    degenerate_bins,
     runner,
     session_of,
-    simulated_bins,
     simulated_stream,
 )
 from tactslip_torch.deploy.stream import Timing, stream_graph
@@ -316,26 +314,3 @@ def test_a_model_that_cannot_be_run_is_told_in_one_line():
 
 
 # Signals ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", DEGENERATE)
-def test_degenerate_bins_are_what_they_are_called(kind):
-    bins = degenerate_bins(HAND, kind, 8, 110, torch.float32)
-    assert (bins.shape, bins.dtype) == ((8, 4, 110), torch.float32)
-    bad = (~bins.isfinite()).flatten(1).sum(1)
-    wanted = {"nan": 1, "inf": 1, "-inf": 1, "all nan": 440}.get(kind, 0)
-    assert bad.tolist() == [wanted] * 8
-    if kind == "step":
-        assert bins.unique().tolist() == [0.0, 5.0]
-
-
-def test_a_simulated_slip_is_of_each_channel_its_kind_and_fills_the_bins():
-    stream = simulated_stream(HAND, 2000.0, torch.float64)
-    assert stream.shape[0] == 4
-    assert 2990 <= stream.shape[1] <= 3000
-    assert (stream[:2].std(1) > 0).all()
-    bins = simulated_bins(HAND, 2000.0, 56, 110, torch.float64)
-    assert torch.equal(bins[0], stream[:, :110])
-    assert torch.equal(bins[-1], stream[:, -110:])
-    slow = simulated_bins(HAND, 20.0, 56, 100, torch.float64)  # a rate at which it were 30 samples
-    assert len(slow.unique(dim=0)) == 56

@@ -1,6 +1,5 @@
 """The graph of a stream against ``StreamingDetector``, push by push; rules, latch, calibration."""
 
-import math
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -16,20 +15,16 @@ from streams import detector_of, onset_of, signal
 
 from tactslip_torch.deploy.check import runner, session_of
 from tactslip_torch.deploy.stream import (
-    LATCH_START,
     Timing,
-    latched,
     memory_size,
     onset_scores,
-    rule_start,
-    statistic_of,
     stream_graph,
 )
 from tactslip_torch.deploy.value import BOOL, F32, F64, I64, Graph
 from tactslip_torch.model.calibration import LARGEST_LLR, Isotonic, Platt, probability
 from tactslip_torch.onset.decisions import AlarmSettings, score_stream
 from tactslip_torch.onset.evidence import OnsetStream
-from tactslip_torch.onset.rules import Cusum, KOfN, Latch, latch
+from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -177,14 +172,6 @@ def test_fast_evidence_in_any_cut_is_that_of_the_detector(
     assert_same_stream(samples[:, :num_samples], cuts, precision, **options)
 
 
-@pytest.mark.parametrize("precision", CLOSE)
-def test_fast_evidence_raises_the_same_alarms_in_small_pieces(precision):
-    cuts = [*range(150), *range(150, 6000, 7)]
-    samples = signal(6000, 6)
-    samples[1, 3000:3005] = torch.nan
-    assert assert_same_stream(samples, cuts, precision, onset=ONSET) >= 5
-
-
 @pytest.mark.parametrize("kinds", ["F", "FF", "GF", "GGF"])
 def test_onset_scores_of_any_hand_and_mask(kinds):
     hand = some_hand(kinds)
@@ -238,15 +225,6 @@ def test_a_hole_at_the_start_reaches_as_far_as_in_the_detector(align, channel):
         samples = signal(300, 3)
         samples[channel, place] = torch.nan
         assert_same_stream(samples, [60, 140], align=align, hop=7)
-
-
-def test_a_decision_that_nothing_reaches_says_nothing():
-    samples = signal(900, 5)
-    samples[:, 400:410] = torch.nan
-    detector, settings, _ = watching()
-    llr = StreamingDetector(detector, settings, dtype=torch.float64).push(samples.T).llr
-    assert (llr == 0).any()
-    assert_same_stream(samples)
 
 
 def test_a_threshold_that_is_given_is_that_of_onset_scores():
@@ -336,81 +314,3 @@ def test_scores_become_the_same_ratios_and_probabilities(calibration, dtype, dat
 
 
 # Rules and latch -------------------------------------------------------------------------------
-
-
-@cache
-def ruling(rule, dtype):
-    graph = Graph()
-    llr, memory = graph.input("llr", dtype, ("k",)), graph.input("memory", F64, ("m",))
-    statistic, after = statistic_of(rule, llr, memory)
-    graph.output("statistic", statistic, ("k",))
-    graph.output("after", after, (len(rule_start(rule)),))
-    return runner(session_of(graph.model()))
-
-
-@pytest.mark.parametrize("dtype", [F32, F64], ids=str)
-@pytest.mark.parametrize(
-    "rule",
-    [KOfN(1, 1), KOfN(1, 4), KOfN(2, 3), KOfN(5, 5), Cusum(0.5, 0.2, 3.0), Cusum(-0.1, 1 - 1e-9)],
-    ids=str,
-)
-@given(data=st.data())
-def test_rules_make_the_same_statistic_in_any_pieces(rule, dtype, data):
-    llr = data.draw(scores_of(dtype)).clip(-LARGEST_LLR, LARGEST_LLR)
-    cuts = data.draw(st.lists(st.integers(0, len(llr)), max_size=4))
-    expected, _ = rule.scan(torch.from_numpy(llr), rule.start(torch.from_numpy(llr)[0]))
-    memory, statistics = np.array(rule_start(rule)), []
-    for piece in np.split(llr, sorted(cuts)):
-        if len(piece):
-            made = ruling(rule, dtype)({"llr": piece, "memory": memory})
-            statistics.append(made["statistic"])
-            memory = made["after"]
-    found = np.concatenate(statistics)
-    assert found.dtype == dtype
-    np.testing.assert_array_equal(found, expected.numpy())
-
-
-@cache
-def latching(dtype, rearm, refractory):
-    graph = Graph()
-    statistic, number = graph.input("statistic", dtype, ("k",)), graph.input("number", F64, ("k",))
-    level, memory = graph.input("level", dtype, (1,)), graph.input("memory", F64, (3,))
-    made = latched(statistic, level, number, memory, rearm=rearm, refractory=refractory)
-    graph.output("alarms", made.alarm, ("k",))
-    graph.output("standing", made.on, ("k",))
-    graph.output("memory_after", made.memory, (3,))
-    return runner(session_of(graph.model()))
-
-
-@pytest.mark.parametrize("dtype", [F32, F64], ids=str)
-@given(
-    data=st.data(),
-    rearm=st.sampled_from([0, 1, 3]),
-    refractory=st.sampled_from([0, 1, 4, 9]),
-    threshold=st.sampled_from([0.5, 0.1, 0.8, math.inf, -math.inf]),
-    first=st.sampled_from([0, 10**12]),
-)
-def test_the_latch_raises_the_same_alarms_in_any_pieces(
-    dtype, rearm, refractory, threshold, first, data
-):
-    level = np.array([threshold], dtype)
-    below = np.nextafter(level[0], -dtype.type(np.inf))
-    exact = [float(level[0]), float(below), 0.0, 1.0]
-    values = st.sampled_from([value for value in exact if math.isfinite(value)])
-    statistic = data.draw(arrays(dtype, st.integers(1, 40), elements=values))
-    cuts = data.draw(st.lists(st.integers(0, len(statistic)), max_size=5))
-    state, memory, number = Latch(), np.array(LATCH_START), first
-    for piece in np.split(statistic, sorted(cuts)):
-        if not len(piece):
-            continue
-        alarm, on, state = latch(
-            piece.tolist(), float(level[0]), rearm=rearm, refractory=refractory, state=state
-        )
-        numbers = number + np.arange(len(piece), dtype=np.float64)
-        feeds = {"statistic": piece, "level": level, "memory": memory, "number": numbers}
-        found = latching(dtype, rearm, refractory)(feeds)
-        np.testing.assert_array_equal(found["alarms"], alarm)
-        np.testing.assert_array_equal(found["standing"], on)
-        memory = found["memory_after"]
-        assert memory[0] == float(state.is_on)
-        number += len(piece)

@@ -110,22 +110,6 @@ def test_values_mean_what_tensors_mean(function):
     np.testing.assert_allclose(found, expected, rtol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("function", "expected"),
-    [
-        (lambda x: x.slice(-2, 6, 0), X[-2:]),
-        (lambda x: x.reshape(2, 3).transpose(1, 0), X.reshape(2, 3).T),
-        (lambda x: x.reshape(2, 3) @ np.eye(3)[:, :2], X.reshape(2, 3)[:, :2]),
-        (lambda x: x.reshape(2, 3).length(1), [3]),
-    ],
-)
-def test_what_tensors_have_not(function, expected):
-    expected = np.asarray(expected)
-    found = applied(function, X, num_axes=expected.ndim)
-    assert found.dtype == expected.dtype
-    np.testing.assert_allclose(found, expected, rtol=1e-14)
-
-
 def test_what_values_do_not_know_is_refused():
     value = Graph().input("x", F64, (2, 2))
     with pytest.raises(TypeError, match="median of torch is not known to values of a graph"):
@@ -211,59 +195,3 @@ def test_if_makes_values_one_way_or_the_other(wanted):
     found = run(graph, x=X, flag=np.array([wanted]))
     np.testing.assert_array_equal(found["y"], X + 1 if wanted else X)
     np.testing.assert_array_equal(found["z"], X > 0 if wanted else [True])
-
-
-def test_if_hands_one_value_out_twice():
-    graph = Graph()
-    x, flag = graph.input("x", F64, ("k",)), graph.input("flag", BOOL, (1,))
-
-    def twice():
-        value = x * 2.0
-        return [value, value]
-
-    made = graph.if_(flag, twice, lambda: [x, x])
-    for name, value in zip("yz", made, strict=True):
-        graph.output(name, value, ("k",))
-    for wanted in (True, False):
-        found = run(graph, x=X, flag=np.array([wanted]))
-        for name in "yz":
-            np.testing.assert_array_equal(found[name], 2 * X if wanted else X)
-
-
-def test_bodies_within_bodies_see_what_is_around_them():
-    graph = Graph()
-    x, flag = graph.input("x", F64, ("k",)), graph.input("flag", BOOL, (1,))
-
-    def outer():
-        shifted = x + 1.0
-        inner = graph.if_(flag, lambda: [shifted * 2.0], lambda: [x])
-        return [inner[0] + 1.0]
-
-    graph.output("y", graph.if_(flag, outer, lambda: [x])[0], ("k",))
-    np.testing.assert_array_equal(run(graph, x=X, flag=np.array([True]))["y"], (X + 1) * 2 + 1)
-
-
-@pytest.mark.parametrize("num", [1, 2, 50])
-def test_scan_walks_row_by_row(num):
-    graph = Graph()
-    rows, start = graph.input("rows", F64, ("k",)), graph.input("start", F64, ())
-
-    def leaky(state, taken):
-        total = state[0] * 0.5 + taken[0]
-        return [total, state[1] + 1.0], [total, state[1] * taken[1]]
-
-    count = graph.constant(0.0, F64)
-    (total, number), (totals, products) = graph.scan(leaky, [start, count], [rows, rows])
-    graph.output("total", total, ())
-    graph.output("number", number, ())
-    graph.output("totals", totals, ("k",))
-    graph.output("products", products, ("k",))
-    given = np.random.default_rng(num).standard_normal(num)
-    found = run(graph, rows=given, start=np.array(3.0))
-    value, expected = 3.0, []
-    for row in given:
-        value = value * 0.5 + row
-        expected.append(value)
-    np.testing.assert_array_equal(found["totals"], expected)
-    np.testing.assert_array_equal(found["products"], np.arange(num) * given)
-    assert (found["total"], found["number"]) == (value, num)
