@@ -122,6 +122,13 @@ class HandLayout:
     def __len__(self) -> int:
         return len(self.channels)
 
+    def __repr__(self) -> str:
+        kinds = []
+        for kind in self.kinds:
+            own = self.indices(kind)
+            kinds.append(f"{len(own)} {kind} ({self.channels[own[0]].adapting})")
+        return f"HandLayout({len(self)} channels: {', '.join(kinds)})"
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Channel names in file order."""

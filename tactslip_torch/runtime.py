@@ -196,6 +196,17 @@ def are_unchanged(tensors: Sequence[Tensor], stamps: Sequence[tuple[Tensor, int 
     )
 
 
+def check_tensor(x: Any) -> None:
+    """Refuse what is no tensor, such as a NumPy array.
+
+    Raises:
+        TypeError: if it is none.
+    """
+    if not isinstance(x, Tensor):
+        kind = f"{type(x).__module__}.{type(x).__name__}".removeprefix("builtins.")
+        raise TypeError(f"expected a torch.Tensor, got {kind}; use torch.as_tensor(samples)")
+
+
 def check_number(name: str, value: Any, *, least: float | None = None, whole: bool = False) -> None:
     """Refuse what is no number, is not positive or not at least ``least``, or is not whole.
 

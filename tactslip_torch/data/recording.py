@@ -111,6 +111,16 @@ class Recording:
                     f"the onset at {onset:g} s must lie between its releases, {first:g}-{last:g} s"
                 )
 
+    def __repr__(self) -> str:
+        origin = ", simulated" * bool(self.provenance.get("simulated"))
+        num = len(self.onsets_s)
+        slips = f"{num} slip{'s' * (num != 1)}" if num else "no slip marked"
+        return (
+            f"Recording({len(self.samples)} channels, {self.duration_s:.2f} s at "
+            f"{self.sample_rate_hz:g} Hz, in {self.units}, material {self.material}, "
+            f"{slips}{origin})"
+        )
+
     @property
     def duration_s(self) -> float:
         """Length in seconds."""

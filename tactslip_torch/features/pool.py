@@ -28,7 +28,7 @@ from tactslip_torch.features.names import pool_names
 from tactslip_torch.features.ops import bounded_gradient, saturating
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.native import BackendName
-from tactslip_torch.runtime import for_each, is_concrete, is_traced
+from tactslip_torch.runtime import check_tensor, for_each, is_concrete, is_traced
 from tactslip_torch.signals.spectrum import SpectrumMethod, spectrum_matrix
 from tactslip_torch.signals.wavelet import (
     Wavelet,
@@ -257,6 +257,14 @@ class FeaturePool(nn.Module):
             frequency_hz=self.maps.frequency_hz.numpy(),
         )
 
+    def __repr__(self) -> str:
+        wavelet = self.wavelet if isinstance(self.wavelet, str) else "own wavelet"
+        return (
+            f"FeaturePool({len(self.names)} features of {len(self.hand)} channels, bins of "
+            f"{self.bin_samples} samples at {self.sample_rate_hz:g} Hz, {wavelet} to level "
+            f"{self.level}, {self.backend} backend)"
+        )
+
     def __getstate__(self) -> dict[str, Any]:
         """Without engines, which hold addresses, and banks, which are soon made."""
         return {**self.__dict__, "_engines": {}, "_banks": {}}
@@ -330,6 +338,7 @@ class FeaturePool(nn.Module):
         Raises:
             ValueError: as ``forward``.
         """
+        check_tensor(bins)
         if bins.ndim < 2 or bins.shape[-2:] != (len(self.hand), self.bin_samples):
             raise ValueError(
                 f"expected bins [*, {len(self.hand)}, {self.bin_samples}] (channels, samples), "

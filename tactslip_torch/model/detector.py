@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from tactslip_torch.features.names import FeatureName
@@ -18,6 +19,8 @@ from tactslip_torch.features.ops import is_nowhere, saturating
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.calibration import Calibration, calibration_from_dict, widened_llr
+from tactslip_torch.model.calibration import probability as stated
 from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_from_dict
 from tactslip_torch.model.missing_channels import (
     ChannelMask,
@@ -111,6 +114,32 @@ class SlipDetector(nn.Module):
         indices = {"channel": channels, "needed": self.extractor.plan.channels}
         for name, index in indices.items():
             self.register_buffer(f"{name}_index", torch.tensor(index), persistent=False)
+
+    def __repr__(self) -> str:
+        pool, info, degree = self.pool, self.info, "kernel"
+        if isinstance(self.head, QuadraticForm):
+            degree = "linear" if self.head.is_linear else "quadratic"
+        simulated = info.get("simulated")
+        origin = f", trained on {'simulated' if simulated else 'real'} recordings"
+        said = "has an alarm" if "alarm" in info else "no alarm set"
+        return (
+            f"SlipDetector({len(pool.hand)} channels, bins of {pool.bin_samples} samples at "
+            f"{pool.sample_rate_hz:g} Hz, {len(self.selected_names)} columns, {degree} machine"
+            f"{origin * (simulated is not None)}, {said}, {self.extractor.backend} backend)"
+        )
+
+    @property
+    def calibration(self) -> tuple[Calibration, float] | None:
+        """What makes a probability of a score, and the share of slip that it is stated for.
+
+        That of the alarm in ``info``; else that of the held-out scores its training chose by, at
+        equal shares; else None.
+        """
+        if alarm := self.info.get("alarm"):
+            return calibration_from_dict(alarm["calibration"]), float(alarm["slip_share"])
+        if plain := self.info.get("calibration"):
+            return calibration_from_dict(plain), 0.5
+        return None
 
     @property
     def selected_names(self) -> tuple[FeatureName, ...]:
@@ -209,6 +238,33 @@ class SlipDetector(nn.Module):
         """
         self._check_raw(samples)
         return self._predict_in_parts(samples, True, nonfinite, given, masked_channels)
+
+    def probability(self, samples: Tensor | NDArray[Any]) -> Tensor:
+        """How probable slip is, by ``calibration``: of filtered bins, or of raw ones.
+
+        Channels with NaN are left out, as ``predict`` does.
+
+        Shape:
+            - samples: ``[*, C, n]``, filtered, or ``[*, C, context_before + n + context_after]``
+            - output: ``[*]``
+
+        Raises:
+            ValueError: if scores were not calibrated, or as ``predict_raw``.
+        """
+        if (known := self.calibration) is None:
+            raise ValueError(
+                "this detector has no calibration, as its training chose nothing; train with "
+                "several recipe.penalties, or use the score"
+            )
+        x = torch.as_tensor(samples)
+        is_filtered = x.ndim > 0 and x.shape[-1] == self.pool.bin_samples
+        found = self.predict(x) if is_filtered else self.predict_raw(x)
+        return stated(widened_llr(known[0], found.score, found.variance), known[1])
+
+    def predict_proba(self, samples: Tensor | NDArray[Any]) -> Tensor:
+        """Probabilities of non-slip and slip, ``[*, 2]``; otherwise as ``probability``."""
+        slip = self.probability(samples)
+        return torch.stack([1 - slip, slip], -1)
 
     def validity(self, bins: Tensor) -> Tensor:
         """Whether every channel in use can be trusted (``FeaturePool.validity``), as ``predict``.

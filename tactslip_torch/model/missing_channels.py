@@ -61,6 +61,14 @@ class Prediction(NamedTuple):
     is_missing: Tensor
     variance: Tensor
 
+    def __repr__(self) -> str:
+        num, slip = self.score.numel(), int((self.score >= 0).sum())
+        lost = int(self.is_missing.any(-1).sum())
+        return (
+            f"Prediction({num} bins: {slip} slip, {num - slip} non-slip; "
+            f"{int(self.is_valid.sum())} valid, {lost} with missing channels)"
+        )
+
 
 Said = TypeVar("Said", Tensor, Prediction)
 

@@ -75,6 +75,13 @@ class SufficientStats:
         self.count = torch.zeros(2, dtype=torch.int64)
         self.seen_batches = SeenBatches()
 
+    def __repr__(self) -> str:
+        quiet, slip = self.count.tolist()
+        return (
+            f"SufficientStats({len(self.seen_batches)} batches, {slip} slip and {quiet} non-slip "
+            f"bins of {self.num_features} features, degree {self.degree})"
+        )
+
     @property
     def weight(self) -> Tensor:
         """``[2]``, float64: sum of the weights of bins."""

@@ -90,6 +90,15 @@ class AlarmSettings:
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
 
+    def __repr__(self) -> str:
+        rate = self.target_per_hour
+        aim = "" if rate is None else f" for {rate:g} false alarms an hour"
+        onset = "" if self.onset is None else f", onset classifier at {self.onset.threshold:.4g}"
+        return (
+            f"AlarmSettings({self.rule} at {self.threshold:.4g}{aim}{onset}, a decision every "
+            f"{self.decision_samples} samples)"
+        )
+
     @property
     def decision_samples(self) -> int:
         """Distance of two decisions: that of the onset classifier, if there is one."""
@@ -145,15 +154,11 @@ class AlarmSettings:
 def calibration_of(detector: SlipDetector) -> tuple[Calibration, float] | None:
     """What makes a probability of a detector's score, and the share of slip it is stated for.
 
-    That of its alarm settings; else that of the held-out scores its training chose by, at equal
-    shares; else None.
+    As ``SlipDetector.calibration``, whose alarm settings are checked.
     """
     if KEY in detector.info:
-        settings = AlarmSettings.of(detector)
-        return settings.calibration, settings.slip_share
-    if plain := detector.info.get("calibration"):
-        return calibration_from_dict(plain), 0.5
-    return None
+        AlarmSettings.of(detector)
+    return detector.calibration
 
 
 Array = NDArray[Any]

@@ -96,6 +96,13 @@ class StreamingDetector:
         self._decider = Decider(self.settings, *parts)
         self._start()
 
+    def __repr__(self) -> str:
+        seen_s = self._clock.num_samples / self._clock.sample_rate_hz
+        return (
+            f"StreamingDetector({seen_s:.3f} s of {len(self.detector.pool.hand)} channels so far, "
+            f"look-ahead {1e3 * self.look_ahead_s:g} ms, {self.settings!r})"
+        )
+
     @property
     def masked_channels(self) -> tuple[str, ...]:
         """Channels that are not listened to, in the order of the hand."""

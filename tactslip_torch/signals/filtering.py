@@ -22,6 +22,8 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
+from tactslip_torch.runtime import check_tensor
+
 Align = Literal["centred", "causal", "trailing"]
 """Which part of its frame's polynomial a sample takes, and where the frame lies.
 
@@ -426,6 +428,7 @@ class ChannelFilter(nn.Module):
         Raises:
             ValueError: if there are no axes of channels and time, or other channels.
         """
+        check_tensor(samples)
         if samples.ndim < 2 or samples.shape[-2] != len(self.window_lengths):
             raise ValueError(
                 f"expected samples [*, {len(self.window_lengths)}, T] (channels, time), "

@@ -17,7 +17,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
@@ -672,6 +672,14 @@ class Scene:
     cycle: int = 0
     name: str = PAPER
 
+    def __repr__(self) -> str:
+        plain = ", ".join(
+            f"{each.name}={getattr(self, each.name)!r}"
+            for each in fields(self)
+            if getattr(self, each.name) != getattr(_usual(self.material), each.name)
+        )
+        return f"Scene({self.material!r}{plain and ', '}{plain})"
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "strokes", tuple(self.strokes))
         if self.session is None:
@@ -825,6 +833,12 @@ def paper_scenes(
         for material in materials
         for cycle in range(cycles)
     ]
+
+
+@lru_cache(maxsize=16)
+def _usual(material: str) -> Scene:
+    """The scene of a material with every other parameter as it is by default."""
+    return Scene(material)
 
 
 _GROUPS: dict[str, Any] = {
