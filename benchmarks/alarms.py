@@ -129,7 +129,7 @@ class Alarms(Benchmark[Sizes]):
     name = "alarms"
     title = "The alarm: budget kept, slips found, how late"
     about = "alarms of +exp=onset within the default budget, on recordings that set nothing"
-    page, markers = "docs/onset.md", "onset"
+    page, markers, has_headings = "docs/onset.md", "onset", False
     sizes = Sizes()
     quick = Sizes(
         (0,), (*QUICK_TRAINING, *QUICK_STREAMS), (0.1,), (30.0,), 1, 3, num_kernels=168, rounds=5

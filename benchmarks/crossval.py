@@ -26,7 +26,7 @@ class Crossval(Benchmark[Sizes]):
     name = "crossval"
     title = "Every choice of held-out materials"
     about = "balanced accuracy, %, on every choice of held-out materials"
-    page = "docs/recipes.md"
+    page, has_headings = "docs/recipes.md", False
     sizes = Sizes()
     quick = Sizes(
         (

@@ -2,8 +2,9 @@
 
 A subject is a class derived from ``Benchmark`` in a file of its own; ``python -m benchmarks.NAME``
 measures it, prints its tables, and writes ``NAME.json``, ``NAME.png`` and its section of
-BENCHMARKS.md between ``<!-- NAME -->`` and ``<!-- /NAME -->``. ``--quick`` measures very little, to
-see that it runs, and touches no tracked file; ``--render`` writes the same from the kept JSON.
+docs/benchmarks.md between ``<!-- NAME -->`` and ``<!-- /NAME -->``. ``--quick`` measures very
+little, to see that it runs, and touches no tracked file; ``--render`` writes the same from the kept
+JSON.
 ``sizes.NAME=value`` on the command line changes how much is measured.
 """
 
@@ -517,7 +518,8 @@ class Benchmark(ABC, Generic[S]):
         quick: sizes that only show that it runs.
         libraries: whose versions matter besides those of all benchmarks.
         markers: between which its section stands.
-        page: that holds them; one of docs says the rest itself, and gets the tables alone.
+        page: that holds them.
+        has_headings: whether the section has its own; else the page says the rest.
         is_simulated: whether its data are.
         drawn: figures that a command leaves in the folder ``numbers["folder"]``, and what their
             names end in here; they stand for one drawn here.
@@ -529,8 +531,9 @@ class Benchmark(ABC, Generic[S]):
     sizes: S
     quick: S
     libraries: ClassVar[tuple[str, ...]] = ()
-    page: ClassVar[str] = "BENCHMARKS.md"
+    page: ClassVar[str] = "docs/benchmarks.md"
     markers: ClassVar[str] = ""
+    has_headings: ClassVar[bool] = True
     is_simulated: ClassVar[bool] = True
     drawn: ClassVar[Mapping[str, str]] = {}
 
@@ -560,7 +563,7 @@ class Benchmark(ABC, Generic[S]):
         """What stands between the markers of the page, in Markdown."""
         tables = self.tables(report["numbers"])
         command = " ".join([f"python -m benchmarks.{self.name}", *map(repr, report["overrides"])])
-        if self.page.startswith("docs/"):
+        if not self.has_headings:
             is_simulated = report["numbers"].get("simulated", report["simulated"])
             kind = "Simulated" if is_simulated else "Recorded"
             parts = [f"{kind} (`{command}`, code {report['code']}):"]
@@ -570,7 +573,7 @@ class Benchmark(ABC, Generic[S]):
             f"`python -m benchmarks.{self.name}`, {ran_on(report)}.",
             *([f"**{QUICK_LINE}.**"] if report["quick"] else []),
             f"{self.about[:1].upper()}{self.about[1:]}.",
-            f"![{self.title}](benchmarks/results/{self.name}.png)",
+            f"![{self.title}](../benchmarks/results/{self.name}.png)",
         ]
         for title, table in tables.items():
             parts += [f"### {title}", table.markdown()]

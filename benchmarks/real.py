@@ -3,7 +3,7 @@
 On the BioTac SP set (``+exp=biotacsp_dos``), each object left out in turn. In one run, on the same
 windows and folds: the machine of three recipes, logistic regression on the features of the first,
 logistic regression and a random forest on simple statistics, and MiniRocket and MultiRocketHydra
-with ridge. All that is fitted or chosen is so inside the fold. Writes REAL_DATA.md.
+with ridge. All that is fitted or chosen is so inside the fold. Writes docs/real_data.md.
 """
 
 from __future__ import annotations
@@ -630,7 +630,7 @@ class Real(Benchmark[Sizes]):
     name = "real"
     title = "Real recordings: slip against stable touch on a BioTac SP"
     about = "slip against stable touch on a real BioTac SP, each object left out in turn"
-    page = "REAL_DATA.md"
+    page = "docs/real_data.md"
     is_simulated = False
     libraries = ("aeon",)
     sizes = Sizes()
@@ -716,9 +716,9 @@ class Real(Benchmark[Sizes]):
         for title, table in self.tables(numbers).items():
             parts += [f"## {title}", *([texts[title]] if title in texts else []), table.markdown()]
             if title == "Scores":
-                parts.append("![Objects and ROC curves](benchmarks/results/real.png)")
+                parts.append("![Objects and ROC curves](../benchmarks/results/real.png)")
             if title == "As streams":
-                parts.append("![One recording](benchmarks/results/real_watched.png)")
+                parts.append("![One recording](../benchmarks/results/real_watched.png)")
         return "\n\n".join(parts)
 
     def draw(self, numbers: Report, drawing: Figure) -> None:

@@ -1,7 +1,7 @@
 """Published numbers beside ours: ``python -m benchmarks.reproduction [key=value ...]``.
 
 Trains every experiment on every seed. Runs that this very code finished are kept, so it resumes.
-Writes the tables of REPRODUCTION.md and of README.md between their markers, and the figures.
+Writes the tables of docs/reproduction.md between their markers, and the figures.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Reproduction(Benchmark[Sizes]):
     name = "reproduction"
     title = "Published numbers beside ours"
     about = "every number of ours is SIMULATED, the paper's are of a real hand"
-    page, markers = "REPRODUCTION.md", "results"
+    page, markers = "docs/reproduction.md", "results"
     sizes = Sizes()
     quick = Sizes(
         1,
@@ -124,7 +124,7 @@ class Reproduction(Benchmark[Sizes]):
         }
 
     def tables(self, numbers: Report) -> dict[str, Table]:
-        """All of REPRODUCTION.md, and what was run."""
+        """All of docs/reproduction.md, and what was run."""
         runs, calibrated = numbers["runs"], numbers["calibrated"]
         scores = Scores(runs)
         found = {
@@ -157,10 +157,10 @@ class Reproduction(Benchmark[Sizes]):
         return {title: table for title, table in found.items() if table.rows}
 
     def publish(self, report: Report, folder: Path) -> None:
-        """The page, and the table between the markers of README.md."""
+        """The page, and its summary between markers of its own."""
         super().publish(report, folder)
         if not report["quick"]:
-            path, table = ROOT / "README.md", short_table(report["numbers"]["runs"]).markdown()
+            path, table = ROOT / self.page, short_table(report["numbers"]["runs"]).markdown()
             text = path.read_text(encoding="utf-8")
             write_text(path, between_markers(text, "reproduction", table))
 
@@ -425,7 +425,7 @@ SHORT = {
     "half_second": ("test", "unseen"),
     "shuffled": ("test",),
 }
-"""Experiments and roles of the table in README.md."""
+"""Experiments and roles of the summary."""
 
 
 def _beside(numbers: Report, scores: Scores, experiment: str) -> Table:
@@ -476,7 +476,7 @@ def _mark(experiment: str, role: str, score: str, calibrated: Mapping[str, Any])
     if role == "test" and experiment == "unseen4":
         return NOT_COMPARABLE, "the paper's test bins have neighbours among its training bins"
     if (experiment, role, score) == ("random_bins", "test", "accuracy") and "target" in calibrated:
-        return CALIBRATED, f"three parameters were set by it: {calibrated['verdict']}"
+        return CALIBRATED, f"three parameters were set by it: {calibrated['outcome']}"
     return PREDICTED, "no parameter was calibrated by it"
 
 
@@ -692,13 +692,13 @@ def _parameters(calibrated: Mapping[str, Any]) -> Table:
         target = calibrated["target"]
         note += (
             f" Aim: {100 * target['accuracy']:.2f} % ({target['row']}); reached: "
-            f"{100 * calibrated['accuracy']:.2f} %, mean over other seeds: {calibrated['verdict']}."
+            f"{100 * calibrated['accuracy']:.2f} %, mean over other seeds: {calibrated['outcome']}."
         )
     return Table(rows, note)
 
 
 def short_table(runs: Runs) -> Table:
-    """The table of README.md."""
+    """The summary."""
     rows, scores = [], Scores(runs)
     for name, roles in SHORT.items():
         for role in roles if name in runs else ():

@@ -145,7 +145,7 @@ def test_the_command_leaves_all_it_tried(found):
         }
     assert content["values"] == content["points"][1]["parameters"]  # closer to the target than d=0
     assert content["target"]["accuracy"] == 0.9639
-    assert "no point tried is closer" in content["verdict"]
+    assert "no point tried is closer" in content["outcome"]
     assert (folder / "calibration.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "config.yaml").exists()
     assert str(folder) not in (folder / "calibration.json").read_text()
@@ -283,7 +283,7 @@ def test_what_is_no_calibration_is_refused(tmp_path, override, message):
 def test_the_table_has_all_points_by_difficulty_and_what_became_of_it(tmp_path, put_in):
     put_in(accuracy=0.99)
     content = calibrate(tiny("most_points=3", "step=0.75"), tmp_path)
-    assert content["verdict"] == "+2.61 points from the target: no point tried is closer"
+    assert content["outcome"] == "+2.61 points from the target: no point tried is closer"
     content["points"][2] |= {"holds": False, "signal_checks": [{**CHECK, "holds": False}]}
     lines = calibration_table(content).splitlines()
     assert lines[0].startswith("SIMULATED")
@@ -293,4 +293,4 @@ def test_the_table_has_all_points_by_difficulty_and_what_became_of_it(tmp_path, 
     assert rows.index(first) < rows.index(last)
     assert last[-2:] == ["fail:", "loud"]
     assert ["it", "is", "loud", "above", "1.5", "2"] in rows
-    assert lines[-1] == content["verdict"]
+    assert lines[-1] == content["outcome"]

@@ -215,7 +215,7 @@ def worth_timing(candidates: Sequence[Candidate], most: int, limits: Limits) -> 
     """The candidates on the modelled front, then those that would be without them, and so on.
 
     A model errs, so what is close to the front is timed as well. Of a layer that is too large:
-    the most accurate; up to half of the room, in order of accuracy, those that keep the limits
+    the most accurate; up to half of that number, in order of accuracy, those that keep the limits
     though modelled 1.5 times too slow, as modelled, or modelled 1.5 times too quick, in turn; and
     of the rest those that are spread by compute, from the cheapest to the dearest.
     """

@@ -278,7 +278,7 @@ def _content(
             "row": "test, six seen materials",
             "source": published.PAPER,
         },
-        "verdict": _outcome(config, points, kept, target),
+        "outcome": _outcome(config, points, kept, target),
         "seeds": list(config.seeds),
         "priors": {name: asdict(prior) for name, prior in PRIORS.items()},
         "signal_checks": kept["signal_checks"],

@@ -5,7 +5,7 @@ and pooled over them, channels, components, filter, head, precision and hop for 
 worst-case latency and compute against accuracy; times those on the front and close to the limits,
 and names three: the most accurate, a cheap one that is hardly worse, and one of few numbers. Those
 that meet both limits by that timing are timed again in a fresh process, in order of accuracy, the
-last try kept for the one with most head-room; the first that meets both there is written. Leaves
+last try kept for the one with most headroom; the first that meets both there is written. Leaves
 ``pareto.json``, ``pareto.png``, the resolved configuration and, last of all, ``detector.pt``. Exit
 status 1 if no detector meets the limits; all but the detector is written then.
 
@@ -221,7 +221,7 @@ def _chosen(
 
 
 def _tries(able: Sequence[Candidate], limits: Limits, most: int) -> list[Candidate]:
-    """The first of those to try; the last of several is the one with most head-room of the rest."""
+    """The first of those to try; the last of several is the one with most headroom of the rest."""
     first, left = list(able[: max(most - 1, 1)]), able[max(most - 1, 1) :]
     if most > 1 and left:
         first.append(max(left, key=lambda each: limits.headroom(each.latency)))

@@ -343,7 +343,7 @@ def _stretches(cell: _Cell) -> tuple[Stretch, ...]:
 
 
 def _items(cell: _Cell) -> list[_Cell]:
-    """The parts of a cell; JSON is read to text, so that numbers are judged in one place."""
+    """The parts of a cell; JSON is read to text, so that numbers are checked in one place."""
     if isinstance(cell, list):
         return cell
     if not cell.startswith("["):

@@ -67,7 +67,7 @@ def unseen4(
     train_fraction: float = 0.8,
     seed: int = 0,
 ) -> list[Split]:
-    """Train and test on cycles of the seen materials, judge on all cycles of the unseen ones.
+    """Train and test on cycles of the seen materials, evaluate on all cycles of the unseen ones.
 
     Raises:
         ValueError: if a material is not in the set, is on both sides, or a role stays empty.
@@ -106,7 +106,7 @@ def random_bins(
 ) -> list[Split]:
     """The authors' split: bins of the seen materials at random, which leaks.
 
-    Neighbouring bins of one slide are on both sides, so its test score is no promise for
+    Neighbouring bins of one slide are on both sides, so its test score says little about
     recordings that were never seen; the difference to ``seen6`` is the leak.
 
     Raises:
@@ -126,7 +126,7 @@ def leave_one_material_out(
     train_fraction: float = 0.8,
     seed: int = 0,
 ) -> list[Split]:
-    """One fold per material: train and test on the others' cycles, judge on its own.
+    """One fold per material: train and test on the others' cycles, evaluate on its own.
 
     Args:
         recordings: of the set.
@@ -168,16 +168,16 @@ def confound(
     train_fraction: float = 0.8,
     seed: int = 0,
 ) -> list[Split]:
-    """Two folds that differ in the scenes trained on, and are judged on the same recordings.
+    """Two folds that differ in the scenes trained on, and are evaluated on the same recordings.
 
     ``protocol`` trains on the paper's scene alone, ``with_scenes`` on the same cycles of the
-    trained scenes as well. Both are judged on the test cycles of the seen materials and all cycles
-    of the unseen ones, of every scene; training cycles of other scenes are not used.
+    trained scenes as well. Both are evaluated on the test cycles of the seen materials and all
+    cycles of the unseen ones, of every scene; training cycles of other scenes are not used.
 
     Args:
         recordings: of the paper's scene and of others.
         seen: materials to train and test on, by cycle.
-        unseen: materials to judge on only.
+        unseen: materials to evaluate on only.
         trained_scenes: kinds of scenes that ``with_scenes`` trains on beside the paper's.
         train_fraction: of the cycles.
         seed: of the draw.
@@ -308,15 +308,15 @@ def leave_one_session_out(
     train_fraction: float = 0.8,
     seed: int = 0,
 ) -> list[Split]:
-    """One fold per session: train on the others, judge the same materials in the one left out.
+    """One fold per session: train on the others, evaluate the same materials in the one left out.
 
     ``test`` are held-out cycles of the sessions trained on, ``unseen`` all cycles of the session
     left out, of materials that the others have too.
 
     Args:
         recordings: of several sessions.
-        seen: materials to train on and to judge.
-        first_alone: put a fold before them that trains on the first session alone and judges the
+        seen: materials to train on and to evaluate.
+        first_alone: put a fold before them that trains on the first session alone and evaluates the
             same materials in all others: what a user gets who trains on one day's recordings.
         train_fraction: of the cycles of each session trained on.
         seed: of the draw.

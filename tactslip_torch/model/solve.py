@@ -299,7 +299,7 @@ def _check_finite(matrix: Tensor, right: Tensor, name: str) -> None:
 
 
 def _finite(x: Tensor, name: str) -> Tensor:
-    """A solution as it is handed out: refused where float64 has no room for it."""
+    """A solution as it is handed out: refused where it overflows float64."""
     if not bool(x.isfinite().all()):
         worst = float(x[~x.isfinite()][0])
         raise ValueError(

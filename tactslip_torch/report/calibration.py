@@ -53,7 +53,7 @@ def calibration_table(content: Mapping[str, Any]) -> str:
             row = {"signal check": check["says"], "range": span}
             checks.append(row | {"values at the point kept": values})
         blocks.append(table(checks, num_left=3))
-    return "\n\n".join([*blocks, f"kept: {_kept(content)}\n{content['verdict']}"])
+    return "\n\n".join([*blocks, f"kept: {_kept(content)}\n{content['outcome']}"])
 
 
 def point_line(point: Mapping[str, Any]) -> str:

@@ -40,7 +40,7 @@ Row = Mapping[str, str]
 ROLE_WORDS = {"held_out": "held-out", "test": "test", "unseen": "unseen"}
 """What the roles are called; ``held_out`` bins are training bins of groups left out in turn."""
 RESELECT_WORDS = {
-    "ranked": "by the recipe's ranking, in which strong channels leave no room for others",
+    "ranked": "by the recipe's ranking, in which strong channels leave no place for others",
     "shared": "as many of each channel",
 }
 BEST_LINE = (
@@ -259,7 +259,7 @@ def _hand(
         channels: of the hand, in order; fingers stand in the order in which they first occur.
         values: by channel.
         limits: values of the palest and of the deepest shade.
-        written: how a value is written into its mark, where there is room.
+        written: how a value is written into its mark, where there is space.
         unit: of the values.
     """
     by_finger: dict[str, dict[str, list[Row]]] = {}

@@ -472,7 +472,7 @@ def _draw_channels(axes: Axes, traces: Traces, slips: Segments) -> None:
 
 
 def lane_height(lines: Iterable[Array]) -> float:
-    """Distance of lanes: room for what is usual, while a burst may cross its neighbours."""
+    """Distance of lanes: enough for what is usual, while a burst may cross its neighbours."""
     return max(max(1.5 * span(line, 0.05), 0.25 * span(line)) for line in lines) or 1.0
 
 

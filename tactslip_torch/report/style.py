@@ -139,7 +139,7 @@ def clean(axes: Axes, grid: Literal["x", "y", "both"] = "both") -> None:
 
 
 def lanes(axes: Axes, names: Sequence[str], *, least: int = 1) -> None:
-    """Give the y axis a lane for each name, the first on top; room for ``least`` lanes."""
+    """Give the y axis a lane for each name, the first on top; space for ``least`` lanes."""
     axes.set_yticks(range(len(names)), names, fontsize=TEXT)
     axes.set_ylim(max(least, len(names)) - 0.4, -0.6)
 

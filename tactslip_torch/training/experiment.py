@@ -438,7 +438,7 @@ def run_fold(
         folder: of its results.
         data: of the fold.
         learner: of its detector.
-        alarming: the stage behind the fit.
+        alarming: the stage after the fit.
         tuned: what tuning found, if it did.
     """
     trainer = make_trainer(config.trainer, folder, [SaveAfterFirstPass(folder)])
