@@ -18,7 +18,6 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 from tqdm.auto import tqdm
 
 __version__ = "0.1.0"
@@ -143,41 +142,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def is_traced() -> bool:
-    """Whether what runs is being written down as a graph, in which no value may be looked at."""
-    is_jit = torch.jit.is_tracing()  # type: ignore[attr-defined,no-untyped-call]
-    return bool(is_jit or torch.compiler.is_compiling())
-
-
-def has_values(x: Tensor) -> bool:
-    """Whether a decision may be taken on the values, wherever they lie and whatever comes along.
-
-    Not so where a graph is recorded or ``x`` is transformed (vmap, func.grad, jvp).
-    """
-    if is_traced():
-        return False
-    try:
-        x.detach().flatten()[:0].cpu().numpy()  # of what is transformed not even nothing
-    except (RuntimeError, TypeError):  # transformed, or NumPy has no such dtype
-        return False
-    return True
-
-
-def is_concrete(x: Tensor) -> bool:
-    """Whether only values are asked for, and lie in memory that can be looked at.
-
-    Not so where a gradient or a tangent is carried along, a graph is recorded, ``x`` is transformed
-    (vmap), or lies on another device than the CPU.
-    """
-    if not x.is_cpu or is_traced() or (x.requires_grad and torch.is_grad_enabled()):
-        return False
-    try:
-        x.detach().numpy()  # under vmap and other transforms there is no memory to look at
-        return forward_ad.unpack_dual(x).tangent is None
-    except (RuntimeError, TypeError):  # transformed, or NumPy has no such dtype
-        return False
 
 
 def stamps_of(tensors: Iterable[Tensor]) -> list[tuple[Tensor, int | Tensor]]:

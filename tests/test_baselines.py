@@ -18,14 +18,13 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.training.baselines import (
     KEY,
     Baselines,
-    FeatureThreshold,
     LogisticRegression,
     PooledNumber,
     RandomForest,
     SimpleStatistics,
-    best_threshold,
 )
 from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.recipe import FeatureThreshold, best_threshold
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",

@@ -354,7 +354,7 @@ def test_a_run_sets_thresholds_and_says_what_answers_cover(tiny, tmp_path, capsy
     assert (tmp_path / "run" / "answers.png").read_bytes().startswith(b"\x89PNG")
     assert list(metrics["answers"]) == ["train", "test", "unseen"]
     detector = SlipDetector.load(tmp_path / "run" / "detector.pt")
-    kept = Abstention.of(detector)
+    kept = Abstention.of(detector.info)
     assert (kept.coverage, kept.metadata["left_out"]) == (0.6, "recording")
     assert kept.metadata["num_recordings"] == {"slip": 4, "non_slip": 4}
     for role, found in metrics["answers"].items():

@@ -26,8 +26,8 @@ from tactslip_torch.analysis.pareto import (
     worth_timing,
 )
 from tactslip_torch.data.splits import seen6, unseen4
+from tactslip_torch.features.bank import pool_names
 from tactslip_torch.features.groups import allowed
-from tactslip_torch.features.names import pool_names
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.selection import rank_features, t_scores

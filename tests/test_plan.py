@@ -4,8 +4,8 @@ import random
 
 import pytest
 
-from tactslip_torch.features.bank import make_plan
-from tactslip_torch.features.names import FeatureName, pool_names
+from tactslip_torch.features.bank import make_plan, pool_names
+from tactslip_torch.features.names import FeatureName
 from tactslip_torch.hand import HandLayout
 
 HAND = HandLayout.paper24()

@@ -10,35 +10,44 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import lightning as L
 from hydra.utils import instantiate
+from lightning.pytorch.callbacks import Checkpoint
 from omegaconf import DictConfig
 
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split, have_same_bins
+from tactslip_torch.deploy.check import GraphKind
+from tactslip_torch.deploy.export import export_detector, read_sidecar
+from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.pooling import pooled_names
-from tactslip_torch.report.results import print_results, write_results
-from tactslip_torch.runtime import is_first_process
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
+from tactslip_torch.onset.decisions import KEY, Scorer
+from tactslip_torch.report.results import print_results, tuning_figure, write_results
+from tactslip_torch.runtime import is_first_process, whole_file
+from tactslip_torch.training.adaptation import FILE as STATISTICS
+from tactslip_torch.training.adaptation import Statistics
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
 from tactslip_torch.training.datamodule import SlipDataModule
 from tactslip_torch.training.experiment import (
-    combined,
     common_metadata,
     feature_cache,
     feature_maker,
     feature_rows,
-    run_fold,
+    make_trainer,
+    merged_results,
     save_config,
-    tune_fold,
 )
 from tactslip_torch.training.learner import SlipLearner
 from tactslip_torch.training.plan import Abstaining
-from tactslip_torch.training.recipe import Recipe
+from tactslip_torch.training.recipe import FeatureSelection, Recipe
 from tactslip_torch.training.tuning import Tuning
 
 log = logging.getLogger(__name__)
@@ -109,9 +118,9 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             )
             found: dict[str, Any] | None = None
             if tuning is not None:
-                learner, found = tune_fold(config, place, data, learner, tuning)
-            fold_metrics[fold.name] = run_fold(config, place, data, learner, alarming, found)
-    metrics = common_metadata(source, pool, config) | combined(
+                learner, found = _tune_fold(config, place, data, learner, tuning)
+            fold_metrics[fold.name] = _run_fold(config, place, data, learner, alarming, found)
+    metrics = common_metadata(source, pool, config) | _combined(
         fold_metrics, by_fold=have_same_bins(folds)
     )
     metrics["timing_s"]["total"] = time.perf_counter() - started
@@ -133,6 +142,253 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         for name in ("accuracy", "balanced_accuracy")
         if scores[name] is not None
     }
+
+
+def _combined(folds: dict[str, dict[str, Any]], *, by_fold: bool) -> dict[str, Any]:
+    """One fold as it is; of several, ``merged_results``, and the features that all selected."""
+    if len(folds) == 1:
+        (only,) = folds.values()
+        del only["recording_events"]
+        return only
+    merged = merged_results(folds, by_fold=by_fold)
+    found = list(folds.values())
+    times = {name: dict[str, float]() for name in ("timing_s", "worker_s")}
+    for own in found:
+        del own["recording_events"]
+        for name, total in times.items():
+            for stage, seconds in own.pop(name).items():
+                total[stage] = total.get(stage, 0.0) + seconds
+    shared = set.intersection(*(set(own["selected"]) for own in found))
+    selected = [name for name in found[0]["selected"] if name in shared]
+    return merged | times | {"selected": selected, "folds": folds}
+
+
+class _SaveAfterFirstPass(Checkpoint):
+    """Writes ``last.ckpt`` behind the first pass, whole or not at all, for ``ckpt_path=``.
+
+    Not behind the second: resuming repeats that and the solve, which read features from the
+    cache. A ``Checkpoint`` is called behind the learner's own end of an epoch, with its plan.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Save."""
+        if trainer.current_epoch == 0 and not getattr(trainer, "fast_dev_run", False):
+            if trainer.is_global_zero:
+                with whole_file(self._folder / "last.ckpt") as temporary:
+                    trainer.save_checkpoint(temporary)
+            else:  # saving is done in step; only the first process writes
+                trainer.save_checkpoint(self._folder / "last.ckpt")
+
+
+def _tune_fold(
+    config: DictConfig, folder: Path, data: SlipDataModule, first: SlipLearner, tuning: Tuning
+) -> tuple[SlipLearner, dict[str, Any]]:
+    """Fit as the recipe says, and learn from there: the second fit's learner, and what was found.
+
+    Detectors of the recipe's choice and of the grid's least loss are evaluated as the tuned one
+    will be, and kept as ``grid.pt`` and ``start.pt``: what is beyond the latter is due to the
+    gradient.
+    """
+    started = time.perf_counter()
+    trainer = make_trainer(config.trainer, folder / "grid")
+    if trainer.world_size > 1:
+        raise ValueError(
+            f"tuning runs in one process, the trainer has {trainer.world_size}; leave out "
+            "trainer.devices and trainer.num_nodes, or take tuning=none"
+        )
+    trainer.fit(first, datamodule=data)
+    found: dict[str, Any] = {"fit_s": time.perf_counter() - started}
+    plan, (_, sample) = first.plan, first.gathered
+    tuned = tuning(plan, sample, [str(name) for name in data.maker.pool.names])
+    found |= tuned.metadata
+    start = found["start"]
+    by_loss = _settled(first, data, plan.selection, start["penalty"], start["offset"])
+    other = make_trainer(config.trainer, folder / "start")
+    other.fit(by_loss, datamodule=data)
+    found["splits"] = {}
+    tests = (("grid", "recipe", trainer, first), ("start", "grid", other, by_loss))
+    for name, way, tester, learner in tests:
+        tester.test(learner, datamodule=data, verbose=False)
+        found["splits"][way] = learner.metrics["splits"]
+        if learner.detector is not None:
+            learner.detector.info |= _origin(config, data)
+            learner.detector.save(folder / f"{name}.pt")
+    simulated = data.maker.source.is_simulated
+    tuning_figure(found, folder / "tuning.png", simulated=simulated)
+    found["validation"] = first.metadata["validation"]
+    return _settled(first, data, tuned.selection, tuned.penalty, tuned.offset), found
+
+
+def _settled(
+    first: SlipLearner,
+    data: SlipDataModule,
+    selection: FeatureSelection,
+    penalty: float,
+    offset: float,
+) -> SlipLearner:
+    """A learner like the first with nothing left to choose."""
+    size = len(selection.selected)
+    recipe = replace(first.recipe, num_features=size, penalties=penalty, offsets=offset)
+    return SlipLearner(
+        data.maker.pool,
+        data.maker.channel_filter,
+        recipe,
+        selection=selection,
+        abstaining=first.abstaining,
+        with_baselines=first.with_baselines,
+    )
+
+
+def _run_fold(
+    config: DictConfig,
+    folder: Path,
+    data: SlipDataModule,
+    learner: SlipLearner,
+    alarming: CalibratedAlarm | DebouncedAlarm | None,
+    tuned: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Fit, test, set the alarm of, save and export one fold; what it found.
+
+    Args:
+        config: of the experiment.
+        folder: of its results.
+        data: of the fold.
+        learner: of its detector.
+        alarming: the stage after the fit.
+        tuned: what tuning found, if it did.
+    """
+    trainer = make_trainer(config.trainer, folder, [_SaveAfterFirstPass(folder)])
+    checkpoint = _checkpoint(config.ckpt_path, data.split)
+    trainer.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    if learner.detector is None:
+        raise ValueError(
+            "the fit ended before its second pass; leave trainer.max_epochs at 2, and resume with "
+            "ckpt_path=THE_FOLDER_OF_THIS_RUN"
+        )
+    started = time.perf_counter()
+    trainer.test(learner, datamodule=data, verbose=False)
+    tested = time.perf_counter()
+    detector = learner.detector
+    detector.info |= _origin(config, data)
+    if tuned is not None:
+        kept = ("learned", "steps", "bins", "start")
+        detector.info["tuned"] = {name: tuned[name] for name in kept}
+    onnx: dict[str, dict[str, float] | str] = {}
+    alarm: dict[str, Any] = {}
+    if getattr(trainer, "fast_dev_run", False):
+        alarming = None  # hours of streams are no quick look
+    if trainer.is_global_zero and alarming is not None:
+        detector.save(folder / "detector.pt")  # what was fitted stays, whatever comes
+        if isinstance(alarming, CalibratedAlarm):
+            alarm = alarming(detector, _baselines(detector), config.num_workers)
+        else:
+            alarming(detector)
+    told = time.perf_counter()
+    if trainer.is_global_zero:
+        detector.save(folder / "detector.pt")
+        if config.statistics:
+            _save_statistics(config, learner, detector, data.split, folder / STATISTICS)
+        onnx = export_fold(detector, folder) if config.export else {}
+    seconds = dict(learner.seconds)
+    seconds["test_pass"] = tested - started
+    if alarming is not None:
+        seconds["alarm"] = told - tested
+    seconds["save_export"] = time.perf_counter() - told
+    events = {**learner.metrics.get("events", {}), **alarm.pop("events", {})}
+    return {
+        **learner.metrics,
+        "events": events,
+        **({"alarm": alarm} if alarm else {}),
+        "recording_events": learner.events,  # for _combined
+        **learner.metadata,
+        **({} if tuned is None else {"tuning": tuned, "validation": tuned.pop("validation")}),
+        "selected": [str(name) for name in detector.selected_names],
+        "trained_on": {
+            "materials": detector.info["train_materials"],
+            "sessions": detector.info["train_sessions"],
+            "scenes": sorted({recording.scene for recording in data.split.having("train")}),
+        },
+        "onnx": onnx,
+        "timing_s": seconds,
+        "worker_s": learner.worker_seconds,
+    }
+
+
+def _save_statistics(
+    config: DictConfig, learner: SlipLearner, detector: SlipDetector, fold: Split, path: Path
+) -> None:
+    """What ``adapt`` solves again from, beside the detector."""
+    materials = {str(recording): recording.material for recording in fold.having("train")}
+    labels = {str(key): value for key, value in config.labels.items() if key != "_target_"}
+    Statistics.of_training(*learner.gathered, materials, labels, detector).save(path)
+
+
+def _origin(config: DictConfig, data: SlipDataModule) -> dict[str, Any]:
+    """What a detector says of where it comes from."""
+    source, trained = data.maker.source, data.split.having("train")
+    return {
+        "simulated": source.is_simulated,
+        **_units(source),
+        "experiment": config.name,
+        "seed": config.seed,
+        "split": data.split.name,
+        "features_dtype": config.features.dtype,
+        "train_materials": sorted({recording.material for recording in trained}),
+        "train_sessions": sorted({r.session or "1" for r in trained}),
+        "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
+    }
+
+
+def _units(source: RecordingSource) -> dict[str, str]:
+    """The unit of samples, where it is not volts."""
+    units = getattr(source, "units", "V")  # sources that do not say record volts
+    return {} if units == "V" else {"units": units}
+
+
+def _baselines(detector: SlipDetector) -> dict[str, Scorer]:
+    """The methods that the paper argues against, on the detector's hand, filter and bins."""
+    if not detector.pool.hand.fast:
+        return {}
+    return {
+        name.replace("_", " "): BaselineDetector(name, detector.pool, detector.channel_filter)
+        for name in get_args(BaselineName)
+    }
+
+
+def export_fold(detector: SlipDetector, folder: Path) -> dict[str, dict[str, float] | str]:
+    """Write the ONNX files; by graph their error, or why there is none: nothing learned is lost."""
+    kinds: list[GraphKind] = ["bin", "stream"] if KEY in detector.info else ["bin"]
+    found: dict[str, dict[str, float] | str] = {}
+    for kind in kinds:
+        try:
+            paths = export_detector(detector, folder, [kind], source=folder / "detector.pt")
+            written = read_sidecar(paths[0])
+            error, size = written["check"]["worst_sd"], written["onnx_bytes"]
+            found[kind] = {"error": error, "bytes": size}
+        except Exception as error:  # of onnxruntime they have no base in common
+            log.exception("the %s graph was not written", kind)
+            found[kind] = (str(error) or type(error).__name__).splitlines()[0]
+    return found
+
+
+def _checkpoint(given: str | None, fold: Split) -> Path | None:
+    """The checkpoint to resume: the file given, or that of the run folder given, if it got so far.
+
+    Raises:
+        FileNotFoundError: if there is nothing at the path.
+    """
+    if given is None:
+        return None
+    path = Path(given)
+    if not path.exists():
+        raise FileNotFoundError(f"no checkpoint or run folder at {path}")
+    if path.is_file():
+        return path
+    found = [path / fold.name / "last.ckpt", path / "last.ckpt"]
+    return next((candidate for candidate in found if candidate.is_file()), None)
 
 
 main = entry_point("train", train)

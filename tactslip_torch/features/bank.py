@@ -25,8 +25,16 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.descriptors import DESCRIPTORS, STEPPED, Rows, band_energy_ratios
-from tactslip_torch.features.names import FeatureName, pool_names
+from tactslip_torch.features.descriptors import (
+    COMMON_DESCRIPTORS,
+    DESCRIPTORS,
+    SPECTRUM_DESCRIPTORS,
+    STEPPED,
+    TIME_DESCRIPTORS,
+    Rows,
+    band_energy_ratios,
+)
+from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import (
     TINY,
     bounded_gradient,
@@ -41,6 +49,30 @@ from tactslip_torch.signals.wavelet import Wavelet, branch_matrix, branch_names
 
 RowKind = Literal["gauge", "time", "freq"]
 ROW_KINDS: tuple[RowKind, ...] = ("gauge", "time", "freq")
+
+
+def pool_names(hand: HandLayout, level: int) -> tuple[FeatureName, ...]:
+    """Names of all features of a hand, in the paper's order (REFERENCE.md section 4)."""
+    names = [
+        FeatureName(hand.names[i], "raw", "time", descriptor)
+        for i in hand.slow
+        for descriptor in COMMON_DESCRIPTORS
+    ]
+    domains = (("time", TIME_DESCRIPTORS), ("freq", SPECTRUM_DESCRIPTORS))
+    for channel in (hand.names[i] for i in hand.fast):
+        names += [
+            FeatureName(channel, f"{kind}{m}", domain, descriptor)
+            for m in range(1, level + 1)
+            for domain, descriptors in domains
+            for kind in "AD"
+            for descriptor in descriptors
+        ]
+        names += [
+            FeatureName(channel, f"{kind}{m}", "freq", "band_energy_ratio")
+            for kind in "AD"
+            for m in range(1, level + 1)
+        ]
+    return tuple(names)
 
 
 class Row(NamedTuple):

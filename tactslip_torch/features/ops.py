@@ -12,11 +12,45 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
-
-from tactslip_torch.runtime import has_values, is_concrete, is_traced
+from torch.autograd import forward_ad
 
 TINY = 1e-300
 """Instead of 0 in a divisor, where a quotient of 0 is to be 0."""
+
+
+def is_traced() -> bool:
+    """Whether what runs is being written down as a graph, in which no value may be looked at."""
+    is_jit = torch.jit.is_tracing()  # type: ignore[attr-defined,no-untyped-call]
+    return bool(is_jit or torch.compiler.is_compiling())
+
+
+def has_values(x: Tensor) -> bool:
+    """Whether a decision may be taken on the values, wherever they lie and whatever comes along.
+
+    Not so where a graph is recorded or ``x`` is transformed (vmap, func.grad, jvp).
+    """
+    if is_traced():
+        return False
+    try:
+        x.detach().flatten()[:0].cpu().numpy()  # of what is transformed not even nothing
+    except (RuntimeError, TypeError):  # transformed, or NumPy has no such dtype
+        return False
+    return True
+
+
+def is_concrete(x: Tensor) -> bool:
+    """Whether only values are asked for, and lie in memory that can be looked at.
+
+    Not so where a gradient or a tangent is carried along, a graph is recorded, ``x`` is transformed
+    (vmap), or lies on another device than the CPU.
+    """
+    if not x.is_cpu or is_traced() or (x.requires_grad and torch.is_grad_enabled()):
+        return False
+    try:
+        x.detach().numpy()  # under vmap and other transforms there is no memory to look at
+        return forward_ad.unpack_dual(x).tangent is None
+    except (RuntimeError, TypeError):  # transformed, or NumPy has no such dtype
+        return False
 
 
 def root(square: Tensor) -> Tensor:

@@ -22,13 +22,20 @@ import torch
 from torch import Tensor, nn
 
 from tactslip_torch import native
-from tactslip_torch.features.bank import Bank, Frame, LinearMaps, Plan, linear_maps, make_plan
+from tactslip_torch.features.bank import (
+    Bank,
+    Frame,
+    LinearMaps,
+    Plan,
+    linear_maps,
+    make_plan,
+    pool_names,
+)
 from tactslip_torch.features.descriptors import DESCRIPTORS
-from tactslip_torch.features.names import pool_names
-from tactslip_torch.features.ops import bounded_gradient, saturating
+from tactslip_torch.features.ops import bounded_gradient, is_concrete, is_traced, saturating
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.native import BackendName
-from tactslip_torch.runtime import check_tensor, for_each, is_concrete, is_traced
+from tactslip_torch.runtime import check_tensor, for_each
 from tactslip_torch.signals.spectrum import SpectrumMethod, spectrum_matrix
 from tactslip_torch.signals.wavelet import (
     Wavelet,

@@ -24,9 +24,9 @@ from torch import Tensor, nn
 
 from tactslip_torch import native
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.ops import ascending, like, root, signed_log
+from tactslip_torch.features.ops import ascending, is_concrete, like, root, signed_log
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.runtime import are_unchanged, for_each, is_concrete, stamps_of
+from tactslip_torch.runtime import are_unchanged, for_each, stamps_of
 
 STATISTICS = ("mean", "std", "min", "max", "median")
 SORTED = "sorted"

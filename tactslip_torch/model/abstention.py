@@ -17,14 +17,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from tactslip_torch.model.detector import SlipDetector
-
 
 KEY = "abstain"
 """Under which ``SlipDetector.info`` keeps the thresholds."""
@@ -145,9 +141,9 @@ class Abstention:
             raise ValueError(f"no thresholds of abstention of this version: {error}") from None
 
     @classmethod
-    def of(cls, detector: SlipDetector) -> Abstention | None:
-        """The thresholds in a detector's file, None if there are none: it never abstains."""
-        plain = detector.info.get(KEY)
+    def of(cls, info: Mapping[str, Any]) -> Abstention | None:
+        """The thresholds in a detector's ``info``, None if there are none: it never abstains."""
+        plain = info.get(KEY)
         return None if plain is None else cls.from_dict(plain)
 
 

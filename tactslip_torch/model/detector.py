@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.ops import is_nowhere, saturating
+from tactslip_torch.features.ops import is_concrete, is_nowhere, saturating
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.hand import HandLayout
@@ -34,13 +34,7 @@ from tactslip_torch.model.missing_channels import (
 )
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName, Filters, Machine, Scores, backend_of
-from tactslip_torch.runtime import (
-    are_unchanged,
-    is_concrete,
-    load_table,
-    save_table,
-    stamps_of,
-)
+from tactslip_torch.runtime import are_unchanged, load_table, save_table, stamps_of
 from tactslip_torch.signals.filtering import ChannelFilter
 
 FORMAT = "tactslip_torch detector 3"

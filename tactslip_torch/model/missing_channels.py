@@ -23,9 +23,9 @@ from typing import Literal, NamedTuple, TypeVar, get_args
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.ops import saturating
+from tactslip_torch.features.ops import has_values, is_concrete, saturating
 from tactslip_torch.model.kernels import Head, QuadraticForm
-from tactslip_torch.runtime import are_unchanged, has_values, in_parts, is_concrete, stamps_of
+from tactslip_torch.runtime import are_unchanged, in_parts, stamps_of
 from tactslip_torch.signals.binning import refuse_nonfinite
 
 ChannelMask = Sequence[str] | Tensor

@@ -30,7 +30,14 @@ from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool, is_rounding
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.training.recipe import balanced_accuracy, sample_groups
+from tactslip_torch.training.recipe import (
+    FeatureThreshold,
+    balanced_accuracy,
+    best_threshold,
+    check_classes,
+    has_both_classes,
+    sample_groups,
+)
 
 POOLED_NUMBER = "best_pooled_number"
 KEY = "baselines"
@@ -44,55 +51,6 @@ WIDE, WIDE_PENALTY = 256, 1e-2
 """With more columns than this, choosing would take longer than the detector's own validation: ``C``
 is fixed. On 672 pooled columns of the simulated hand 1e-3 to 1 differ by .3 points."""
 LOG_FLOOR = 1e-2  # of the training median of a magnitude, below which its logarithm levels out
-
-
-@dataclass(frozen=True)
-class FeatureThreshold:
-    """Says slip where ``sign * feature > sign * threshold``.
-
-    Args:
-        index: position of the feature.
-        threshold: in the feature's unit.
-        sign: +1 if slip has the larger values, -1 otherwise.
-    """
-
-    index: int
-    threshold: float
-    sign: int
-
-    def __call__(self, features: Tensor) -> Tensor:
-        """Decisions: ``[*, K] -> [*]``, bool."""
-        decision: Tensor = self.sign * features[..., self.index] > self.sign * self.threshold
-        return decision
-
-
-def best_threshold(
-    features: Tensor, is_slip: Tensor, weights: Tensor | None = None
-) -> FeatureThreshold:
-    """The single feature and threshold of the best balanced accuracy on training bins.
-
-    Shape:
-        - features: ``[N, K]``, finite; is_slip: ``[N]``, bool
-        - weights: ``[N]``, of each bin; 1 by default
-
-    Raises:
-        ValueError: if a class is absent.
-    """
-    check_classes(is_slip)
-    weights = torch.ones(len(is_slip), dtype=torch.float64) if weights is None else weights
-    slip, quiet = weights * is_slip, weights * ~is_slip
-    step = slip / slip.sum() - quiet / quiet.sum()
-    values, order = features.sort(dim=0)
-    below = step[order].cumsum(0)[:-1]  # slip recall minus non-slip recall if cut above this value
-    below = torch.where(values[1:] > values[:-1], below, 0.0)  # no cut between equal values
-    best = below.abs().flatten().argmax()
-    row, index = divmod(int(best), features.shape[1])
-    sign = -1 if below[row, index] > 0 else 1
-    lower, upper = float(values[row, index]), float(values[row + 1, index])
-    threshold = lower + (upper - lower) / 2
-    if threshold in (lower, upper):  # neighbouring floats: the side that is not slip
-        threshold = lower if sign > 0 else upper
-    return FeatureThreshold(index, threshold, sign)
 
 
 class SimpleStatistics:
@@ -216,7 +174,7 @@ def _chosen_penalty(z: Tensor, sample: SampledBins) -> float:
     groups, names = sample_groups(sample)
     num_folds = min(len(names), MOST_FOLDS)
     folds = [groups % num_folds == fold for fold in range(num_folds)]
-    folds = [out for out in folds if _has_both(sample.is_slip[~out])]
+    folds = [out for out in folds if has_both_classes(sample.is_slip[~out])]
     if num_folds < 2 or not folds:
         return WIDE_PENALTY
     means = {}
@@ -277,20 +235,6 @@ class RandomForest:
     def metadata(self) -> dict[str, Any]:
         """Its size, JSON-able."""
         return {"trees": len(self._trees)}
-
-
-def _has_both(is_slip: Tensor) -> bool:
-    return bool(is_slip.any()) and not bool(is_slip.all())
-
-
-def check_classes(is_slip: Tensor) -> None:
-    """Refuse bins ``[N]`` of one class.
-
-    Raises:
-        ValueError: if they are.
-    """
-    if not _has_both(is_slip):
-        raise ValueError("baselines need training bins of both classes; got only one")
 
 
 def _single(columns: Tensor) -> NDArray[np.float32]:

@@ -351,7 +351,7 @@ class SlipLearner(L.LightningModule):
         scaled = self.detector.scaled(chosen.to(device))
         score = self.detector.head(scaled).cpu()
         baselines = self.baselines(batch.features, scaled.cpu()) if self.baselines else {}
-        abstention = Abstention.of(self.detector)
+        abstention = Abstention.of(self.detector.info)
         answer = abstention.answer(score) if abstention else None
         for role, part in evaluated_bins(batch, score >= 0, baselines, answer).items():
             self._evaluated[role].append(part)
@@ -364,7 +364,7 @@ class SlipLearner(L.LightningModule):
         baselines = self.baselines.metadata() if self.baselines else {}
         for about in baselines.values():
             about["splits"] = {}
-        pool, abstention = self.detector.pool, Abstention.of(self.detector)
+        pool, abstention = self.detector.pool, Abstention.of(self.detector.info)
         latency = LatencyParts(
             self.detector.look_ahead / pool.sample_rate_hz, pool.bin_samples / pool.sample_rate_hz
         )

@@ -51,11 +51,11 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import SeenBatches, Ticker, bar, content_digest, for_each
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.baselines import best_threshold
 from tactslip_torch.training.recipe import (
     FeatureSelection,
     Recipe,
     balanced_accuracy,
+    best_threshold,
     class_fractions,
     number_of_bins,
     sample_groups,
