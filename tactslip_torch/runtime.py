@@ -8,6 +8,7 @@ import math
 import multiprocessing
 import os
 import secrets
+import stat
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
@@ -237,84 +238,30 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def save_table(
-    path: str | os.PathLike[str],
-    form: str,
-    metadata: Mapping[str, Any],
-    tensors: Mapping[str, Tensor],
-) -> None:
-    """Write tensors and JSON-able metadata to one file, whole or not at all.
+def regular_file(path: str | os.PathLike[str], most_bytes: float = math.inf) -> Path:
+    """The path of a file that can be read from start to end: no folder, device or pipe.
 
-    The same metadata and tensors give the same bytes. Of a view, no more is written than it shows.
+    Opening a pipe would wait for whoever writes to it.
 
     Args:
         path: of the file.
-        form: names the format and, last, its number; ``load_table`` wants the same.
-        metadata: kept as JSON text.
-        tensors: by name.
-    """
-    text = json.dumps(metadata, sort_keys=True)
-    content = {
-        "format": form,
-        "facts": text,
-        "tensors": {name: _alone(tensors[name]) for name in sorted(tensors)},
-        "digest": _digest(text, tensors),
-    }
-    with whole_file(path) as temporary, temporary.open("wb") as file:
-        torch.save(content, file)  # handed a path, it would write its name into the file
-
-
-def load_table(path: str | os.PathLike[str], form: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Metadata and tensors of a file that ``save_table`` wrote; nothing in it is executed.
+        most_bytes: that it may be long.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it has another format, or is damaged.
+        FileNotFoundError: if there is nothing.
+        ValueError: if it is no file, or longer than that.
     """
-    name = os.fspath(path)
-    content = _read(path)
-    kind, number = form.rsplit(" ", 1)
-    if content["format"] in {f"{kind} {earlier}" for earlier in range(1, int(number))}:
-        raise ValueError(
-            f"{name} was made by version 0.1.0 or earlier; make it again, or use that version"
-        )
-    if content["format"] != form:
-        raise ValueError(f"{name} must be of format {form!r}, got {content['format']!r}")
+    path = Path(path)
     try:
-        metadata, tensors = content["facts"], content["tensors"]
-        is_whole = content["digest"] == _digest(metadata, tensors)
-    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError):
-        is_whole = False
-    if not is_whole:
-        raise ValueError(f"{name} is damaged; make it again")
-    return json.loads(metadata), tensors
-
-
-def _read(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What ``save_table`` wrote, unchecked but for its format being text."""
-    name = os.fspath(path)
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise FileNotFoundError(f"no file at {name}") from None
-    except Exception as error:  # torch.load raises many kinds for a file that is not its own
-        raise ValueError(f"{name} is damaged or no file of ours; make it again") from error
-    if not isinstance(content, dict) or not isinstance(content.get("format"), str):
-        raise ValueError(f"{name} is damaged or no file of ours; make it again")
-    return content
-
-
-def _alone(tensor: Tensor) -> Tensor:
-    """The values without a larger storage around them, which ``torch.save`` would write too."""
-    tensor = tensor.detach().cpu().contiguous()
-    is_all = tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
-    return tensor if is_all else tensor.clone()
-
-
-def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
-    names = sorted(tensors)
-    head = torch.frombuffer(bytearray((text + "\n".join(names)).encode()), dtype=torch.uint8)
-    return content_digest(head, *(tensors[name] for name in names))
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise FileNotFoundError(f"no file at {path}") from None
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or pipe"
+        raise ValueError(f"{path} is {kind}, expected a file; copy it to a file first")
+    if status.st_size > most_bytes:
+        raise ValueError(f"{path} has {status.st_size} bytes, at most {most_bytes:.0f} can be read")
+    return path
 
 
 class SeenBatches(dict[str, str]):

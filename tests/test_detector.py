@@ -1,4 +1,5 @@
 import copy
+import math
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from tactslip_torch import FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.model.detector import FORMAT
 from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm, RadialBasis
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.runtime import load_table, save_table
+from tactslip_torch.own_files import load_table, save_table
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -235,6 +236,10 @@ def with_facts(**changes):
     return lambda facts, state: (facts | changes, state)
 
 
+def with_pool(**changes):
+    return lambda facts, state: (facts | {"pool": facts["pool"] | changes}, state)
+
+
 def with_state(**changes):
     changed = {name.replace("__", "."): value for name, value in changes.items()}
     return lambda facts, state: (facts, state | changed)
@@ -243,7 +248,6 @@ def with_state(**changes):
 @pytest.mark.parametrize(
     "change",
     [
-        without("kernel"),
         without("selected"),
         without("info"),
         lambda facts, state: ([], state),
@@ -255,17 +259,25 @@ def with_state(**changes):
         with_facts(window_lengths=[50] * 24),
         with_facts(window_lengths=[51] * 23),
         with_facts(pool={"rate": 2000.0}),
+        with_pool(level=99_999),
+        with_pool(bin_samples=10**9),
+        with_pool(sample_rate_hz=math.nan),
+        with_facts(info={"alarm": 3}),
+        with_facts(info={"calibration": {"kind": "platt", "slope": math.inf, "offset": 0}}),
+        with_facts(kernel={"kind": "polynomial", "degree": 10**400, "offset": 0.5}),
         with_facts(kernel={"kind": "polynomial", "degree": 3, "offset": 0.5}),
         with_facts(kernel={"kind": "sigmoid"}),
         with_state(scaler__minimum=torch.full((12,), torch.nan)),
         with_state(scaler__elbow=torch.ones(12)),
         with_state(head__quadratic=torch.zeros(12)),
+        with_state(head__constant=torch.tensor(torch.nan)),
+        with_state(head__linear=torch.zeros(12, dtype=torch.int64)),
     ],
 )
 def test_what_describes_no_detector_is_refused_in_one_line(change, saved):
     """Whole files, so the digest fits; another program wrote them."""
     save_table(saved, FORMAT, *change(*load_table(saved, FORMAT)))
-    with pytest.raises(ValueError, match="is a damaged detector: ") as caught:
+    with pytest.raises(ValueError, match="is damaged: ") as caught:
         SlipDetector.load(saved)
     assert "\n" not in str(caught.value)
 

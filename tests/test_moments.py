@@ -9,7 +9,7 @@ from sklearn.kernel_ridge import KernelRidge
 
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.moments import FORMAT, ProductSums, SufficientStats
-from tactslip_torch.runtime import load_table, save_table
+from tactslip_torch.own_files import load_table, save_table
 
 NUM = 4
 ABOUT = {"hand": {"name": "paper24", "channels": ["SG1", "PVDF1"]}, "scaler": "range"}

@@ -11,7 +11,7 @@ from tactslip_torch.data.splits import unseen4
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import FORMAT, SlipDetector
-from tactslip_torch.runtime import load_table, save_table
+from tactslip_torch.own_files import load_table, save_table
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker
 
@@ -71,6 +71,6 @@ def test_damaged_filters_are_named_in_one_line(tmp_path, change):
     facts, tensors = load_table(path, FORMAT)
     change(facts)
     save_table(path, FORMAT, facts, tensors)
-    with pytest.raises(ValueError, match="is a damaged detector: ") as error:
+    with pytest.raises(ValueError, match="is damaged: ") as error:
         SlipDetector.load(path)
     assert "\n" not in str(error.value)

@@ -5,19 +5,19 @@ import os
 import pickle
 import random
 import time
+import zipfile
 
 import numpy as np
 import pytest
 import torch
 
+from tactslip_torch.own_files import load_table, save_table
 from tactslip_torch.runtime import (
     SeenBatches,
     content_digest,
     for_each,
     in_parts,
     in_processes,
-    load_table,
-    save_table,
     whole_file,
 )
 
@@ -263,10 +263,10 @@ def test_a_flipped_byte_is_refused_in_one_line_wherever_it_counts(saved):
 def test_content_that_does_not_fit_its_digest_is_refused(saved, change):
     content = torch.load(saved, weights_only=True) | change
     torch.save(content, saved)
-    assert refusal(saved) == f"{saved} is damaged; make it again"
+    assert refusal(saved) == f"{saved} is damaged or no file of ours; make it again"
     content.pop(next(iter(change)))
     torch.save(content, saved)
-    assert refusal(saved) == f"{saved} is damaged; make it again"
+    assert refusal(saved) == f"{saved} is damaged or no file of ours; make it again"
 
 
 class Trap:
@@ -297,6 +297,24 @@ def test_other_files_are_refused_and_nothing_in_them_is_executed(tmp_path):
         load_table(path, "test table 3")
     with pytest.raises(FileNotFoundError, match=r"no file at .*nowhere\.pt"):
         load_table(tmp_path / "nowhere.pt", FORM)
+
+
+@pytest.mark.parametrize("how", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA])
+def test_what_inflates_is_refused_before_it_does(tmp_path, how, saved):
+    """2 GB of zeros in some 2 MB took as much memory, and 27 s."""
+    packed = tmp_path / "packed.pt"
+    with zipfile.ZipFile(saved) as whole, zipfile.ZipFile(packed, "w", how) as file:
+        for member in whole.infolist():
+            file.writestr(member.filename, whole.read(member))
+    assert refusal(packed) == f"{packed} is damaged or no file of ours; make it again"
+
+
+def test_what_is_no_file_is_refused_without_a_wait(tmp_path):
+    os.mkfifo(tmp_path / "pipe.pt")
+    for path, said in ((tmp_path / "pipe.pt", "a device or pipe"), (tmp_path, "a folder")):
+        assert refusal(path) == f"{path} is {said}, expected a file; copy it to a file first"
+    with pytest.raises(ValueError, match="bytes, at most 10 can be read"):
+        load_table(__file__, FORM, 10)
 
 
 # --- batches seen and digests -------------------------------------------------------------------

@@ -26,9 +26,10 @@ from tactslip_torch.deploy.stream import Timing, stream_graph
 from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import KEY, AlarmSettings, calibration_of
+from tactslip_torch.own_files import SIDECAR as FORMAT
+from tactslip_torch.own_files import read_json
 from tactslip_torch.runtime import __version__, plain, whole_file
 
-FORMAT = "tactslip_torch onnx 1"
 CERTIFICATE_FORMAT = "tactslip_torch certificate 1"
 FILES: dict[GraphKind, str] = {"bin": "model.onnx", "stream": "stream.onnx"}
 """What the file of each graph is called."""
@@ -190,9 +191,13 @@ def sidecar_path(model: Path) -> Path:
 
 
 def read_sidecar(model: Path) -> dict[str, Any]:
-    """Metadata of a model, with name, digest and length of its file."""
-    metadata: dict[str, Any] = json.loads(sidecar_path(model).read_text())
-    return metadata
+    """Metadata of a model, with name, digest and length of its file.
+
+    Raises:
+        FileNotFoundError: if they are not there.
+        ValueError: if they are damaged.
+    """
+    return read_json(sidecar_path(model), FORMAT)
 
 
 def stale_graphs(source: Path) -> tuple[Path, ...]:

@@ -35,6 +35,7 @@ from tactslip_torch.features.descriptors import DESCRIPTORS
 from tactslip_torch.features.ops import bounded_gradient, is_concrete, is_traced, saturating
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.native import BackendName
+from tactslip_torch.own_files import MOST_BIN_SAMPLES
 from tactslip_torch.runtime import check_tensor, for_each
 from tactslip_torch.signals.spectrum import SpectrumMethod, spectrum_matrix
 from tactslip_torch.signals.wavelet import (
@@ -116,6 +117,11 @@ class FeaturePool(nn.Module):
         super().__init__()
         if not sample_rate_hz > 0:
             raise ValueError(f"sample_rate_hz must be positive, got {sample_rate_hz}")
+        if bin_samples > MOST_BIN_SAMPLES:
+            raise ValueError(
+                f"bins have at most {MOST_BIN_SAMPLES} samples, got {bin_samples}; take shorter bins "
+                "(labels.bin_ms) or a lower rate (data.resample_hz)"
+            )
         if arithmetic not in get_args(Arithmetic):
             raise ValueError(
                 f"arithmetic must be one of {', '.join(get_args(Arithmetic))}, got {arithmetic!r}"

@@ -34,10 +34,13 @@ from tactslip_torch.model.missing_channels import (
 )
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName, Filters, Machine, Scores, backend_of
-from tactslip_torch.runtime import are_unchanged, load_table, save_table, stamps_of
+from tactslip_torch.own_files import DETECTOR as FORMAT
+from tactslip_torch.own_files import FORGED, load_table, save_table
+from tactslip_torch.runtime import are_unchanged, stamps_of
 from tactslip_torch.signals.filtering import ChannelFilter
 
-FORMAT = "tactslip_torch detector 3"
+MOST_BYTES = 2**30
+"""Of a file."""
 
 
 class SlipDetector(nn.Module):
@@ -465,33 +468,35 @@ class SlipDetector(nn.Module):
         backend_of(backend)
         name = os.fspath(path)
         try:
-            metadata, state = load_table(path, FORMAT)
+            metadata, state = load_table(path, FORMAT, MOST_BYTES)
         except FileNotFoundError:
             raise FileNotFoundError(f"no detector at {name}") from None
         try:
             return cls._from_table(metadata, state, backend)
-        except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        except FORGED as error:
             reason = str(error).splitlines()[0]
-            raise ValueError(f"{name} is a damaged detector: {reason}") from error
+            raise ValueError(f"{name} is damaged: {reason}") from error
 
     @classmethod
     def _from_table(
         cls, metadata: Mapping[str, Any], state: Mapping[str, Tensor], backend: BackendName
     ) -> SlipDetector:
         """What ``save`` wrote."""
+        if odd := [name for name, value in state.items() if not value.is_floating_point()]:
+            raise ValueError(f"{odd[0]} must hold floating-point numbers")
 
         def part(name: str) -> dict[str, Any]:
             start = f"{name}."
             own = {key: value for key, value in state.items() if key.startswith(start)}
             return {key.removeprefix(start): value for key, value in own.items()}
 
-        kernel, hand = metadata["kernel"], HandLayout.from_rows(metadata["channels"])
+        kernel, hand = metadata.get("kernel"), HandLayout.from_rows(metadata["channels"])
         head: Head
         if kernel is None:
             head = QuadraticForm(**part("head"))
         else:
             head = KernelSum(**part("head"), kernel=kernel_from_dict(kernel))
-        pooling = metadata["pooling"]
+        pooling = metadata.get("pooling")
         return cls(
             FeaturePool(hand, **metadata["pool"]),
             ChannelFilter(

@@ -21,9 +21,10 @@ from torch import Tensor
 
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.solve import check_weights
-from tactslip_torch.runtime import SeenBatches, content_digest, load_table, save_table
+from tactslip_torch.own_files import SUMS as FORMAT
+from tactslip_torch.own_files import load_table, save_table
+from tactslip_torch.runtime import SeenBatches, content_digest
 
-FORMAT = "tactslip_torch sums 2"
 _CLASSES = ("non-slip", "slip")
 _CHUNK_BINS = 512  # whose products of two variables are held at a time
 _BLOCK = 8  # variables; more hold more sums twice, fewer make smaller products

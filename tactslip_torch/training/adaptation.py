@@ -43,7 +43,9 @@ from tactslip_torch.model.leave_one_group_out import MOST_CONDITION, HeldOut, re
 from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.onset.decisions import KEY as ALARM
-from tactslip_torch.runtime import SeenBatches, bar, content_digest, load_table, save_table
+from tactslip_torch.own_files import STATISTICS as _FORMAT
+from tactslip_torch.own_files import load_table, save_table
+from tactslip_torch.runtime import SeenBatches, bar, content_digest
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.plan import TrainingPass, solve_metadata
 from tactslip_torch.training.recipe import recalls
@@ -59,7 +61,6 @@ Where every training material in turn was new (simulated, ``benchmarks.adapting`
 kept rising to about the last of these, and what the others lost rose with it.
 """
 
-_FORMAT = "tactslip_torch statistics 4"
 _JOURNAL = "adaptations"  # under which SlipDetector.info keeps the entries of all steps
 _CHUNK = 1024  # bins of whole recordings whose columns are solved at a time, unless one has more
 _MOST_WEIGHT = 8000.0  # of a bin; more would hide the others

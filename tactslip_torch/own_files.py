@@ -1,0 +1,456 @@
+"""The project's own files: tables of tensors and JSON, and the one schema of what they hold.
+
+A table is an archive as ``torch.save`` writes it. The reader here takes members that are stored as
+they are, so a file takes no more memory than it is long, and executes nothing in it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import pickle
+import pickletools
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.hand import Adapting
+from tactslip_torch.runtime import content_digest, regular_file, whole_file
+
+FORGED = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+"""What comes of a file that another program wrote, where a part is made of what it says."""
+
+# Tables ------------------------------------------------------------------------------------------
+
+
+def save_table(
+    path: str | os.PathLike[str],
+    form: str,
+    metadata: Mapping[str, Any],
+    tensors: Mapping[str, Tensor],
+) -> None:
+    """Write tensors and JSON-able metadata to one file, whole or not at all.
+
+    The same metadata and tensors give the same bytes. Of a view, no more is written than it shows.
+
+    Args:
+        path: of the file.
+        form: names the format and, last, its number; ``load_table`` wants the same.
+        metadata: kept as JSON text.
+        tensors: by name.
+    """
+    text = json.dumps(metadata, sort_keys=True)
+    content = {
+        "format": form,
+        "facts": text,
+        "tensors": {name: _alone(tensors[name]) for name in sorted(tensors)},
+        "digest": _digest(text, tensors),
+    }
+    with whole_file(path) as temporary, temporary.open("wb") as file:
+        torch.save(content, file)  # handed a path, it would write its name into the file
+
+
+def load_table(
+    path: str | os.PathLike[str], form: str, most_bytes: int = 2**33
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Metadata and tensors of a file that ``save_table`` wrote; nothing in it is executed.
+
+    Args:
+        path: of the file.
+        form: that it must be of.
+        most_bytes: that it may be long.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no file, has another format, is longer than that, is damaged, or holds
+            what ``SCHEMAS`` does not allow.
+    """
+    name = os.fspath(path)
+    content = _read(regular_file(path, most_bytes))
+    kind, number = form.rsplit(" ", 1)
+    if content["format"] in {f"{kind} {earlier}" for earlier in range(1, int(number))}:
+        raise ValueError(
+            f"{name} was made by version 0.1.0 or earlier; make it again, or use that version"
+        )
+    if content["format"] != form:
+        raise ValueError(f"{name} must be of format {form!r}, got {content['format']!r:.80}")
+    try:
+        metadata, tensors = content["facts"], content["tensors"]
+        is_whole = content["digest"] == _digest(metadata, tensors)
+        metadata = json.loads(metadata)
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
+        is_whole = False
+    if not is_whole:
+        raise ValueError(f"{name} is damaged or no file of ours; make it again")
+    checked(name, metadata, form)
+    for place, tensor in tensors.items():
+        is_finite = form not in SCHEMAS or bool(tensor.isfinite().all())
+        if not is_finite:
+            raise ValueError(f"{name} is damaged: {place} must be finite; make it again")
+    return metadata, tensors
+
+
+def _alone(tensor: Tensor) -> Tensor:
+    """The values without a larger storage around them, which ``torch.save`` would write too."""
+    tensor = tensor.detach().cpu().contiguous()
+    is_all = tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
+    return tensor if is_all else tensor.clone()
+
+
+def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
+    names = sorted(tensors)
+    head = torch.frombuffer(bytearray((text + "\n".join(names)).encode()), dtype=torch.uint8)
+    return content_digest(head, *(tensors[name] for name in names))
+
+
+_OPCODES = frozenset(
+    name
+    for line in (
+        "PROTO STOP MARK EMPTY_DICT EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINUNICODE BININT",
+        "BININT1 BININT2 LONG1 NONE NEWTRUE NEWFALSE BINPUT LONG_BINPUT BINGET LONG_BINGET",
+        "SETITEM SETITEMS GLOBAL BINPERSID REDUCE",
+    )
+    for name in line.split()
+)
+_STORAGES = {
+    f"{name}Storage": dtype
+    for name, dtype in {
+        "Double": torch.float64,
+        "Float": torch.float32,
+        "Half": torch.float16,
+        "BFloat16": torch.bfloat16,
+        "Long": torch.int64,
+        "Int": torch.int32,
+        "Short": torch.int16,
+        "Char": torch.int8,
+        "Byte": torch.uint8,
+        "Bool": torch.bool,
+    }.items()
+}
+
+
+class _TableReader(pickle.Unpickler):
+    """Of an archive; it knows tensors that fill their storage, and nothing else."""
+
+    def __init__(self, archive: zipfile.ZipFile, root: str) -> None:
+        text = archive.read(f"{root}/data.pkl")
+        for opcode, _, _ in pickletools.genops(text):
+            if opcode.name not in _OPCODES:
+                raise ValueError(f"{opcode.name} has no place in a table")
+        super().__init__(io.BytesIO(text))
+        self._archive, self._root = archive, root
+        self._storages: dict[str, Tensor] = {}
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module == "torch" and name in _STORAGES:
+            return _STORAGES[name]
+        known = {
+            ("torch._utils", "_rebuild_tensor_v2"): _tensor,
+            ("collections", "OrderedDict"): dict,
+        }
+        return known[module, name]
+
+    def persistent_load(self, about: Any) -> Tensor:
+        _, dtype, key, _, num = about
+        if key not in self._storages:
+            content = bytearray(self._archive.read(f"{self._root}/data/{key}"))
+            made = (
+                torch.frombuffer(content, dtype=dtype) if content else torch.empty(0, dtype=dtype)
+            )
+            self._storages[key] = made
+        storage = self._storages[key]
+        if storage.dtype != dtype or len(storage) != num:
+            raise ValueError("a storage has another length")
+        return storage
+
+
+def _tensor(storage: Tensor, offset: int, shape: Any, stride: Any, *_: Any) -> Tensor:
+    tensor = storage.reshape(shape)
+    if offset or (tensor.numel() and tensor.stride() != tuple(stride)):
+        raise ValueError("a tensor is a view")
+    return tensor
+
+
+_KNOWN: Mapping[tuple[str, str], Any] = {
+    ("torch._utils", "_rebuild_tensor_v2"): _tensor,
+    ("collections", "OrderedDict"): dict,
+}
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """What ``save_table`` wrote, unchecked but for its format being text."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            is_stored = all(
+                member.compress_type == zipfile.ZIP_STORED and not member.flag_bits & 1
+                for member in members
+            )
+            if not is_stored or sum(m.file_size for m in members) > path.stat().st_size:
+                raise ValueError("members must be stored as they are")
+            content = _TableReader(archive, members[0].filename.split("/")[0]).load()
+    except Exception as error:  # archives and pickles raise many kinds for what is not their own
+        raise ValueError(f"{path} is damaged or no file of ours; make it again") from error
+    if not isinstance(content, dict) or not isinstance(content.get("format"), str):
+        raise ValueError(f"{path} is damaged or no file of ours; make it again")
+    return content
+
+
+def read_json(path: str | os.PathLike[str], form: str, most_bytes: int = 2**24) -> dict[str, Any]:
+    """The content of a JSON file of ours, held against the schema of its format.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no JSON, longer than that, or not what the schema wants.
+    """
+    try:
+        content = json.loads(regular_file(path, most_bytes).read_bytes())
+    except (ValueError, RecursionError) as error:
+        if str(error).startswith(os.fspath(path)):
+            raise
+        raise ValueError(f"{os.fspath(path)} is damaged ({error}); make it again") from None
+    found: dict[str, Any] = checked(os.fspath(path), content, form)
+    return found
+
+
+# Schema ------------------------------------------------------------------------------------------
+#
+# What a field may be: a function of its value that returns what was wanted, or None if it is right;
+# a dictionary of the fields of a mapping ("name?" may be absent or null, "*" is of all others); a
+# list of one such thing for a list, and of how many entries it may have at most.
+
+Wanted = Callable[[Any], str | None] | Mapping[str, Any] | list[Any]
+
+
+def checked(name: str, content: Any, form: str) -> Any:
+    """``content``, if it is what ``SCHEMAS`` say of this format.
+
+    Raises:
+        ValueError: that names the file, the field, what was wanted and what it is.
+    """
+    if problem := _problem(content, SCHEMAS.get(form, _any), ""):
+        raise ValueError(f"{name} is damaged: {problem}; make it again")
+    return content
+
+
+def _problem(value: Any, wanted: Wanted, field: str) -> str | None:
+    if callable(wanted):
+        said = wanted(value)
+        return said and f"{field} must be {said}, got {value!r:.60}"
+    if isinstance(wanted, list):
+        each, most = wanted
+        if not isinstance(value, list) or len(value) > most:
+            said = f"{len(value)}" if isinstance(value, list) else f"{value!r:.60}"
+            return f"{field} must be a list of at most {most}, got {said}"
+        problems = (_problem(x, each, f"{field}[{i}]") for i, x in enumerate(value))
+        return next(filter(None, problems), None)
+    if not isinstance(value, dict):
+        return f"{field or 'content'} must be a mapping, got {value!r:.60}"
+    before = f"{field}." if field else ""
+    for key, each in wanted.items():
+        own = key.rstrip("?")
+        if key == "*" or (own != key and value.get(own) is None):
+            continue
+        if own not in value:
+            return f"{before}{own} is missing"
+        if said := _problem(value[own], each, f"{before}{own}"):
+            return said
+    known = {key.rstrip("?") for key in wanted}
+    for key in value.keys() - known:
+        if "*" not in wanted:
+            return f"{before}{key:.60} is not known"
+        if said := _problem(value[key], wanted["*"], f"{before}{key:.60}"):
+            return said
+    return None
+
+
+def _number(least: float, most: float, *, whole: bool = False) -> Callable[[Any], str | None]:
+    kind = "a whole number" if whole else "a number"
+
+    def wanted(value: Any) -> str | None:
+        is_number = type(value) is int or (type(value) is float and not whole)
+        is_right = is_number and least <= value <= most
+        return None if is_right else f"{kind} from {least:g} to {most:g}"
+
+    return wanted
+
+
+def _one_of(*choices: Any) -> Callable[[Any], str | None]:
+    def wanted(value: Any) -> str | None:
+        is_known = any(type(value) is type(choice) and value == choice for choice in choices)
+        return None if is_known else f"one of {', '.join(map(str, choices))}"
+
+    return wanted
+
+
+def _any(value: Any) -> str | None:
+    return None
+
+
+def _text(value: Any) -> str | None:
+    return None if isinstance(value, str) else "text"
+
+
+def _bool(value: Any) -> str | None:
+    return None if isinstance(value, bool) else "true or false"
+
+
+def _either(first: Wanted, second: Wanted) -> Callable[[Any], str | None]:
+    """The first or, of mappings and where the first is wrong, the second."""
+
+    def wanted(value: Any) -> str | None:
+        said = _problem(value, first, "it") and _problem(value, second, "it")
+        return said and said.removeprefix("it must be ").split(", got ")[0]
+
+    return wanted
+
+
+_positive, _share = _number(1e-30, 1e30), _number(0, 1)
+_finite, _seconds = _number(-1e300, 1e300), _number(0, 1e9)
+_threshold = _number(-1e300, math.inf)
+_rate = _number(1e-3, 1e7)
+_count = _number(0, 2**48, whole=True)
+_names = [_text, 10**6]
+MOST_BIN_SAMPLES, MOST_CHANNELS, MOST_FRAME = 1024, 2048, 4001
+"""Of a detector: beyond these its constant matrices take gigabytes or minutes."""
+
+_CHANNELS = [
+    {
+        **dict.fromkeys(("name", "kind", "finger", "segment"), _text),
+        "adapting?": _one_of(*get_args(Adapting)),
+    },
+    MOST_CHANNELS,
+]
+_FILTERS = {
+    "name": _text,
+    **{name: [_number(-1e6, 1e6), 512] for name in ("dec_lo", "dec_hi", "rec_lo", "rec_hi")},
+}
+_POOL = {
+    "sample_rate_hz": _rate,
+    "bin_samples": _number(1, MOST_BIN_SAMPLES, whole=True),
+    "wavelet": _either(_text, _FILTERS),
+    "level": _number(1, 16, whole=True),
+    "spectrum": _text,
+    "arithmetic": _text,
+}
+_KERNEL = {
+    "kind": _text,
+    "degree?": _number(1, 100),
+    "offset?": _number(0, 1e100),
+    "gamma?": _positive,
+}
+_CALIBRATION = {
+    "kind": _text,
+    "slope?": _number(0, 1e300),
+    "offset?": _finite,
+    "scores?": [_finite, 10**5],
+    "llrs?": [_finite, 10**5],
+}
+_RULE = {
+    "name": _text,
+    "k?": _number(1, 10**4, whole=True),
+    "n?": _number(1, 10**4, whole=True),
+    "drift?": _finite,
+    "evidence?": _number(1e-12, 1),
+    "ceiling?": _number(1e-300, math.inf),
+}
+_ONSET = {
+    "hop_samples": _number(1, 10**5, whole=True),
+    "mains_hz": _number(10, 1000),
+    "comb_periods": _number(1, 16, whole=True),
+    "fast_knee": [_positive, 64],
+    "slow_knee": [_positive, 64],
+    **{name: [_finite, 4096] for name in ("minimum", "maximum", "linear")},
+    "quadratic": [[_finite, 4096], 4096],
+    "constant": _finite,
+    "threshold": _threshold,
+    "lead_s": _number(-1e6, 1e6),
+}
+_ALARM = {
+    "hop_samples": _number(1, 10**7, whole=True),
+    "calibration": _CALIBRATION,
+    "rule": _RULE,
+    "threshold": _threshold,
+    "target_per_hour?": _number(1e-9, 1e9),
+    "slip_share": _share,
+    "rearm_s": _seconds,
+    "refractory_s": _seconds,
+    "lead_s": _number(-1e6, 1e6),
+    "metadata": {"*": _any},
+    "onset?": _ONSET,
+}
+_ABSTAIN = {"coverage": _share, "low": _number(-1e300, 0), "high": _number(0, 1e300), "*": _any}
+_INFO = {
+    "alarm?": _ALARM,
+    "calibration?": _CALIBRATION,
+    "abstain?": _ABSTAIN,
+    "simulated?": _bool,
+    "units?": _text,
+    "features_dtype?": _one_of("float64", "float32"),
+    "train_materials?": _names,
+    "train_sessions?": _names,
+    "*": _any,
+}
+_SUMS = {
+    "num_features": _number(1, 10**5, whole=True),
+    "degree?": _one_of(1, 2),
+    "about?": {"*": _any},
+}
+DETECTOR, SUMS, STATISTICS = (
+    "tactslip_torch detector 3",
+    "tactslip_torch sums 2",
+    "tactslip_torch statistics 4",
+)
+SIDECAR = "tactslip_torch onnx 1"
+SCHEMAS: Mapping[str, Wanted] = {
+    DETECTOR: {
+        "channels": _CHANNELS,
+        "pool": _POOL,
+        "window_lengths": [_number(1, MOST_FRAME, whole=True), MOST_CHANNELS],
+        "polyorder": _number(0, 20, whole=True),
+        "align": _text,
+        "kernels?": {"*": [_number(-1e6, 1e6), MOST_FRAME]},
+        "selected": [_number(0, 10**7, whole=True), 10**6],
+        "pooling?": {"names": [[_text, 8], 10**6]},
+        "kernel?": _KERNEL,
+        "info": _INFO,
+    },
+    SUMS: {**_SUMS, "batches": {"*": _text}},
+    SIDECAR: {
+        "format": _one_of(SIDECAR),
+        "graph": _one_of("bin", "stream"),
+        "precision": _one_of("float32", "float64"),
+        "channels": [_text, MOST_CHANNELS],
+        "kinds": [_text, MOST_CHANNELS],
+        "sample_rate_hz": _rate,
+        "bin_samples": _number(1, MOST_BIN_SAMPLES, whole=True),
+        "onnx_bytes": _count,
+        "onnx_sha256": _text,
+        "detector_sha256": _text,
+        "calibration?": _CALIBRATION,
+        "abstain?": _ABSTAIN,
+        "check": {"worst_sd": _number(0, 1e300), "*": _any},
+        "certificate?": {
+            "holds": _bool,
+            "simulated?": _bool,
+            "margin": _number(0, 1e300),
+            "*": _any,
+        },
+        "*": _any,
+    },
+}
+"""What the metadata of each format must be."""
