@@ -30,7 +30,7 @@ from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import calibration_of
-from tactslip_torch.runtime import load_table, save_table
+from tactslip_torch.own_files import load_table, save_table
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.spectrum import SpectrumMethod
 from tactslip_torch.signals.wavelet import highest_level

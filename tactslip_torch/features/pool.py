@@ -119,8 +119,8 @@ class FeaturePool(nn.Module):
             raise ValueError(f"sample_rate_hz must be positive, got {sample_rate_hz}")
         if bin_samples > MOST_BIN_SAMPLES:
             raise ValueError(
-                f"bins have at most {MOST_BIN_SAMPLES} samples, got {bin_samples}; take shorter bins "
-                "(labels.bin_ms) or a lower rate (data.resample_hz)"
+                f"bins have at most {MOST_BIN_SAMPLES} samples, got {bin_samples}; take shorter "
+                "bins (labels.bin_ms) or a lower rate (data.resample_hz)"
             )
         if arithmetic not in get_args(Arithmetic):
             raise ValueError(
