@@ -434,10 +434,14 @@ class _RocketDetector:
         """Samples behind a bin that the longest frame takes in."""
         return self.channel_filter.context_after
 
-    def predict(self, bins: torch.Tensor, *, given: torch.dtype) -> Prediction:
-        """Score filtered bins ``[N, C, n]``; a channel that is missing counts as silent."""
-        is_missing = self.pool.is_missing(bins)
-        is_valid = (self.pool.is_alive(bins) & ~is_missing).all(-1)
+    def predict_raw(self, samples: torch.Tensor, *, given: torch.dtype) -> Prediction:
+        """Score raw bins with their context; a channel that is missing counts as silent."""
+        bins = self.channel_filter.valid(samples)
+        is_missing, raw_magnitude = (
+            self.pool.is_missing(bins),
+            self.channel_filter.raw_magnitude(samples),
+        )
+        is_valid = (self.pool.is_alive(bins, given, raw_magnitude) & ~is_missing).all(-1)
         windows = torch.where(is_missing[..., None], 0.0, bins).float().contiguous()
         score = torch.from_numpy(np.asarray(self.scores(windows.numpy()))).reshape(-1).to(given)
         return Prediction(score, is_valid, is_missing, torch.zeros_like(score))

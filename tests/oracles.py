@@ -100,7 +100,7 @@ def mode(x: np.ndarray, scale: float) -> float:
 def entropy(x: np.ndarray) -> float:
     if np.ptp(x) == 0:
         return 0.0
-    q = np.floor(255 * ((x - x.min()) / np.ptp(x)) + 0.5 + 1e-9)
+    q = np.floor(255 * ((x - x.min()) / np.ptp(x)) + 0.5 + 1e-6)
     counts, _ = np.histogram(q, bins=np.unique(q))  # NumPy's last cell holds both its edges
     p = counts / len(x)
     return float(-(p * np.log2(p + EPS)).sum())

@@ -146,8 +146,8 @@ class Louder:
         self.needed_index, self.look_ahead = detector.needed_index, detector.look_ahead
         self._detector = detector
 
-    def predict(self, bins, *, given=None):
-        return self._detector.predict(bins, given=given)
+    def predict_raw(self, samples, *, given=None):
+        return self._detector.predict_raw(samples, given=given)
 
 
 @pytest.fixture(scope="module")

@@ -129,12 +129,12 @@ def test_a_baseline_scores_filtered_bins(name, rng):
     films = list(HAND.indices("PVDF"))
     assert detector.needed_index.tolist() == films
     assert detector.look_ahead == 5  # half the films' frame, not the gauges' 25
-    bins = ChannelFilter([51, 51, 11, 11]).valid(raw_bins(20))
-    score, is_valid, is_missing, _ = detector.predict(bins)
-    assert torch.equal(score, SCORES[name](bins, films))
+    samples = raw_bins(20)
+    score, is_valid, is_missing, _ = detector.predict_raw(samples)
+    assert torch.equal(score, SCORES[name](ChannelFilter([51, 51, 11, 11]).valid(samples), films))
     assert is_valid.all()
     assert not is_missing.any()
-    in_32 = detector.predict(bins, given=torch.float32)
+    in_32 = detector.predict_raw(samples, given=torch.float32)
     assert in_32.score.dtype == torch.float32
     torch.testing.assert_close(in_32.score.double(), score, rtol=0, atol=1e-4)
 
@@ -142,17 +142,17 @@ def test_a_baseline_scores_filtered_bins(name, rng):
 @pytest.mark.parametrize("name", SCORES)
 def test_a_missing_film_is_flagged_and_counts_as_silent(name):
     detector = baseline(name)
-    bins = ChannelFilter([51, 51, 11, 11]).valid(raw_bins(5))
-    whole = detector.predict(bins)
-    bins[1, 2, 30] = torch.nan  # a film
-    bins[2, 0, 30] = torch.inf  # a gauge, which no score depends on
-    bins[3, 3] = 0.1  # a dead film
-    bins[4] = torch.nan
-    found = detector.predict(bins)
+    samples = raw_bins(5)
+    whole = detector.predict_raw(samples)
+    samples[1, 2, 60] = torch.nan  # a film
+    samples[2, 0, 60] = torch.inf  # a gauge, which no score depends on
+    samples[3, 3] = 0.1  # a dead film
+    samples[4] = torch.nan
+    found = detector.predict_raw(samples)
     assert found.score.isfinite().all()
     assert found.is_valid.tolist() == [True, False, True, False, False]
     assert found.is_missing.sum(-1).tolist() == [0, 1, 1, 0, 4]
-    other = SCORES[name](bins[1:2], [3])
+    other = SCORES[name](ChannelFilter([51, 51, 11, 11]).valid(samples)[1:2], [3])
     torch.testing.assert_close(found.score[1:2], other)
     torch.testing.assert_close(found.score[[0, 2]], whole.score[[0, 2]])
 
@@ -163,5 +163,5 @@ def test_a_baseline_that_does_not_exist_or_feels_nothing_is_refused():
     gauges = HandLayout(tuple(c for c in HAND.channels if c.kind == "SG"))
     with pytest.raises(ValueError, match="needs a film"):
         baseline("largest_detail", pool=FeaturePool(gauges), channel_filter=ChannelFilter([51, 51]))
-    with pytest.raises(ValueError, match="expected bins"):
-        baseline("largest_detail").predict(torch.randn(2, 3, 100))
+    with pytest.raises(ValueError, match="expected samples"):
+        baseline("largest_detail").predict_raw(torch.randn(2, 3, 150))

@@ -127,14 +127,15 @@ def test_every_extreme_gives_a_finite_score_or_a_flag(kind, detector):
     samples = extreme_bins(kind, (16, 24, 150), torch.Generator().manual_seed(3), torch.float32)
     found = detector.predict_raw(samples)
     assert found.score.isfinite().all()
-    if kind in ("constant", "zero"):
+    if kind in ("constant", "zero", "tone without gain"):
         assert not found.is_valid.any()
     if kind in ("plain", "integers", "rails", "alternating"):
         assert found.is_valid.float().mean() > 0.9
     single = copy.deepcopy(detector).float()  # as in float64 but for the head
-    z = scaled_of(detector, samples.double())
+    is_known = found.is_valid | (kind != "tone without gain")  # of which rounding is left
+    z = scaled_of(detector, samples[is_known].double())
     expected = single.head(z.float())
-    torch.testing.assert_close(single.score_raw(samples), expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(single.score_raw(samples[is_known]), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_all_channels_missing_gives_the_score_of_what_is_known_beforehand(detector):

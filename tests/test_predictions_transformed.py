@@ -105,6 +105,60 @@ def test_compiled_it_holds_for_other_bins(detector, monkeypatch):
         assert_same(compiled(bins), detector.predict(bins))
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
+def test_a_detector_compiles():
+    detector = with_gaussians(seed=SEED)
+    torch.compiler.reset()
+    compiled = torch.compile(detector, backend="eager")
+    for bins in (healthy_bins(detector), healthy_bins(detector).float()):
+        assert_same([compiled(bins)], [detector(bins)])
+
+
+# Autocast and other kinds of numbers -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("backend", ["native", "torch"])
+def test_autocast_changes_nothing(backend):
+    """Not even in a head of float32, whose products it would make in bfloat16."""
+    detector = small_detector(backend=backend).float()
+    samples = raw_bins(20).float()
+    bins = detector.channel_filter.valid(samples)
+    features = detector.extractor(bins)
+    calls = (
+        (detector.predict_raw, samples),
+        (detector.score_raw, samples.clone().requires_grad_()),
+        (detector, bins),
+        (detector.pool, bins.clone().requires_grad_()),
+        (detector.score_features, features),
+    )
+    for call, x in calls:
+        plain = call(x)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            narrowed = call(x)
+        torch.testing.assert_close(narrowed, plain, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("convert", "message"),
+    [
+        (torch.Tensor.bfloat16, r"got torch.bfloat16; convert with .float\(\) or .double\(\)"),
+        (torch.Tensor.half, "got torch.float16; convert"),
+        (torch.Tensor.int, "got torch.int32; convert"),
+        (torch.Tensor.numpy, "got numpy.ndarray; use torch.as_tensor"),
+        (torch.Tensor.tolist, "got list; use torch.as_tensor"),
+    ],
+)
+def test_what_is_no_tensor_of_volts_is_refused(convert, message):
+    detector, samples = small_detector(), raw_bins(2)
+    for call in (detector.predict_raw, detector.score_raw):
+        with pytest.raises((TypeError, ValueError), match=message):
+            call(convert(samples))
+    for call in (detector.predict, detector, detector.pool):
+        with pytest.raises((TypeError, ValueError), match=message):
+            call(convert(samples[..., 25:125]))
+
+
 # Inference mode ----------------------------------------------------------------------------------
 
 
@@ -132,8 +186,12 @@ def test_a_change_under_inference_mode_is_followed(tmp_path):
         torch.testing.assert_close(made.predict(bins).score, before + 1, rtol=1e-9, atol=1e-9)
 
 
-def test_gradients_are_open_after_a_first_judgement_under_inference_mode():
+@pytest.mark.parametrize("is_loaded", [False, True])
+def test_gradients_are_open_after_a_first_use_under_inference_mode(is_loaded, tmp_path):
     detector = with_gaussians(seed=SEED)
+    detector.save(tmp_path / "detector.pt")
     with torch.inference_mode():
+        if is_loaded:
+            detector = SlipDetector.load(tmp_path / "detector.pt")
         detector.predict(broken_bins(detector))
     assert gradient_of(detector, broken_bins(detector)).isfinite().all()

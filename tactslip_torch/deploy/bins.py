@@ -136,9 +136,6 @@ def masked_input(graph: Graph, detector: SlipDetector) -> Value:
 def score_bins(windows: Value, detector: SlipDetector, masked: Value) -> Scored:
     """Score raw bins.
 
-    Where samples of a bin differ by more than their precision can hold, or by so little that they
-    are denormal in it, their channel may count as missing or dead (1e38 V and 1e-38 V in float32).
-
     Args:
         windows: raw samples in volts of the channels in use, in the dtype that scores shall have.
         detector: that scores them.
@@ -200,15 +197,14 @@ def _samples(windows: Value, detector: SlipDetector, frame: Frame) -> tuple[Samp
     before, after = detector.channel_filter.reaches[frame.channels[0]]
     start = raw.before - before
     x: Any = windows.take([raw.channels.index(channel) for channel in frame.channels], 1)
-    x = x.slice(start, start + before + raw.bin + after, 2)
-    first = x.slice(before, before + 1, 2)
-    moving, unit = x - first, None
+    x = x.slice(start, start + before + raw.bin + after, 2).double()
+    unit, loudest = None, x.abs().amax(2)
     if dtype == F64:  # whose squares float64 does not hold
-        unit = x.abs().amax(2, keepdim=True).maximum(TINY)
-        moving, first = moving / unit, first / unit
-        shifted = graph.concat(moving, first, axis=2)
-    else:
-        shifted = graph.concat(x.double() - first.double(), first.double(), axis=2)
+        unit = loudest.maximum(TINY).unsqueeze(2)
+        x, loudest = x / unit, loudest / unit.squeeze(2)
+    first = x.slice(before, before + 1, 2)
+    moving = x - first
+    shifted = graph.concat(moving, first, axis=2)
     moving = moving @ frame.smooth.T
     filtered = moving + first
     high, low = filtered.amax(2), filtered.amin(2)
@@ -218,8 +214,7 @@ def _samples(windows: Value, detector: SlipDetector, frame: Frame) -> tuple[Samp
     unit = None if unit is None else unit.squeeze(2)
     largest = min(LARGEST_SAMPLE, float(np.finfo(dtype).max))
     is_known = (probe if unit is None else probe * unit) <= largest
-    of_dtype = torch.empty(0, dtype=torch.float64 if dtype == F64 else torch.float32)
-    inverse = detector.pool.inverse_span(of_dtype)[list(frame.channels)]
-    is_alive = (high - low) * inverse > scale
-    values: tuple[Any, ...] = shifted, moving, scale.double(), unit
-    return Samples(*values), ~is_known, is_alive & is_known
+    given = torch.float64 if dtype == F64 else torch.float32
+    inverse = detector.pool.inverse_span(given, is_raw=True)[list(frame.channels)]
+    is_alive = (high - low) * inverse > loudest
+    return Samples(shifted, moving, scale, unit), ~is_known, is_alive & is_known

@@ -28,7 +28,7 @@ from tactslip_torch.features.ops import ascending, counted, like, looked_up, roo
 
 ENTROPY_LEVELS = 255
 RUN_TOLERANCE = {torch.float64: 1e-12, torch.float32: 2.0**-20}
-HALF_SLACK = {torch.float64: 1e-9, torch.float32: 2.0**-13}
+HALF_SLACK = {torch.float64: 1e-6, torch.float32: 2.0**-13}
 CV_FLOOR = 1e-6
 CV_ZERO = 1e-12
 _NEXT_TO_NOTHING = 1e-60  # instead of 0 in a divisor; variances of rows are 0 or far above
@@ -209,7 +209,7 @@ def energy(x: Rows) -> Tensor:
 def entropy(x: Rows) -> Tensor:
     """Shannon entropy of the amplitude histogram in bits; 0 for a constant.
 
-    Values are quantised to 256 levels between their extremes, halves (within 1e-9 of a level)
+    Values are quantised to 256 levels between their extremes, halves (within 1e-6 of a level)
     rounded up. The distinct levels serve as histogram *edges*, so the two highest occupied ones
     share one cell.
     """

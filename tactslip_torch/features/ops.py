@@ -8,11 +8,14 @@ whether it has a tensor before it, or a value of a graph.
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+
+from tactslip_torch.runtime import check_tensor
 
 TINY = 1e-300
 """Instead of 0 in a divisor, where a quotient of 0 is to be 0."""
@@ -51,6 +54,28 @@ def is_concrete(x: Tensor) -> bool:
         return forward_ad.unpack_dual(x).tangent is None
     except (RuntimeError, TypeError):  # transformed, or NumPy has no such dtype
         return False
+
+
+def check_samples(x: Tensor, what: str = "samples") -> None:
+    """Refuse what is no tensor, and one of whole numbers or of half precision.
+
+    Raises:
+        TypeError: if it is no tensor.
+        ValueError: for another dtype.
+    """
+    check_tensor(x)
+    if x.dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"expected float32 or float64 {what} in volts, got {x.dtype}; "
+            "convert with .float() or .double()"
+        )
+
+
+def full_precision(x: Tensor) -> AbstractContextManager[object]:
+    """Within it ``torch.autocast`` narrows nothing that is computed on the device of ``x``."""
+    kind = x.device.type
+    is_on = torch.is_autocast_enabled(kind)
+    return torch.autocast(kind, enabled=False) if is_on else nullcontext()
 
 
 def root(square: Tensor) -> Tensor:

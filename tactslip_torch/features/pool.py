@@ -32,11 +32,18 @@ from tactslip_torch.features.bank import (
     pool_names,
 )
 from tactslip_torch.features.descriptors import DESCRIPTORS
-from tactslip_torch.features.ops import bounded_gradient, is_concrete, is_traced, saturating
+from tactslip_torch.features.ops import (
+    bounded_gradient,
+    check_samples,
+    full_precision,
+    is_concrete,
+    is_traced,
+    saturating,
+)
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.native import BackendName
 from tactslip_torch.own_files import MOST_BIN_SAMPLES
-from tactslip_torch.runtime import check_tensor, for_each
+from tactslip_torch.runtime import for_each
 from tactslip_torch.signals.spectrum import SpectrumMethod, spectrum_matrix
 from tactslip_torch.signals.wavelet import (
     Wavelet,
@@ -48,9 +55,13 @@ from tactslip_torch.signals.wavelet import (
 Arithmetic = Literal["double", "native"]
 NATIVE_SPAN = 2.0**-10
 """Part of a film's magnitude; in float32 throughout, less may be lost in a branch."""
+LEAST_SPAN = {torch.float32: 2.0**-17, torch.float64: 2.0**-22}
+"""Part of the largest raw sample within reach that a filtered span must exceed, by the dtype of the
+raw samples: 64 roundings of float32; of float64, what leaves seven digits to a filtered sample."""
 VALIDITY = (
-    "every channel in use is finite, and its filtered span above 64 eps of its magnitude; in "
-    "native float32 that of a film above 2^-10 of it"
+    "every channel in use is finite, and its filtered span above 2^-22 of the largest raw sample "
+    "that its filter takes in, of float32 samples above 2^-17; in native float32 a film's above "
+    "2^-10"
 )
 """``FeaturePool.validity`` of the channels in use, in words for people."""
 LARGEST_SAMPLE = torch.finfo(torch.float64).max / 64
@@ -136,7 +147,7 @@ class FeaturePool(nn.Module):
         self.backend = native.backend_of(backend)
         self.names = pool_names(hand, level)
         self.selected = tuple(range(len(self.names)))
-        self._inverses: dict[torch.dtype, Tensor] = {}
+        self._inverses: dict[tuple[torch.dtype, bool], Tensor] = {}
         self._banks: dict[torch.dtype, Bank] = {}
         self._engines: dict[torch.dtype, native.FeatureEngine] = {}
         _ = self.maps  # refuses a bin that is too short for the levels
@@ -204,7 +215,8 @@ class FeaturePool(nn.Module):
         self.check(bins)
         dtype = dtype or bins.dtype
         if not is_concrete(bins) or dtype not in (torch.float32, torch.float64):
-            return self._by_torch(bins, dtype)
+            with full_precision(bins):
+                return self._by_torch(bins, dtype)
         with torch.inference_mode(False), torch.no_grad():  # what is kept outlives the mode
             flat = bins.detach().reshape(-1, *bins.shape[-2:])
             features = torch.empty(len(flat), len(self.names), dtype=dtype, device="cpu")
@@ -288,17 +300,17 @@ class FeaturePool(nn.Module):
         Raises:
             ValueError: if they are neither float32 nor float64.
         """
-        if x.dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"expected float32 or float64 samples in volts, got {x.dtype}")
+        check_samples(x)
         x = bounded_gradient(x)
         return x if self.arithmetic == "native" else x.double()
 
     def validity(self, bins: Tensor) -> Tensor:
-        """Which channels can be trusted.
+        """Which channels of filtered bins can be trusted.
 
         False where a channel holds a NaN or Inf (``is_missing``) or its span is within 64 eps of
         its magnitude (a dead sensor, or a vibration the dtype cannot resolve). In native float32 a
-        film's span must be a thousandth of it, for its branches to survive.
+        film's span must be a thousandth of it, for its branches to survive. What the filter took
+        away is not seen here: ``SlipDetector.predict_raw`` compares with the raw samples.
 
         Shape:
             - bins: ``[*, C, n]``
@@ -310,28 +322,44 @@ class FeaturePool(nn.Module):
         self.check(bins)
         return self.is_alive(bins) & ~self.is_missing(bins)
 
-    def is_alive(self, bins: Tensor) -> Tensor:
-        """Which channels have a span the dtype can resolve: ``validity`` but for its limit.
+    def is_alive(
+        self, bins: Tensor, given: torch.dtype | None = None, raw_magnitude: Tensor | None = None
+    ) -> Tensor:
+        """Which channels have a span that can be resolved: ``validity`` but for its limit.
+
+        Args:
+            bins: filtered.
+            given: dtype of the samples that they were filtered from, by default theirs.
+            raw_magnitude: of these samples (``ChannelFilter.raw_magnitude``), by which a span is
+                judged (``LEAST_SPAN``); without, by the magnitude of the filtered bin.
 
         Shape:
-            - bins: ``[*, C, n]``
+            - bins: ``[*, C, n]``; raw_magnitude: ``[*, C]``
             - output: ``[*, C]``, bool
         """
-        high, low = bins.amax(-1), bins.amin(-1)  # by the inverse, so that nothing underflows
-        return (high - low) * self.inverse_span(bins) > torch.maximum(high, -low)
+        high, low = bins.amax(-1).double(), bins.amin(-1).double()
+        is_raw = raw_magnitude is not None
+        magnitude = torch.maximum(high, -low) if raw_magnitude is None else raw_magnitude
+        inverse = self.inverse_span(given or bins.dtype, is_raw).to(high.device)
+        return (high - low) * inverse > magnitude  # by the inverse, so that nothing underflows
 
-    def inverse_span(self, like: Tensor) -> Tensor:
-        """One over the least span that resolves, as a part of the magnitude, ``[C]``."""
-        if like.dtype not in self._inverses:
-            least = [64 * torch.finfo(like.dtype).eps] * len(self.hand)
-            if self.arithmetic == "native" and like.dtype == torch.float32:
+    def inverse_span(self, given: torch.dtype, is_raw: bool) -> Tensor:
+        """One over the least span that is resolved, as a part of the magnitude, ``[C]``, float64.
+
+        Args:
+            given: dtype of the samples.
+            is_raw: whether the magnitude is that of raw samples, or of filtered ones.
+        """
+        if (inverse := self._inverses.get((given, is_raw))) is None:
+            span = LEAST_SPAN[given] if is_raw else 64 * torch.finfo(given).eps
+            least = [span] * len(self.hand)
+            if self.arithmetic == "native" and given == torch.float32:
                 for film in self.hand.fast:
                     least[film] = NATIVE_SPAN
             with torch.inference_mode(False):  # it may be needed for a gradient later
-                self._inverses[like.dtype] = torch.tensor(
-                    least, dtype=like.dtype, device="cpu"
-                ).reciprocal()
-        return self._inverses[like.dtype].to(like.device)
+                inverse = torch.tensor(least, dtype=torch.float64, device="cpu").reciprocal()
+            self._inverses[given, is_raw] = inverse
+        return inverse
 
     def is_missing(self, bins: Tensor) -> Tensor:
         """Which channels hold a NaN or Inf, or a sample beyond ``LARGEST_SAMPLE``.
@@ -351,14 +379,12 @@ class FeaturePool(nn.Module):
         Raises:
             ValueError: as ``forward``.
         """
-        check_tensor(bins)
+        check_samples(bins, "bins")
         if bins.ndim < 2 or bins.shape[-2:] != (len(self.hand), self.bin_samples):
             raise ValueError(
                 f"expected bins [*, {len(self.hand)}, {self.bin_samples}] (channels, samples), "
                 f"got {tuple(bins.shape)}"
             )
-        if bins.dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"expected float32 or float64 bins in volts, got {bins.dtype}")
 
 
 _NOISE_BINS = 128

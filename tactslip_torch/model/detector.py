@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.ops import is_concrete, is_nowhere, saturating
+from tactslip_torch.features.ops import (
+    check_samples,
+    full_precision,
+    is_concrete,
+    is_nowhere,
+    saturating,
+)
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.hand import HandLayout
@@ -204,7 +210,8 @@ class SlipDetector(nn.Module):
             nonfinite: what to do about NaN and Inf. ``"mask"``: the channel counts as missing, the
                 score is the one expected without it, and not valid. ``"raise"``: refuse.
             given: dtype of the samples that the bins were filtered from, float32 or float64, by
-                default theirs; that of the score, and what a sensor must resolve to be trusted.
+                default theirs; that of the score, and what a sensor must resolve to be trusted
+                (``FeaturePool.validity``: the raw samples are not known here).
             masked_channels: channels that count as missing whatever they say.
 
         Shape:
@@ -226,6 +233,10 @@ class SlipDetector(nn.Module):
         masked_channels: ChannelMask | None = None,
     ) -> Prediction:
         """``predict`` for raw bins with their context, where NaN and Inf count as filters reach it.
+
+        A channel is trusted where what its filter leaves stands above the rounding of the raw
+        samples in its frames (``features.pool.LEAST_SPAN``). A tone that the filter takes out
+        wholly leaves nothing, however loud it is.
 
         Shape:
             - samples: ``[*, C, context_before + n + context_after]``, volts
@@ -279,7 +290,8 @@ class SlipDetector(nn.Module):
             - features: ``[*, M]`` in the order of ``selected``
             - output: ``[*]``, dtype of the detector
         """
-        score: Tensor = self.head(self.scaled(features))
+        with full_precision(features):
+            score: Tensor = self.head(self.scaled(features))
         return score
 
     def columns(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
@@ -302,9 +314,8 @@ class SlipDetector(nn.Module):
         return scaled.to(self.imputation.dtype)
 
     def _check_raw(self, samples: Tensor) -> None:
+        check_samples(samples)
         (channel_filter := self.channel_filter).check(samples)
-        if samples.dtype not in _DTYPES:
-            raise ValueError(f"expected float32 or float64 samples in volts, got {samples.dtype}")
         before, after = channel_filter.context_before, channel_filter.context_after
         if samples.shape[-1] != (wanted := before + self.pool.bin_samples + after):
             raise ValueError(
@@ -347,8 +358,11 @@ class SlipDetector(nn.Module):
         return self._predict_by_torch(x, is_raw, given)
 
     def _predict_by_torch(self, x: Tensor, is_raw: bool, given: torch.dtype) -> Prediction:
-        bins = self._filter(x) if is_raw else x
-        is_alive = self.pool.is_alive(bins.to(given))  # sensors resolve no more than they give
+        bins, raw_magnitude = x, None
+        if is_raw:
+            bins = self._filter(x)
+            raw_magnitude = self.channel_filter.raw_magnitude(x, self.extractor.plan.channels)
+        is_alive = self.pool.is_alive(bins, given, raw_magnitude)
         bins = self.pool.widen(bins)
         is_missing = self.pool.is_missing(bins)
         is_whole = is_nowhere(is_missing)
@@ -472,7 +486,9 @@ class SlipDetector(nn.Module):
         except FileNotFoundError:
             raise FileNotFoundError(f"no detector at {name}") from None
         try:
-            return cls._from_table(metadata, state, backend)
+            with torch.inference_mode(False):  # it may be differentiated later
+                state = {key: value.clone() for key, value in state.items()}
+                return cls._from_table(metadata, state, backend)
         except FORGED as error:
             reason = str(error).splitlines()[0]
             raise ValueError(f"{name} is damaged: {reason}") from error
@@ -560,10 +576,9 @@ class _Engine:
         # by dtypes of bins, and of samples they were filtered from
         self._engines = {dtype: detector.extractor.engine(dtype) for dtype in _DTYPES}
         self._inverse = {
-            dtype: detector.pool.inverse_span(torch.empty(0, dtype=dtype, device="cpu"))
-            .double()
-            .numpy()
+            (dtype, is_raw): detector.pool.inverse_span(dtype, is_raw).numpy()
             for dtype in _DTYPES
+            for is_raw in (False, True)
         }
 
     def scores(self, x: Tensor, is_raw: bool) -> Tensor:
@@ -575,7 +590,7 @@ class _Engine:
 
     def predict(self, x: Tensor, is_raw: bool, given: torch.dtype) -> Prediction:
         """As ``SlipDetector._predict``."""
-        flat, found, score = self._run(x, is_raw, given, self._inverse[given])
+        flat, found, score = self._run(x, is_raw, given, self._inverse[given, is_raw])
         is_valid, variance = found.is_valid & np.isfinite(score), np.zeros(len(score), score.dtype)
         arrays = (score, is_valid, found.is_missing, variance)
         parts = Prediction(*map(torch.from_numpy, arrays))

@@ -23,7 +23,7 @@ from typing import Literal, NamedTuple, TypeVar, get_args
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.ops import has_values, is_concrete, saturating
+from tactslip_torch.features.ops import full_precision, has_values, is_concrete, saturating
 from tactslip_torch.model.kernels import Head, QuadraticForm
 from tactslip_torch.runtime import are_unchanged, in_parts, stamps_of
 from tactslip_torch.signals.binning import refuse_nonfinite
@@ -87,14 +87,15 @@ def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
 
 def predict_in_parts(predict: Callable[[Tensor], Said], x: Tensor) -> Said:
     """What ``predict`` says of bins ``[*, C, n]``: of many in parts that stay in a cache."""
-    if x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS or not is_concrete(x):
-        return predict(x)
 
     def joined(parts: Sequence[Tensor]) -> Tensor:
         whole: Tensor = torch.cat(list(parts)).unflatten(0, x.shape[:-2])
         return whole
 
-    found = in_parts(predict, x.flatten(0, -3).split(_PART_BINS))
+    with full_precision(x):
+        if x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS or not is_concrete(x):
+            return predict(x)
+        found = in_parts(predict, x.flatten(0, -3).split(_PART_BINS))
     if isinstance(found[0], Prediction):
         return Prediction(*map(joined, zip(*found, strict=True)))
     return joined(found)

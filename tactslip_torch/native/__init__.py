@@ -250,10 +250,10 @@ class FeatureEngine(_Kept):
             machine: from features to the score.
             bins: with the context that the filters need.
             filters: of the channels; None: bins are filtered.
-            given: dtype of the score, in which extremes are compared as well.
-            inverse_span: one over the least span of a channel that can be trusted, as a part of its
-                magnitude; channels with a NaN or Inf are then left out (``Scores.is_missing``).
-                Without, they make a score NaN.
+            given: dtype of the score.
+            inverse_span: one over the least filtered span of a channel that can be trusted, as a
+                part of the largest of its samples as they are given; channels with a NaN or Inf are
+                then left out (``Scores.is_missing``). Without, they make a score NaN.
 
         Shape:
             - bins: ``[M, C, n + context]``, float32 or float64; samples of a channel lie side by

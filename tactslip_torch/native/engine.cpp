@@ -216,7 +216,7 @@ template <class T> struct Describe {
   // Levels of sorted values as bytes; how many are equal to the one r places before is how often a
   // cell holds more than r, and gain[r] what that adds. `levels` has VECTOR_BYTES to spare.
   static V entropy(const V* sorted, const double* gain, uint8_t* levels, int64_t n) {
-    constexpr T half = 0.5 + (sizeof(T) == 4 ? 0x1p-13 : 1e-9);
+    constexpr T half = 0.5 + (sizeof(T) == 4 ? 0x1p-13 : 1e-6);
     V last = {}, low = sorted[0], factor = (T)LEVELS / (sorted[n - 1] - low);
     for (int64_t i = 0; i < n; ++i) {
       V level = (sorted[i] - low) * factor + half;
@@ -310,7 +310,8 @@ template <class T> struct Group : Describe<T> {
   int64_t bin[W], channel[W], first_bin;  // the bin whose features come first in memory
   int num;             // pairs in it; the other lanes repeat the first
   bool is_broken[W];   // holds NaN or Inf
-  D first[H], scale[H], unit[H], high[H], low[H];
+  double loudest[W];   // size of a sample as given, in the frames of its filter
+  D first[H], scale[H], unit[H], span[H];
   D *window[H], *weights[H];  // samples that the filter takes in, and its weights
   D *y[H], *approximation[H], *coefficients[H], *row[H];
   V *raw, *d, *few, *lines, *total;
@@ -374,6 +375,7 @@ template <class T> struct Group : Describe<T> {
       }
       bool usual = most == 0 || (SMALLEST_USUAL <= most && most <= LARGEST_USUAL);
       is_broken[k] = !finite;
+      loudest[k] = most;
       bins.is_odd[bin[k]] |= finite && !usual;
       bool is_read = finite && usual;
       double* to = (double*)window[k / DL] + k % DL;
@@ -387,9 +389,8 @@ template <class T> struct Group : Describe<T> {
     for (int h = 0; h < H; ++h) {
       convolve(window[h], weights[h], y[h], taps);
       Extent e = extent(y[h], n);
-      high[h] = e.high;
-      low[h] = e.low;
-      scale[h] = larger(high[h], -low[h]);
+      span[h] = e.high - e.low;
+      scale[h] = larger(e.high, -e.low);
       D inverse = 1 / scale[h];
       unit[h] = scale[h] > 0 ? inverse : D{};
       first[h] = y[h][0];
@@ -413,13 +414,7 @@ template <class T> struct Group : Describe<T> {
   // valid.
   void note_channels() {
     for (int k = 0; k < num; ++k) {
-      double above = ((double*)high)[k], below = ((double*)low)[k];
-      double inverse = bins.inverse_span[channel[k]];
-      bool is_alive = (above - below) * inverse > (above > -below ? above : -below);
-      if (bins.given_as_float) {
-        float a = (float)above, b = (float)below;
-        is_alive = (a - b) * (float)inverse > (a > -b ? a : -b);
-      }
+      bool is_alive = ((double*)span)[k] * bins.inverse_span[channel[k]] > loudest[k];
       bins.is_missing[bin[k] * plan.num_channels + channel[k]] = is_broken[k];
       bins.is_valid[bin[k]] &= is_alive && !is_broken[k];
     }

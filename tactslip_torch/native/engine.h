@@ -46,8 +46,8 @@ struct Bins {
   // for a machine
   double *scaled, *score;  // [M, columns], [M]
   uint8_t *is_missing, *is_valid;  // [M, C], [M]; if given, channels with a NaN or Inf are left out
-  const double* inverse_span;      // [C] one over the least span of a channel that can be trusted
-  int64_t given_as_float;          // so are extremes compared
+  const double* inverse_span;  // [C] one over the least span that can be trusted, by the loudest sample
+  int64_t given_as_float;      // so is a score bounded
 };
 
 enum Statistic { POOLED_MEAN, POOLED_STD, POOLED_MIN, POOLED_MAX, POOLED_ORDER };

@@ -135,32 +135,36 @@ class BaselineDetector:
         reaches = self.channel_filter.reaches
         return max(reaches[film][1] for film in self.pool.hand.fast)
 
-    def predict(self, bins: Tensor, *, given: torch.dtype | None = None) -> Prediction:
-        """Score filtered bins. A film that is missing counts as silent, and the score as not valid.
+    def predict_raw(self, samples: Tensor, *, given: torch.dtype | None = None) -> Prediction:
+        """Filter and score raw bins that come with their context.
+
+        A film that is missing counts as silent, and the score as not valid.
 
         Args:
-            bins: in volts.
-            given: dtype of the samples that they were filtered from, and of the score; by default
-                theirs.
+            samples: in volts.
+            given: dtype in which they were measured, and of the score; by default theirs.
 
         Shape:
-            - bins: ``[*, C, n]``; score and validity ``[*]``, missing channels ``[*, C]``
+            - samples: ``[*, C, context_before + n + context_after]``; score and validity ``[*]``,
+              missing channels ``[*, C]``
 
         Raises:
             ValueError: if the number of channels or samples is another.
         """
+        given, films = given or samples.dtype, self.needed_index.tolist()
+        bins = self.channel_filter.valid(samples, films)
         self.pool.check(bins)
-        bins = bins.to(given or bins.dtype)
         is_missing = self.pool.is_missing(bins)
-        is_trusted = self.pool.is_alive(bins) & ~is_missing
+        raw_magnitude = self.channel_filter.raw_magnitude(samples, films)
+        is_trusted = self.pool.is_alive(bins, given, raw_magnitude) & ~is_missing
+        bins = bins.to(given)
         if not is_nowhere(is_missing):
             bins = torch.where(is_missing[..., None], 0.0, bins)
-        films = self.needed_index
         if self.name == "film_band_power":
             score = film_band_power(bins, films, self.pool.sample_rate_hz)
         else:
             score = largest_detail(bins, films, self.pool.wavelet, self.pool.level)
-        is_valid = is_trusted.index_select(-1, films.to(bins.device)).all(-1)
+        is_valid = is_trusted[..., films].all(-1)
         return Prediction(score, is_valid, is_missing, torch.zeros_like(score))
 
 

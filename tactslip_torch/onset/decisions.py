@@ -31,7 +31,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import Prediction
 from tactslip_torch.onset.evidence import OnsetClassifier
 from tactslip_torch.onset.rules import NEUTRAL, NOTHING_YET, Latch, Rule, latch, rule_from_dict
-from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.signals.filtering import ChannelFilter, extended
 
 KEY = "alarm"
 """Under which ``SlipDetector.info`` keeps the settings."""
@@ -183,8 +183,8 @@ class Scorer(Protocol):
     def look_ahead(self) -> int:
         """Samples behind a bin that its score waits for."""
 
-    def predict(self, bins: Tensor, *, given: torch.dtype) -> Prediction:
-        """Score filtered bins ``[N, C, n]``, of samples that were ``given`` in a dtype."""
+    def predict_raw(self, samples: Tensor, *, given: torch.dtype) -> Prediction:
+        """Score raw bins with their context, ``[N, C, W]``, as they were ``given`` in a dtype."""
 
 
 def score_stream(
@@ -192,9 +192,8 @@ def score_stream(
 ) -> Prediction:
     """Predict every bin of a recording that begins a whole number of hops from its start.
 
-    The recording is filtered whole, each channel in use, and scored some bins at a time. A NaN
-    makes the bins within its frame's reach not valid. A recording shorter than a bin or a frame
-    has no bins.
+    Before and behind it lies what its filter takes to lie there (``extended``). A NaN makes the
+    bins within its frame's reach not valid. A recording shorter than a bin or a frame has no bins.
 
     Args:
         detector: that predicts.
@@ -222,9 +221,11 @@ def score_stream(
         if samples.shape[-1] < max(length, *(lengths[channel] for channel in used)):
             empty, none = samples.new_empty(0), samples.new_empty(0, len(samples)).bool()
             return Prediction(empty, none[:, 0], none, empty)
-        filtered = detector.channel_filter(detector.pool.widen(samples), used)
-        bins = filtered.unfold(-1, length, hop_samples).transpose(0, 1)  # [N, C, n], a view
-        parts = [detector.predict(x.contiguous(), given=samples.dtype) for x in bins.split(chunk)]
+        whole = extended(detector.pool.widen(samples), detector.channel_filter, used)
+        bins = whole.unfold(-1, length + 2 * detector.channel_filter.context, hop_samples)
+        parts = [
+            detector.predict_raw(x, given=samples.dtype) for x in bins.transpose(0, 1).split(chunk)
+        ]
         return Prediction(*map(torch.cat, zip(*parts, strict=True)))
 
 
@@ -582,12 +583,13 @@ def stream_statistic(
             f"expected at least {shortest} samples, a bin and the longest frame in use, "
             f"got {samples.shape[-1]}; give a longer recording"
         )
-    filtered = detector.channel_filter(detector.pool.widen(samples), used)
-    bins = filtered.unfold(-1, length, settings.hop_samples).movedim(-3, -2)  # [*, m, C, n]
+    whole = extended(detector.pool.widen(samples), detector.channel_filter, used)
+    bins = whole.unfold(-1, length + 2 * detector.channel_filter.context, settings.hop_samples)
     is_used = torch.zeros(len(detector.pool.hand), 1, dtype=torch.bool, device=bins.device)
     is_used[used] = True
+    bins = bins.movedim(-3, -2)  # [*, m, C, n + context]
     bins = torch.where(is_used | bins.isfinite(), bins, 0.0)  # or 0 times NaN comes back
-    score, _, is_missing, variance = detector.predict(bins, given=samples.dtype)
+    score, _, is_missing, variance = detector.predict_raw(bins, given=samples.dtype)
     llr = widened_llr(settings.calibration, score, variance)
     tells = is_usable(score, is_missing, detector.needed_index) & llr.isfinite()
     llr = torch.where(tells, llr, NEUTRAL)

@@ -400,6 +400,24 @@ class ChannelFilter(nn.Module):
                 filtered[..., chosen, :] = torch.maximum(kept.amax(-1), -kept.amin(-1))[..., None]
         return filtered
 
+    def raw_magnitude(self, samples: Tensor, channels: Collection[int] | None = None) -> Tensor:
+        """Largest size of the raw samples that each filtered bin of ``valid`` is made of.
+
+        NaN where one of them is; no gradient.
+
+        Shape:
+            - samples: as ``valid``
+            - output: ``[*, C]``, float64
+        """
+        num_samples = samples.shape[-1] - 2 * self.context
+        samples = samples.detach()
+        found = samples[..., 0].to(torch.float64, copy=True)  # of its kind under vmap too
+        for length, chosen, _ in self._groups_for(channels):
+            start = self.context_before - reach(length, self.align)[0]
+            kept = samples[..., chosen, start : start + num_samples + length - 1]
+            found[..., chosen] = torch.maximum(kept.amax(-1), -kept.amin(-1)).double()
+        return found
+
     def _groups_for(self, channels: Collection[int] | None) -> list[_Group]:
         """The channels by their frames, those that are wanted apart from the others."""
         key = None if channels is None else tuple(channels)
@@ -447,12 +465,19 @@ class ChannelFilter(nn.Module):
         return _matrix_of(tuple(kernel.tolist()), num_kept, like.dtype, like.device)
 
 
-def extended(samples: Tensor, channel_filter: ChannelFilter) -> Tensor:
+def extended(
+    samples: Tensor, channel_filter: ChannelFilter, channels: Sequence[int] | None = None
+) -> Tensor:
     """A whole recording between what its filter takes to lie before and behind it.
 
     Bins cut from it have their context wherever they lie, and ``ChannelFilter.valid`` makes of
     them what ``ChannelFilter(...)`` makes of the whole. Further out than a channel's frame reaches,
     its first and last sample go on; nothing is made of them.
+
+    Args:
+        samples: the recording.
+        channel_filter: that bins are going to be filtered by.
+        channels: which matter, by default all; the others go on as they begin and end.
 
     Shape:
         - samples: ``[*, C, T]``
@@ -462,9 +487,10 @@ def extended(samples: Tensor, channel_filter: ChannelFilter) -> Tensor:
         ValueError: if the number of channels is another, or ``T`` is shorter than a frame.
     """
     channel_filter.check(samples)
-    _check_length(samples, max(channel_filter.window_lengths))
-    future = past_of(samples.flip(-1), channel_filter).flip(-1)  # the mirror image
-    past = past_of(samples, channel_filter)
+    lengths = channel_filter.window_lengths
+    _check_length(samples, max(lengths if channels is None else (lengths[c] for c in channels)))
+    future = past_of(samples.flip(-1), channel_filter, channels).flip(-1)  # the mirror image
+    past = past_of(samples, channel_filter, channels)
     return torch.cat([past, samples, future[..., : channel_filter.context_after]], dim=-1)
 
 

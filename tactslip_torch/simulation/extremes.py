@@ -1,4 +1,4 @@
-"""Bins that real hands produce and textbooks do not: dead sensors, rails, offsets, denormals.
+"""Bins that real hands produce and textbooks do not: dead sensors, rails, offsets, lost tones.
 
 For the certificate and for tests: each kind is a corner in which sums of squares cancel, overflow
 or underflow, or a descriptor's definition ends.
@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 
 RAIL_V = 5.0
+COUNT_V = 2 * RAIL_V / 2**16
+"""One count of a converter of 16 bits."""
 
 EXTREMES = (
     "plain",
@@ -27,6 +29,10 @@ EXTREMES = (
     "ramp",
     "denormal",
     "huge",
+    "tone without gain",
+    "constant and dither",
+    "synchronous",
+    "mixed magnitudes",
 )
 """Names of the kinds."""
 
@@ -102,6 +108,23 @@ def extreme_bins(
             bins = noise() * (limits.tiny / 8)
         case "huge":
             bins = noise() * min(1e30, limits.max / 1e6)
+        case "tone without gain":  # of whole counts; a moving average over its period is 0
+            one = torch.randint(-9000, 9000, (*size[:-1], 51), generator=generator)
+            is_short = uniform(each) < 0.5
+            one[..., 11:] = torch.where(is_short, 0, one[..., 11:])
+            one[..., :1] -= one.sum(-1, keepdim=True)
+            period = torch.where(is_short, 11, 51)
+            bins = COUNT_V * one.gather(-1, torch.arange(num) % period)
+        case "constant and dither":
+            counts = torch.randint(-(2**14), 2**14, each, generator=generator)
+            bins = COUNT_V * (counts + torch.randint(0, 2, size, generator=generator))
+        case "synchronous":  # a tone of which each period gives the same one, two or four samples
+            turns = torch.tensor([1.0, 0.5, 0.25])[torch.randint(3, each, generator=generator)]
+            phase = 2 * torch.pi * uniform(each)
+            bins = torch.sin(2 * torch.pi * ((turns * torch.arange(num)) % 1) + phase)
+        case "mixed magnitudes":
+            most = 40.0 if limits.max > 1e40 else 36.0
+            bins = noise() * power_of_ten(-most, most)
         case _:
             raise ValueError(f"kind must be one of {', '.join(EXTREMES)}, got {kind!r}")
     return bins.to(dtype)

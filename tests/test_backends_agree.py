@@ -1,0 +1,103 @@
+"""Every kind of input by every backend, alone and among others: the same flags and decisions."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from engine_bins import KINDS, bins_of
+from small_detector import HAND, alarming_detector, raw_bins
+from test_onnx_bins import run_on
+
+from tactslip_torch.analysis.certificate import certify
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.decisions import score_stream
+from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
+
+BROKEN = {"nan": torch.nan, "inf": torch.inf, "-inf": -torch.inf}
+ALL = (*EXTREMES, *KINDS, *BROKEN)
+HOSTILE = (
+    *("tone without gain", "constant and dither", "synchronous", "mixed magnitudes"),
+    *("offset 1e6, vibration 1e-6", "denormal", "nan"),
+)
+
+
+@cache
+def detectors():
+    made = alarming_detector()
+    return made, SlipDetector(
+        made.pool, made.channel_filter, made.selected, made.scaler, made.head, backend="torch"
+    )
+
+
+@cache
+def margin():
+    return certify(detectors()[0], raw_bins(200), simulated=True).content["margin"]["score"]
+
+
+def bins_by(kind, shape, dtype, beside):
+    """Raw bins of a kind in every channel, or in two of them ``beside`` ordinary ones."""
+    generator = torch.Generator().manual_seed(sum(map(ord, kind)))
+    ordinary = 0.1 * torch.randn(shape, generator=generator, dtype=torch.float64)
+    ordinary[:, :2] += 1.0
+    if kind in EXTREMES:
+        bins = extreme_bins(kind, shape, generator, dtype).double()
+    elif kind in BROKEN:
+        bins, place = ordinary.clone(), torch.randint(shape[2], (shape[0], 1), generator=generator)
+        bins[:, 1].scatter_(-1, place, BROKEN[kind])
+    else:
+        bins = bins_of(kind, shape[0], HAND, shape[2], generator)
+    if beside:
+        bins[:, ::2] = ordinary[:, ::2]
+    return bins.to(dtype)
+
+
+def assert_agree(found, expected, what, rows=slice(None)):
+    """Flags are the same, and decisions where both are valid and outside the margin."""
+    score, is_valid = (np.asarray(each) for each in found)
+    own, is_own_valid = (np.asarray(each)[rows] for each in expected)
+    np.testing.assert_array_equal(is_valid, is_own_valid, err_msg=f"flags by {what}")
+    is_clear = is_valid & is_own_valid & (np.abs(own) > margin())
+    turned = (score >= 0) != (own >= 0)
+    assert not (turned & is_clear).any(), f"{what}: {score[turned & is_clear]}"
+    assert np.isfinite(score).all()
+
+
+def joined(parts):
+    return [torch.cat(each) for each in zip(*parts, strict=True)]
+
+
+def check(kind, num, dtype, beside):
+    native, by_torch = detectors()
+    bins = bins_by(kind, (num, len(HAND), 150), dtype, beside)
+    expected = native.predict_raw(bins)[:2]
+    graph = run_on(native, str(dtype).removeprefix("torch."), bins)
+    assert_agree((graph["score"], graph["valid"]), expected, "onnx")
+    assert_agree(by_torch.predict_raw(bins)[:2], expected, "torch")
+    few = range(0, num, num // 8)
+    for name, made in (("native", native), ("torch", by_torch)):
+        alone = joined(made.predict_raw(bins[i : i + 1])[:2] for i in few)
+        assert_agree(alone, expected, f"{name}, alone", list(few))
+    whole = bins_by(kind, (1, len(HAND), 1500), dtype, beside)[0]
+    offline = score_stream(native, whole, 20)[:2]
+    assert_agree(score_stream(by_torch, whole, 20)[:2], offline, "torch, offline")
+    stream = StreamingDetector(native, dtype=dtype)
+    parts = [*map(stream.push, whole.T.split(37)), stream.flush()]
+    assert_agree(joined((each.score, each.is_valid) for each in parts), offline, "stream")
+
+
+@pytest.mark.onnx
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_what_is_lost_in_rounding_is_flagged_by_all(kind, dtype):
+    check(kind, 24, dtype, beside=False)
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
+@pytest.mark.parametrize("beside", [False, True])
+@pytest.mark.parametrize("kind", ALL)
+def test_every_kind_of_input_is_decided_alike(kind, beside, dtype):
+    check(kind, 200, dtype, beside)
