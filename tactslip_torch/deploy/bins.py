@@ -217,4 +217,5 @@ def _samples(windows: Value, detector: SlipDetector, frame: Frame) -> tuple[Samp
     given = torch.float64 if dtype == F64 else torch.float32
     inverse = detector.pool.inverse_span(given, is_raw=True)[list(frame.channels)]
     is_alive = (high - low) * inverse > loudest
-    return Samples(shifted, moving, scale, unit), ~is_known, is_alive & is_known
+    values: tuple[Any, ...] = shifted, moving, scale, unit
+    return Samples(*values), ~is_known, is_alive & is_known
