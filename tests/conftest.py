@@ -64,25 +64,9 @@ def seed_hypothesis(config: pytest.Config, items: list[pytest.Item]) -> None:
             seed(f"{generated.SEED} {name}")(test)
 
 
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """A worker of pytest-xdist tells what it made."""
-    if hasattr(session.config, "workeroutput"):
-        session.config.workeroutput["generated"] = generated.told()
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node: object) -> None:
-    """A worker has ended; one that broke down tells nothing."""
-    output = getattr(node, "workeroutput", {})
-    generated.hear(output.get("generated", []))
-
-
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    if num := generated.num_generated():
-        terminalreporter.write_line(
-            f"property tests: {num} generated bins, seed {generated.SEED} "
-            f"(TACTSLIP_SEED={generated.SEED} and the same tests make them again)"
-        )
+    said = f"property tests: seed {generated.SEED} (TACTSLIP_SEED={generated.SEED} repeats them)"
+    terminalreporter.write_line(said)
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
-"""Generated bins for property tests: drawn by hypothesis, made by torch, counted and named.
+"""Generated bins for property tests: drawn by hypothesis, made by torch, and named.
 
-``TACTSLIP_SEED`` drives both generators; the summary of a run says which seed it had and how many
-bins it made. A failure says which kind of bin stood in which channel.
+``TACTSLIP_SEED`` drives both generators; the head of a run says which seed it has. A failure says
+which kind of bin stood in which channel.
 """
 
 from __future__ import annotations
@@ -17,24 +17,6 @@ from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 
 SEED = int(os.environ.get("TACTSLIP_SEED", "1"))
 ORDINARY = ("plain", "integers", "ramp")  # drawn as often as all the others together
-_made: set[tuple[int, int, torch.dtype]] = set()
-
-
-def num_generated() -> int:
-    """How many different bins this process has made, or has heard of, so far."""
-    return sum(num for _, num, _ in _made)
-
-
-def told() -> list[tuple[int, int, str]]:
-    """What ``hear`` takes in another process: which bins were made in this one."""
-    return [(drawn, num, str(dtype)) for drawn, num, dtype in _made]
-
-
-def hear(others: list[tuple[int, int, str]]) -> None:
-    """Count what another process made; the same bins count once, as they do in one process."""
-    _made.update(
-        (drawn, num, getattr(torch, dtype.removeprefix("torch."))) for drawn, num, dtype in others
-    )
 
 
 def generator(drawn: int) -> torch.Generator:
@@ -63,9 +45,8 @@ class Batch:
 
 
 def make_batch(drawn: int, num: int, channels: int, samples: int, dtype: torch.dtype) -> Batch:
-    """Bins whose channels are of random kinds, each its own; counted."""
+    """Bins whose channels are of random kinds, each its own."""
     source = generator(drawn)
-    _made.add((drawn, num, dtype))
     menu = (*EXTREMES, *ORDINARY * (len(EXTREMES) // len(ORDINARY)))
     choice = torch.randint(len(menu), (num, channels), generator=source)
     bins = torch.empty(num, channels, samples, dtype=dtype)

@@ -14,7 +14,6 @@ from small_set import SMALL_HAND
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.abstention import (
-    ABSTAIN,
     KEY,
     NON_SLIP,
     SLIP,
@@ -101,28 +100,6 @@ def test_the_next_recording_is_covered_in_the_mean():
     assert (bins > ours).all(), bins
 
 
-def test_separate_classes_are_always_answered():
-    scores = torch.cat([torch.linspace(1, 2, 40), -torch.linspace(1, 2, 40)])
-    apart = Abstention.fit(scores, scores > 0, torch.arange(80) % 20, 0.9)
-    assert (apart.low, apart.high) == (0.0, 0.0)  # they would cross at 1 and -1
-
-
-def test_recordings_weigh_alike_whatever_their_length():
-    # nineteen recordings of one bin each and one, of which all is wrong, of a thousand
-    scores = torch.cat([torch.ones(19), torch.full((1000,), -1.0), -torch.ones(20)])
-    is_slip = torch.arange(len(scores)) < 1019
-    unit = torch.cat([torch.arange(19), torch.full((1000,), 19), torch.arange(20)])
-    assert Abstention.fit(scores, is_slip, unit, 0.9).low == 0  # one of twenty may be lost
-    assert Abstention.fit(scores, is_slip, torch.arange(len(scores)), 0.9).low == -1  # most may not
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_answers_in_any_shape_and_dtype(dtype):
-    scores = torch.tensor([[-2.0, -1.0, 0.0], [0.5, 3.0, math.nan]], dtype=dtype)
-    wanted = [[NON_SLIP, ABSTAIN, ABSTAIN], [SLIP, SLIP, ABSTAIN]]
-    assert Abstention(0.9, -1.0, 0.5).answer(scores).tolist() == wanted
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -174,16 +151,6 @@ def test_thresholds_are_those_of_machines_refitted_without_the_bins_own(left_out
     assert found["unit"] == "recording"
     assert found["left_out"] == ("material" if left_out == "group" else "recording")
     assert found["num_recordings"] == {"slip": 24, "non_slip": 24}
-
-
-def test_a_plan_gets_thresholds_and_more_coverage_abstains_more():
-    plan, sample = fitted()
-    found = [Abstaining(c).settle(plan, sample).abstain for c in (0.6, 0.8, 0.9, 0.95)]
-    lows, highs = [one["low"] for one in found], [one["high"] for one in found]
-    assert lows == sorted(lows, reverse=True)
-    assert highs == sorted(highs)
-    assert lows[-1] < 0 < highs[-1]
-    assert Abstaining(None).settle(plan, sample) is plan
 
 
 def test_too_few_recordings_are_said_and_cost_no_fit(caplog):

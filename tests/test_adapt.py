@@ -130,22 +130,6 @@ def test_a_material_comes_in_and_all_is_said(run, files, trained, capsys):
     assert new.info["abstain"]["adapted"]
 
 
-def test_what_stands_in_for_a_sensor_is_of_old_and_new_bins(run, files, trained):
-    add_c(run, files, "weight=2")
-    old, new = (SlipDetector.load(f / "detector.pt") for f in (trained, run))
-    known = Statistics.load(run / "statistics.pt").known()
-    assert {2.0} < set(known.sample_weight.tolist())  # a bin of C weighs as two
-    expected = torch.stack(
-        [
-            (known.z * w).sum(0) / w.sum()
-            for w in (known.sample_weight[:, None] * (known.is_slip == c)[:, None] for c in (0, 1))
-        ]
-    )
-    torch.testing.assert_close(new.gaussians.mean, expected)
-    torch.testing.assert_close(new.imputation, expected.mean(0))
-    assert not torch.allclose(old.gaussians.mean, expected)
-
-
 @pytest.mark.parametrize("left_out", ["recording", "material"])
 def test_thresholds_are_of_machines_that_never_met_what_was_left_out(run, files, left_out):
     detector = SlipDetector.load(run / "detector.pt")
@@ -252,27 +236,6 @@ def test_what_old_materials_do_not_allow_changes_nothing(run, files, monkeypatch
     assert Statistics.load(run / "statistics.pt").steps[0].entry["forced"] is True
 
 
-def test_bins_without_slip_alone_are_taken_where_asked_for(run, files):
-    found = add_c(run, files, "slip_free=true", "material=other")
-    assert found["recordings"] == [f"other/{i}" for i in range(4)]
-    kept = Statistics.load(run / "statistics.pt")
-    assert not any(bool(own.is_slip.any()) for own in kept.bins.values())
-    assert found["num_bins"] == sum(len(own.z) for own in kept.bins.values())
-
-
-@pytest.mark.slow
-def test_a_second_visit_is_numbered_on_and_known_recordings_are_found_again(run, files, tmp_path):
-    more = write_files(tmp_path / "more", ["C"], cycles=2, seed=1)
-    add_c(run, files, "weight=2", "material=3")
-    visit = f"recordings={more}", "material=3", "weight=2", "force=true"
-    assert adapt(settings(run, *visit), run / "results")["recordings"] == ["3/4", "3/5"]
-    first = f"recordings={files}", "data.materials=[C]"
-    found = adapt(settings(run, "action=forget", *first), run / "results")
-    assert (found["recordings"], found["materials"]) == ([f"3/{i}" for i in range(4)], ["3"])
-    found = add_c(run, files, "weight=2", "material=3", "force=true")
-    assert found["recordings"] == [f"3/{i}" for i in range(4)]
-
-
 @pytest.mark.slow
 def test_no_recording_comes_in_twice_by_another_name(run, files, tmp_path):
     add_c(run, files, "weight=2", "material=wood")
@@ -334,17 +297,6 @@ def test_bad_input_is_one_line(run, overrides, message):
     assert message in one_line(caught.value)
     assert "\n" not in one_line(caught.value)
     assert content(run) == state
-
-
-def test_a_detector_without_its_statistics_says_how_to_get_them(run, trained):
-    other = SlipDetector.load(run / "detector.pt")
-    other.head.constant += 1
-    other.save(run / "detector.pt")
-    with pytest.raises(ValueError, match="belongs to another detector"):
-        adapt(settings(run, "action=list"), run / "results")
-    (run / "statistics.pt").unlink()
-    with pytest.raises(FileNotFoundError, match="train with recipe=robust statistics=true"):
-        adapt(settings(run, "action=list"), run / "results")
 
 
 @pytest.mark.parametrize(

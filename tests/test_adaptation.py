@@ -14,7 +14,6 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.training import adaptation
 from tactslip_torch.training.adaptation import (
     FACTORS,
-    AccuracyChange,
     KnownBins,
     Machine,
     RecordingBins,
@@ -22,7 +21,6 @@ from tactslip_torch.training.adaptation import (
     add,
     class_scales,
     forget,
-    mean_recall,
     solve,
 )
 from tactslip_torch.training.plan import Plan, TrainingPass
@@ -125,23 +123,6 @@ def test_machine_and_scores_without_a_recording_are_those_of_refits(old, trained
         torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-9)
 
 
-def test_mean_recall_is_balanced_accuracy_or_that_of_the_one_class():
-    truth = torch.tensor([True, True, True, False])
-    assert mean_recall(torch.tensor([True, False, True, False]), truth) == pytest.approx(5 / 6)
-    assert mean_recall(truth, ~torch.zeros(4, dtype=torch.bool)) == pytest.approx(3 / 4)
-
-
-def test_a_change_of_accuracy_names_what_falls():
-    same = {"a": 0.9, "b": 0.8}
-    assert AccuracyChange(same, same).problem(0.0) is None
-    assert AccuracyChange({}, {}).problem(0.0) is None
-    fall = AccuracyChange(same, {"a": 0.88, "b": 0.8})
-    assert fall.problem(0.0101) is None
-    assert fall.problem(0.005).startswith("old materials fall from 85.00 to 84.00 %")
-    of_one = AccuracyChange(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7})
-    assert of_one.problem(0.01).startswith("b falls from 80.00 to 75.00 %")  # four times as much
-
-
 def test_known_bins_of_a_recording_give_way_to_those_that_changed(old, trained, new):
     weights = {"a/0": 0.0} | dict.fromkeys(new, 3.0)
     known = old.rehearsal.with_others({"a/0": trained["a/0"]} | new, weights)
@@ -193,31 +174,6 @@ def test_bins_go_out_as_they_came_in(old, num_bins, weight, tmp_path):
     assert_same(replace(back, bins={}, weights={}), old, tmp_path, weight)
 
 
-def test_undone_steps_leave_no_trace(old, trained, new, tmp_path):
-    """One adds, one takes out recordings of training too, one brings others of a known name."""
-    file, states = torch.arange(5, dtype=torch.uint8), [old]
-    gone = {"b/1": trained["b/1"], "new/0": new["new/0"]}
-    for number, step in enumerate(
-        (
-            lambda at: add(at, solve(at), new, 2.0, margin=1.0),
-            lambda at: forget(at, solve(at), gone),
-            lambda at: add(at, solve(at), {"new/0": without_slip(new["new/0"])}, 3.0, margin=1.0),
-        )
-    ):
-        change = step(states[-1])
-        states.append(
-            states[-1].with_step(change.statistics, {}, file + number, f"digest {number}")
-        )
-    states[-1].save(tmp_path / "last")
-    at = Statistics.load(tmp_path / "last")
-    for number in (2, 1, 0):
-        at, found = at.undo()
-        assert torch.equal(found, file + number)
-        assert_same(at, states[number], tmp_path)
-    with pytest.raises(ValueError, match="nothing to undo"):
-        at.undo()
-
-
 def test_forgetting_is_as_if_it_was_never_in(old, before, trained, tmp_path):
     mine = {name: own for name, own in trained.items() if own.material == "c"}
     others = {name: own for name, own in trained.items() if own.material != "c"}
@@ -258,21 +214,6 @@ def test_auto_takes_the_largest_weight_that_old_materials_allow(old, before, new
     larger = FACTORS[FACTORS.index(found.factor) + 1]
     by_hand = add(old, before, new, found.weight * larger / found.factor, margin=margin)
     assert by_hand.old.problem(0.5 * margin) is not None
-
-
-@pytest.mark.parametrize("largest", [0.0, FACTORS[0], FACTORS[2]])
-def test_auto_leaves_out_weights_that_lead_to_no_machine(old, before, new, monkeypatch, largest):
-    def solved(statistics):
-        if statistics.weight_of("new/0") > 1.01 * largest * 4 / 3:
-            raise ValueError("no machine")
-        return solve(statistics)
-
-    monkeypatch.setattr(adaptation, "solve", solved)
-    if largest:
-        assert add(old, before, new, None, margin=0.9).factor == largest
-        return
-    with pytest.raises(ValueError, match="no machine"):
-        add(old, before, new, None, margin=0.9)
 
 
 def test_bins_without_slip_weigh_as_those_of_an_average_material(old, before, trained):

@@ -5,8 +5,6 @@ from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
-import numpy as np
-import onnxruntime
 import pytest
 import torch
 from any_hands import HANDS, detector_of
@@ -17,8 +15,6 @@ from test_commands import composed
 
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.labels import LabelRule
-from tactslip_torch.deploy.bins import RawBin
-from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.features.pool import is_rounding
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, score_stream
@@ -37,18 +33,6 @@ def stream_of(name, num_bins=12, seed=3):
     hand = HANDS[name]
     pieces, _ = hand.noise(num_bins, 3 * hand.bin_samples, seed)
     return torch.cat(list(pieces), dim=-1)
-
-
-@any_hand
-def test_the_pool_is_sized_by_the_hand(name):
-    pool = HANDS[name].pool()
-    of_fast = 2 * pool.level * (14 + 15 + 1)
-    assert len(pool.names) == 13 * len(pool.hand.slow) + of_fast * len(pool.hand.fast)
-    assert len({str(each) for each in pool.names}) == len(pool.names)
-    samples, _ = HANDS[name].noise(3, pool.bin_samples, seed=0)
-    features = pool(samples)
-    assert features.shape == (3, len(pool.names))
-    assert features.isfinite().all()
 
 
 @any_hand
@@ -98,39 +82,6 @@ def test_a_stream_in_pieces_is_the_recording_scored_whole(name, data):
     assert len(score) == len(expected.score) > 0
     torch.testing.assert_close(score, expected.score, rtol=1e-9, atol=1e-9)
     assert torch.equal(torch.cat([part.is_valid for part in found]), expected.is_valid)
-
-
-@pytest.mark.onnx
-@unlike_hand
-def test_exported_graphs_give_the_detectors_scores(name, tmp_path):
-    hand, detector = HANDS[name], detector_of(name)
-    bin_path, stream_path = export_detector(detector, tmp_path)  # checks itself, too
-    facts = json.loads((tmp_path / "model.onnx.json").read_text())
-    assert facts["kinds"] == [channel.kind for channel in hand.layout().channels]
-    assert (facts["sample_rate_hz"], facts["bin_samples"]) == (hand.rate_hz, hand.bin_samples)
-    window, context = RawBin.of(detector), detector.channel_filter.context
-    samples, _ = hand.noise(50, hand.bin_samples + 2 * context, seed=4)
-    samples = samples.float()
-    expected = detector.score_raw(samples.double())
-    start = detector.context_before - window.before
-    (score,) = session(bin_path).run(
-        ["score"], {"samples": samples[..., start : start + window.length].numpy()}
-    )
-    assert np.abs(score - expected.numpy()).max() < 1e-3 * float(expected.std())
-
-    whole = stream_of(name).float()
-    settings = AlarmSettings.of(detector)
-    decided = StreamingDetector(detector, settings, dtype=torch.float64).push(whole.double().T)
-    given = {"samples": np.ascontiguousarray(whole.T.numpy()), "threshold": np.empty(0)}
-    given |= {"tail": np.empty((0, len(detector.pool.hand)), np.float32), "state": np.empty(0)}
-    found, alarm = session(stream_path).run(["score", "alarm"], given)
-    assert len(found) == len(decided.score) > 3
-    assert np.abs(found - decided.score.numpy()).max() < 1e-3 * float(decided.score.std())
-    assert alarm.tolist() == decided.is_alarm.tolist()
-
-
-def session(path):
-    return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
 
 
 @pytest.mark.parametrize(

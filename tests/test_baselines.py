@@ -24,7 +24,7 @@ from tactslip_torch.training.baselines import (
     SimpleStatistics,
 )
 from tactslip_torch.training.datamodule import SlipDataModule
-from tactslip_torch.training.recipe import FeatureThreshold, best_threshold
+from tactslip_torch.training.recipe import best_threshold
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",
@@ -114,15 +114,6 @@ def test_the_pooled_number_is_the_best_of_all_means_and_deviations(fitted):
     assert torch.equal(found(features), sample.is_slip)
 
 
-def test_the_simple_ones_see_nothing_of_the_detector(fitted):
-    pool, baselines = fitted
-    features = pool(bins_of(50, seed=3)[0]).float()
-    one, other = (baselines(features, torch.full((50, 40), value).double()) for value in (-9, 9))
-    assert torch.equal(one["random_forest_simple"], other["random_forest_simple"])
-    assert torch.equal(one["logistic_regression_simple"], other["logistic_regression_simple"])
-    assert len(one["logistic_regression"].unique()) == 1  # that one sees nothing else
-
-
 def test_logistic_regression_is_scikit_learns():
     linear = pytest.importorskip("sklearn.linear_model")
     scaling = pytest.importorskip("sklearn.preprocessing")
@@ -150,20 +141,6 @@ def test_the_forest_votes_as_scikit_learns_does():
     found = RandomForest(columns, sample)(others)
     right = found.numpy() == made.predict(others.numpy())
     assert right.mean() > 0.99  # equal votes are decided by rounding
-
-
-def test_bins_stand_for_those_they_were_drawn_from():
-    """A group with ten times the bins weighs ten times as much, though as many were kept."""
-    rng = np.random.default_rng(1)
-    sample = BinSample(100)
-    for group, num, sign in (("few", 200, -1.0), ("many", 2000, 1.0)):
-        is_slip = torch.arange(num) % 2 == 0
-        x = torch.where(is_slip, 1.0, -1.0) * sign + 0.1 * torch.from_numpy(rng.normal(size=num))
-        sample.update(group, group, x[:, None].float(), is_slip)
-    bins = sample.bins()
-    assert len(bins.is_slip) == 400
-    found = LogisticRegression.fit(bins.features, bins)
-    assert found.weights[0] > 0
 
 
 def test_one_class_is_refused():
@@ -200,46 +177,6 @@ def test_no_cut_is_better(num_levels, share, rng):
         says_slip = rule(torch.from_numpy(features)).numpy()
         expected = best_of_all(features, is_slip)
         assert balanced_accuracy(says_slip, is_slip) == pytest.approx(expected, abs=1e-12)
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_the_sign_says_where_slip_lies(sign):
-    noise, useful = torch.tensor([5.0, -5.0, 5.0, -5.0]), sign * torch.tensor([0.0, 1.0, 2.0, 4.0])
-    is_slip = torch.tensor([False, False, True, True])
-    rule = best_threshold(torch.stack([noise, useful], dim=-1).double(), is_slip)
-    assert rule == FeatureThreshold(index=1, threshold=1.5 * sign, sign=sign)
-    new = torch.tensor([[0.0, 1.4 * sign], [0.0, 1.6 * sign]])
-    assert rule(new).tolist() == [False, True]
-
-
-def test_features_that_tell_nothing_still_give_a_rule():
-    features = torch.ones(6, 2, dtype=torch.float64)
-    is_slip = torch.arange(6) < 3
-    says_slip = best_threshold(features, is_slip)(features)
-    assert says_slip.all() or not says_slip.any()
-
-
-def test_neighbouring_floats_are_told_apart():
-    is_slip = torch.tensor([False, False, True, True])
-    below = torch.tensor(1.0, dtype=torch.float64)
-    for _ in range(4):
-        above = torch.nextafter(below, torch.tensor(2.0, dtype=torch.float64))
-        features = torch.stack([below, below, above, above])[:, None]
-        for truth in (is_slip, ~is_slip):
-            assert best_threshold(features, truth)(features).tolist() == truth.tolist()
-        below = above
-
-
-# --------------------------------------------------------------------------------- what is kept
-def test_the_pooled_number_survives_json(fitted):
-    pool, baselines = fitted
-    kept = json.loads(json.dumps(baselines.to_dict()))
-    again = Baselines.from_dict(pool, kept)
-    features = pool(bins_of(50, seed=3)[0]).float()
-    scaled = features[:, :40].double()
-    assert list(again(features, scaled)) == NAMES[:1]
-    assert torch.equal(again(features, scaled)[NAMES[0]], baselines(features, scaled)[NAMES[0]])
-    assert again.to_dict() == baselines.to_dict()
 
 
 def test_a_learner_evaluates_them_and_a_saved_detector_those_it_keeps(tmp_path):

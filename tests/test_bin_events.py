@@ -14,7 +14,6 @@ from tactslip_torch.training.datamodule import RecordingFeatures
 from tactslip_torch.training.learner import (
     BINS_APART,
     RULES,
-    bin_scores,
     evaluated_bins,
     event_numbers,
     events_by_rule,
@@ -95,38 +94,6 @@ def test_a_detector_without_errors_finds_every_slip_one_bin_later_by_two_of_thre
         assert onset.bin_fill_s == pytest.approx(0.04)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "first_transition", "two_of_three", "num_false"),
-    [
-        ([(0, -10)], [("found", 1), ("found", 1)], [("found", 1), ("found", 1)], 1),
-        ([(0, -1), (0, -2), (0, -3), (1, -3)], [("early", 1), ("found", 2)],
-         [("early", 1), ("found", 1)], 0),  # an alarm before the onset that stands is early
-        ([(0, 5), (0, 9), (0, 10), (0, 11)], [("found", 3), ("found", 1)],
-         [("found", 2), ("found", 1)], 0),  # a slip that breaks off is several alarms
-    ],
-)  # fmt: skip
-def test_wrong_bins_are_false_alarms_early_ones_or_several(
-    wrong, first_transition, two_of_three, num_false
-):
-    batch = batch_of()
-    events = events_of(batch, says(batch, wrong=wrong))
-    assert seen(events["first_transition"]) == first_transition
-    assert seen(events["two_of_three"]) == two_of_three
-    assert len(events["first_transition"].false_alarms_s) == num_false
-    assert events["two_of_three"].false_alarms_s == ()
-
-
-def test_never_slip_misses_all_and_always_slip_finds_nothing():
-    batch = batch_of()
-    quiet = events_of(batch, torch.zeros_like(batch.is_slip))
-    loud = events_of(batch, torch.ones_like(batch.is_slip))
-    for name in RULES:
-        assert seen(quiet[name]) == [("missed", 0)] * 2
-        assert seen(loud[name]) == [("missed", 0)] * 2
-        assert quiet[name].false_alarms_s == ()
-        assert len(loud[name].false_alarms_s) == 2  # one for each stroke, each seen alone
-
-
 def plain_alarms(decisions, name):
     """Whether each decision raises an alarm: the paper's rule, and two of three, by hand."""
     last, was_on, raised = deque(maxlen=3), False, []
@@ -165,14 +132,6 @@ def test_random_decisions_raise_the_alarms_that_rules_by_hand_do(layout, hop_ms)
             assert sum(own) == len(alarms) - len(false) > 0
 
 
-def test_overlapping_bins_of_a_stroke_are_one_stream_over_the_onset():
-    batch = batch_of(onsets=(2.0,), ends=(4.0,), hop_ms=10.0)
-    events = events_of(batch, batch.is_slip)
-    # no bin over the onset has a label: the first that has comes as without overlap
-    for name, delay in (("first_transition", 0.0525), ("two_of_three", 0.0625)):
-        assert [onset.delay_s for onset in events[name].onsets] == pytest.approx([delay])
-
-
 def test_bins_of_no_stroke_are_watched_and_a_hole_between_them_is_not():
     batch = batch_of(onsets=(), ends=(), stretches=((1.0, 3.0), (5.0, 6.0)))
     assert bool((batch.position == NO_POSITION).all())
@@ -184,12 +143,6 @@ def test_bins_of_no_stroke_are_watched_and_a_hole_between_them_is_not():
     assert events["first_transition"].false_alarms_s == pytest.approx(expected)
     assert events["two_of_three"].false_alarms_s == ()
     assert events["first_transition"].onsets == ()
-
-
-def test_a_hop_longer_than_a_bin_watches_no_time_twice():
-    batch = batch_of(stretches=((4.0, 4.25), (4.3, 4.6)), hop_ms=150.0)
-    events = events_of(batch, batch.is_slip)
-    assert events["first_transition"].quiet_s < 12.0
 
 
 def test_stretches_of_slip_and_of_none_are_watched_in_the_order_of_time():
@@ -244,32 +197,3 @@ def test_a_split_by_bin_has_no_events_and_says_why():
     assert events_by_rule([of_whole, parts["test"]], LATENCY) == {name: [] for name in RULES}
     numbers = event_numbers({"test": events_by_rule([of_whole], LATENCY)})
     assert "reason" not in numbers["test"]["first_transition"]
-
-
-def test_recordings_of_different_length_do_not_mix():
-    short = batch_of(onsets=(2.0,), ends=(2.5,), recording=RecordingId("M2", 1))
-    long = batch_of(stretches=((9.0, 11.0),))
-    parts = []
-    for batch, wrong in ((short, [(0, -12)]), (long, [(1, -4), (1, 3)])):
-        decisions = says(batch, wrong=wrong)
-        parts.append(evaluated_bins(batch, decisions, {})["test"])
-    alone = [events_by_rule([part], LATENCY) for part in parts]
-    for name, own in events_by_rule(parts, LATENCY).items():
-        assert own == [one[name][0] for one in alone]
-        assert [(one.recording, one.material) for one in own] == [("M2/1", "M2"), ("M1/0", "M1")]
-
-
-def test_scores_are_of_all_bins_of_a_role():
-    first, second = batch_of(), batch_of(onsets=(), ends=(), stretches=((1.0, 2.0),))
-    never = [torch.zeros_like(batch.is_slip) for batch in (first, second)]
-    parts = [
-        evaluated_bins(batch, batch.is_slip, {"never": none, "right": batch.is_slip})["test"]
-        for batch, none in zip((first, second), never, strict=True)
-    ]
-    scores, baselines = bin_scores(parts)
-    assert scores["accuracy"] == 1.0
-    assert baselines["right"]["accuracy"] == 1.0
-    found = baselines["never"]
-    assert scores["num_bins"] == found["num_bins"] == len(first.is_slip) + 20
-    assert (found["slip_recall"], found["non_slip_recall"]) == (0.0, 1.0)
-    assert sum(of["num_bins"] for of in scores["per_position"].values()) == len(first.is_slip)

@@ -264,19 +264,6 @@ def test_backends_agree(n):
         assert_close(one, other, 1e-8)
 
 
-def test_a_load_below_nothing_is_none_and_nothing_is_changed(backend):
-    lanes = varied(2)
-    start = at_rest(lanes, 0.1)
-    before = [values.clone() for values in (*lanes, *start)]
-    strided = LaneState(*(torch.stack([v, v], -1)[..., 0] for v in start))
-    none, state = carry(lanes, start, shaken, 50, 250e-6, backend=backend)
-    below, _ = carry(lanes, strided, lambda t: shaken(t, -1.0), 50, 250e-6, backend=backend)
-    assert_close(none, below)
-    assert all(torch.equal(x, old) for x, old in zip((*lanes, *start), before, strict=True))
-    assert none.friction_n.shape == (50, 2, 3)
-    assert state.bristle_m.shape == (2, 3, 2)
-
-
 def test_pieces_make_the_whole(backend):
     lanes, step_s = varied(4), 2.0**-12
     whole, end = carry(lanes, at_rest(lanes), shaken, 60, step_s, backend=backend)
@@ -439,12 +426,3 @@ def test_no_stage_is_left_unsolved_and_engines_agree(step_s, monkeypatch):
     scale = 1e-6 * largest_force(lanes, speed, load)
     for name in ("friction_n", "inertia_n"):
         assert ((getattr(eager, name)[:4] - getattr(compiled, name)).abs() <= scale).all(), name
-
-
-@pytest.mark.parametrize("wrong", [math.nan, math.inf])
-def test_a_search_ends_though_nothing_can_be_found(backend, wrong):
-    lanes = SMOOTH.lanes(m=[0.0, 5e-3], pressure=hertz_pressure(2))
-    trace, _ = carry(
-        lanes, at_rest(lanes, 0.3), driven(lambda t: wrong), 3, 250e-6, backend=backend
-    )
-    assert not trace.friction_n.isfinite().any()

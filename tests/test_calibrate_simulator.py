@@ -10,7 +10,6 @@ from tactslip_torch.commands import calibrate_simulator as command
 from tactslip_torch.commands.calibrate_simulator import best_point, calibrate, parameters_at, search
 from tactslip_torch.commands.train import train
 from tactslip_torch.report import published
-from tactslip_torch.report.calibration import calibration_table
 from tactslip_torch.simulation import Contact, Disturbances, paper_scenes, scene
 from tactslip_torch.simulation.scene import CALIBRATED_PATH, PRIORS, read_calibrated
 
@@ -57,51 +56,13 @@ def test_the_search_meets_the_target_on_a_falling_curve(root, bend):
     assert len(places) <= 8
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize(
-    ("bound", "tried"),
-    [(2.5, [1.0, 2.0, 2.5]), (0.333, [0.333]), (1.004, [1.0, 1.004]), (0.003, [0.003])],
-)
-def test_the_search_ends_at_the_bound(sign, bound, tried):
-    places, kept = searched(lambda d: 0.96 + sign * 0.1 - 0.001 * d, bounds=(-bound, bound))
-    assert places == [0.0, *(sign * place for place in tried)]
-    assert kept["difficulty"] == places[-1]
-
-
-def test_a_target_is_met_at_once_and_within_bounds_between_hundredths_and_by_the_least_step():
-    assert searched(lambda d: 0.9605 - 0.01 * d)[0] == [0.0]
-    _, kept = searched(lambda d: 0.96 - 0.05 * (d - 0.317), bounds=(-0.333, 0.333))
-    assert abs(kept["accuracy"] - 0.96) <= 0.001
-    places, _ = searched(lambda d: 0.97 - 0.5 * d, step=0.001)
-    assert places[1] == 0.02
-
-
 @pytest.mark.parametrize("edge", [0.31, 1.5, 2.2, 2.35])
 def test_the_search_is_cut_back_to_where_the_checks_hold(edge):
     _, kept = searched(lambda d: 0.99 - 0.0125 * d, holds=lambda d: d < edge)
     assert edge - 0.1 <= kept["difficulty"] < edge
 
 
-def test_checks_that_fail_beyond_the_target_do_not_matter_and_at_the_start_end_it():
-    _, kept = searched(lambda d: 0.99 - 0.02 * d, holds=lambda d: d < 1.8)
-    assert abs(kept["accuracy"] - 0.96) <= 0.001
-    assert searched(lambda d: 0.99, holds=lambda d: False) == ([0.0], None)
-
-
 # --- the line and the frozen values -------------------------------------------------------------
-
-
-def test_the_line_begins_at_the_starting_values_and_gets_harder():
-    start = {"friction_noise_mv": 8.0, "presliding_mm": [0.3, 3.0], "burst_rate_hz": 0.3}
-    assert parameters_at(0.0) == start  # PHYSICS.md
-    rows = [parameters_at(d) for d in (2.0, 1.0, 0.0, -1.0)]
-    noise, presliding, bursts = ([row[name] for row in rows] for name in PRIORS)
-    assert noise == sorted(noise)
-    assert presliding[::-1] == sorted(presliding)
-    assert bursts[::-1] == sorted(bursts)
-    assert [high / low for low, high in presliding] == pytest.approx([10.0] * 4, rel=1e-3)
-    for difficulty in composed(name="calibrate_simulator").bounds:
-        paper_scenes(cycles=1, materials=["M1"], **parameters_at(difficulty))
 
 
 def test_parameters_take_the_frozen_values():
@@ -170,14 +131,6 @@ def test_accuracy_is_what_train_reports_for_the_same_parameters_and_seed(tmp_pat
 
 
 @pytest.mark.slow
-def test_a_point_is_the_mean_over_its_seeds(found):
-    several = command.evaluate_point(tiny("seeds=[1000,1001]"), -1.5)
-    first, second = several["accuracy_by_seed"]
-    assert first == found[0]["points"][1]["accuracy"] != second
-    assert several["accuracy"] == (first + second) / 2
-
-
-@pytest.mark.slow
 def test_unseen_materials_and_their_results_are_used_nowhere(tmp_path, found, monkeypatch):
     monkeypatch.setattr(published, "SPLITS", MappingProxyType({"test": published.SPLITS["test"]}))
     monkeypatch.setattr(scene, "UNSEEN_MATERIALS", ())
@@ -215,11 +168,6 @@ def put_in(monkeypatch, tmp_path):
     put()
     put.path = path
     return put
-
-
-def test_the_published_test_accuracy_is_the_target(tmp_path, monkeypatch, put_in):
-    monkeypatch.setattr(published, "SPLITS", {"test": published.PublishedSplit(accuracy=0.999)})
-    assert calibrate(tiny(), tmp_path)["points"][1]["difficulty"] == -1.5
 
 
 def test_write_freezes_the_values_that_parameters_then_take(tmp_path, put_in):
@@ -278,19 +226,3 @@ def test_what_is_no_calibration_is_refused(tmp_path, override, message):
     with pytest.raises(ValueError, match=message):
         calibrate(tiny(override), tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_table_has_all_points_by_difficulty_and_what_became_of_it(tmp_path, put_in):
-    put_in(accuracy=0.99)
-    content = calibrate(tiny("most_points=3", "step=0.75"), tmp_path)
-    assert content["outcome"] == "+2.61 points from the target: no point tried is closer"
-    content["points"][2] |= {"holds": False, "signal_checks": [{**CHECK, "holds": False}]}
-    lines = calibration_table(content).splitlines()
-    assert lines[0].startswith("SIMULATED")
-    rows = [line.split() for line in lines]
-    first = ["+0.00", "8", "0.3", "to", "3", "0.3", "99.00", "99.00", "hold"]
-    (last,) = (row for row in rows if row[:1] == ["+1.50"])
-    assert rows.index(first) < rows.index(last)
-    assert last[-2:] == ["fail:", "loud"]
-    assert ["it", "is", "loud", "above", "1.5", "2"] in rows
-    assert lines[-1] == content["outcome"]

@@ -16,7 +16,6 @@ from tactslip_torch.analysis.certificate import (
     WORST_SD,
     certify,
     compare,
-    coverage,
     pipelines,
 )
 from tactslip_torch.model.kernels import QuadraticForm
@@ -45,45 +44,6 @@ def test_both_scores_are_those_of_the_pipelines(head, arithmetic):
     assert torch.equal(compared.flips, (rounded >= 0) != (compared.exact >= 0))
     total = sum(compared.stages.values())
     torch.testing.assert_close(total, compared.rounded - compared.exact, rtol=0, atol=1e-12)
-
-
-def test_an_error_is_laid_to_the_stage_that_makes_it():
-    samples = raw_bins(32).float()
-    double, native = (
-        compare(*pipelines(small_detector(arithmetic=a)), samples) for a in ("double", "native")
-    )
-    assert double.stages["features"].abs().max() == 0
-    assert native.stages["features"].abs().max() > 1e-7
-    detector = lying_detector(-2.0)  # whatever the feature
-    lied = compare(*pipelines(detector), samples)
-    torch.testing.assert_close(lied.stages["head"], -2 * lied.exact, rtol=1e-4, atol=1e-5)
-    assert lied.flips.all()
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_what_bins_cover_is_their_extremes_and_spans(rng, dtype):
-    samples = torch.from_numpy(rng.standard_normal((6, 3, 9)))
-    filtered = (samples[..., 2:-2] + 0.5).to(dtype)
-    filtered[0, 0] = 0.0
-    filtered[1, 1] = 3.0
-    found = coverage(samples, filtered)
-    assert found.dtype == dtype
-    own = filtered.numpy()
-    span, size = np.ptp(own, axis=-1), np.abs(own).max(-1)
-    relative = np.divide(span, size, out=np.zeros_like(span), where=size > 0)
-    expected = [samples.numpy().min(-1), -samples.numpy().max(-1), span, relative]
-    np.testing.assert_array_equal(found, np.stack(expected, -1).astype(own.dtype))
-    assert found[0, 0, 3] == found[1, 1, 3] == 0
-
-
-def test_neither_detector_nor_samples_change():
-    detector, samples = small_detector(), raw_bins(5)
-    before, state = samples.clone(), copy.deepcopy(detector.state_dict())
-    certify(detector, samples, simulated=False, extremes=2)
-    assert torch.equal(samples, before)
-    for name, value in detector.state_dict().items():
-        assert torch.equal(value, state[name])
-        assert value.dtype == state[name].dtype
 
 
 # Certificate -----------------------------------------------------------------------------------
@@ -178,18 +138,6 @@ def test_extremes_are_scored_by_kind_and_flagged_as_the_pipeline_flags_them():
     flagged = {kind for kind, row in found.content["extremes"].items() if row["invalid"] == 6}
     assert {"constant", "zero", "offset 1e6, vibration 1e-6"} <= flagged
     assert not flagged & {"plain", "rails", "integers"}
-
-
-def test_a_spike_is_flagged_where_the_filter_leaves_none_of_it():
-    """As the note of the page has it."""
-    detector = small_detector()
-    spikes = extreme_bins("spike", (60, 4, 150), torch.Generator().manual_seed(0), torch.float32)
-    filtered = detector.channel_filter.valid(spikes.double()).numpy()
-    used = {name.channel for name in detector.selected_names}
-    places = [i for i, name in enumerate(detector.pool.hand.names) if name in used]
-    is_gone = (filtered[:, places] == 0).all(-1).any(-1)
-    assert 0 < is_gone.sum() < 60
-    assert (~compare(*pipelines(detector), spikes).is_valid.numpy() == is_gone).all()
 
 
 def test_condition_numbers_are_those_of_finite_differences():

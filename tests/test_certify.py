@@ -8,16 +8,13 @@ import pytest
 import torch
 from drawing import assert_png
 from hydra.utils import instantiate
-from small_detector import certified, small_detector
+from small_detector import small_detector
 from test_commands import TinyRecordings, composed
 
 from tactslip_torch.analysis.raw_bins import bins_inside, draw_bins
 from tactslip_torch.commands.certify import certify, main
 from tactslip_torch.data.labels import LabelRule, label_bins
-from tactslip_torch.data.splits import Split
 from tactslip_torch.features.cache import cache_key
-from tactslip_torch.report.certificate import certificate_figure, conclusion, number
-from tactslip_torch.runtime import plain
 from tactslip_torch.simulation.extremes import EXTREMES
 from tactslip_torch.training.datamodule import FeatureMaker
 
@@ -77,32 +74,6 @@ def test_the_files_stand_beside_the_detector_and_repeat(tmp_path):
     assert written(path) == content
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({}, "Holds: float32 decides as float64 does where |score| exceeds"),
-        ({"head": "sum"}, "as measured: this head has no bound"),
-        (
-            {"gain": 1e39},
-            "Does not hold: error of the head, worst seen is not finite, wanted <=",
-        ),
-    ],
-)
-def test_every_outcome_has_a_conclusion_and_a_figure(options, words, tmp_path):
-    found = certified(small_detector(**options), num_bins=30, extremes=2)
-    content = plain(found.content)
-    assert words in conclusion(content)
-    certificate_figure(content, found.points(), tmp_path / "certificate.png")
-    assert_png(tmp_path / "certificate.png")
-    told = [conclusion(content | {"simulated": simulated}) for simulated in (True, False)]
-    assert ["(simulated data)" in line for line in told] == [True, False]
-
-
-def test_numbers_are_short():
-    shown = [number(v) for v in (1.23456e-7, 0.0, 0.25, 12345.6, 7, None, "words")]
-    assert shown == ["1.2e-07", "0", "0.25", "1.2e+04", "7", "-", "words"]
-
-
 # The bins it draws -----------------------------------------------------------------------------
 
 
@@ -155,14 +126,6 @@ def test_as_many_of_each_class_are_drawn_if_asked():
             )
         )
     assert [known[key] for key in keys_of(bins)] == is_slip.tolist()
-
-
-def test_bins_of_one_recording_may_have_two_roles():
-    fold = Split("random_bins", dict.fromkeys(source().ids[:2], "train"), test_fraction=0.5)
-    train, test = (set(keys_of(drawn(20, role, fold=fold)[0])) for role in ("train", "test"))
-    assert not train & test
-    with pytest.raises(ValueError, match="no recording has the role 'unseen' in random_bins; cho"):
-        drawn(5, "unseen", fold=fold)
 
 
 # The command -----------------------------------------------------------------------------------

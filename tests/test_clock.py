@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactslip_torch.data.clock import Gap, even_clock, nominal_rate, snapped_rate
+from tactslip_torch.data.clock import even_clock, nominal_rate, snapped_rate
 from tactslip_torch.data.file_recordings import EvenSamples
 
 RATE = 2000.0
@@ -87,25 +87,6 @@ def test_stamps_neither_round_the_rate_nor_lose_or_invent_samples(rate, unit):
         assert found.sample_rate_hz == pytest.approx(rate, rel=error)
 
 
-def test_the_rate_is_measured_across_gaps():
-    found = clock_of(ticks(3000, {500, 501, 1500}, 12345.6)[0])
-    assert found.sample_rate_hz == pytest.approx(12345.6, rel=1e-9)
-
-
-def test_stamps_that_slip_slowly_against_the_samples_lose_none():
-    found = clock_of(rounded(1000.1, 1e-3, torch.arange(12_000)))
-    assert (found.num_samples, found.gaps) == (12_000, ())
-    assert found.sample_rate_hz == pytest.approx(1000.1, rel=3e-5)
-
-
-def test_a_pause_between_coarse_stamps():
-    stamps = (ticks(20_000, set(range(7000, 7040)))[0] * 1000).floor() / 1000
-    found = clock_of(stamps)
-    assert found.sample_rate_hz == pytest.approx(RATE, rel=1e-4)
-    assert (len(found.gaps), found.num_samples) == (1, 20_000)
-    assert abs(found.gaps[0].start - 7000) <= 1
-
-
 @settings(max_examples=40)
 @given(
     st.sampled_from([(r, u) for r, u in ROUNDED if u * r < 0.45]),
@@ -134,24 +115,6 @@ def test_coarse_stamps_that_do_not_tell_what_is_missing_are_refused(rate):
     stamps = rounded(rate, 1e-3, is_left.nonzero().flatten())
     with pytest.raises(ValueError, match=r"rounded so coarsely .* reading\.sample_rate_hz=\.\.\."):
         clock_of(stamps, rate)
-
-
-@pytest.mark.parametrize("after", [1, 2, 8, 500, 992, 998, 999])
-def test_a_pause_is_found_at_any_place(after):
-    seconds, _ = ticks(1000)
-    seconds[after:] += 1.0
-    found = clock_of(seconds)
-    assert found.gaps == (Gap(after, 2000, after),)
-    assert found.jitter_s < 1e-9
-
-
-def test_a_sample_that_comes_late_is_no_gap():
-    seconds, _ = ticks(200)
-    seconds[50] += 0.9 / RATE
-    seconds[90:94] += torch.tensor([3.2, 2.2, 1.2, 0.3]).double() / RATE
-    found = clock_of(seconds)
-    assert found.gaps == ()
-    assert found.jitter_s == pytest.approx(3.2 / RATE, rel=0.02)
 
 
 def test_a_clock_that_runs_otherwise_or_drifts_loses_nothing_and_says_how_far_it_is_off():

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from drawing import assert_png, rows_of
+from drawing import rows_of
 from hydra import compose, initialize_config_dir
 from small_set import RATE_HZ, SMALL_HAND, SmallTimeline
 
@@ -17,10 +17,8 @@ from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.report.metrics import bin_metrics, confusion_matrix, split_metrics
 from tactslip_torch.report.results import (
-    confound_figure,
     confound_table,
     print_results,
-    write_results,
 )
 
 pytestmark = pytest.mark.filterwarnings(
@@ -132,14 +130,6 @@ def table_rows(metrics):
     return rows_of("\n".join(lines[1:] if metrics["simulated"] else lines))
 
 
-def test_results_of_one_scene_have_nothing_to_compare(tmp_path, capsys):
-    metrics, _ = made(scenes=("paper",))
-    write_results(tmp_path, metrics, [])
-    assert not (tmp_path / "confound.png").exists()
-    print_results(metrics, [])
-    assert "detector" not in capsys.readouterr().out
-
-
 def test_the_table_has_the_scores_of_the_bins_of_each_detector_and_scene(capsys):
     metrics, bins = made()
     header, *rows = table_rows(metrics)
@@ -171,43 +161,6 @@ def test_the_table_has_the_scores_of_the_bins_of_each_detector_and_scene(capsys)
         assert (row[1], row[-1]) == (f"{100 * accuracy:.2f}", "600")
 
 
-def dots_of(axes):
-    return [line for line in axes.lines if line.get_marker() == "o"]
-
-
-def test_each_dot_of_the_figure_is_a_score(drawn, tmp_path):
-    for simulated in (True, False):
-        metrics, _ = made(simulated=simulated)
-        confound_figure(metrics, tmp_path / "confound.png")
-    assert_png(tmp_path / "confound.png")
-    assert ["SIMULATED" in figure.get_suptitle() for figure in drawn] == [True, False]
-    colours = {"protocol": "#0072B2", "with_scenes": "#D55E00"}
-    for row, role in enumerate(("test", "unseen")):
-        names = [label.get_text() for label in drawn[0].axes[2 * row].get_yticklabels()]
-        assert names == ["paper's protocol", "carried", "tapped"]  # from the top
-        for column, key in enumerate(("non_slip_recall", "slip_recall")):
-            dots = {
-                (line.get_color(), names[round(float(line.get_ydata()[0]))]): line.get_xdata()[0]
-                for line in dots_of(drawn[0].axes[2 * row + column])
-            }
-            expected = {}
-            for fold, colour in colours.items():
-                for scene, scores in metrics["folds"][fold]["splits"][role]["per_scene"].items():
-                    if (value := scores[key]) is not None:
-                        name = "paper's protocol" if scene == "paper" else scene
-                        expected[colour, name] = 100 * (1 - value if column == 0 else value)
-            assert dots == pytest.approx(expected)
-    false_slips, found = drawn[0].axes[:2]
-    hollow = [
-        (line.get_color(), round(float(line.get_ydata()[0])))
-        for line in dots_of(false_slips)
-        if line.get_markerfacecolor() == "white"
-    ]
-    assert sorted(hollow) == [("#0072B2", 1), ("#0072B2", 2), ("#D55E00", 2)]
-    assert [text.get_text() for text in found.texts] == ["no slip in this scene"]
-    assert not false_slips.texts
-
-
 # The experiment, on small scenes -----------------------------------------------------------------
 
 
@@ -223,23 +176,6 @@ def test_a_run_on_several_scenes_leaves_table_and_figure(ran):
         "with_scenes/detector.pt",
     ):
         assert (folder / name).is_file(), name
-
-
-def test_scenes_tell_a_detector_of_slip_from_one_of_motors(ran):
-    """In the protocol the hum is the clearest sign of slip; only other scenes show it is none."""
-    metrics = json.loads((ran[0] / "metrics.json").read_text())
-    for role in ("test", "unseen"):
-        before, after = (
-            metrics["folds"][fold]["splits"][role]["per_scene"]
-            for fold in ("protocol", "with_scenes")
-        )
-        assert before["paper"]["balanced_accuracy"] > 0.95
-        assert before["arm_motion"]["non_slip_recall"] < 0.3
-        assert after["arm_motion"]["non_slip_recall"] > 0.7
-        for scene in ("pulled", "motor_off"):
-            assert before[scene]["slip_recall"] < 0.8
-            assert after[scene]["slip_recall"] > 0.9
-        assert before["arm_motion"]["slip_recall"] is None
 
 
 def test_scores_on_the_same_bins_are_each_ones_own_and_no_sums(ran):
@@ -287,17 +223,6 @@ def test_scores_on_the_same_bins_are_each_ones_own_and_no_sums(ran):
 def evaluated(ran, folder, *overrides):
     model = f"model={ran[0] / 'with_scenes' / 'detector.pt'}"
     return evaluate(composed(model, *overrides, name="evaluate"), folder)
-
-
-def test_evaluate_on_several_scenes_draws_them(ran, tmp_path, capsys):
-    kinds = [f"+scene@extra_scenes.{kind}={kind}" for kind in ("arm_motion", "pulled")]
-    metrics = evaluated(ran, tmp_path, *kinds)
-    assert confound_table(metrics) in capsys.readouterr().out
-    assert (tmp_path / "confound.png").is_file()
-    assert {row[2] for row in table_rows(metrics)[1:]} == {"detector"}
-    scenes = metrics["splits"]["unseen"]["per_scene"]
-    assert list(scenes) == ["arm_motion", "paper", "pulled"]
-    assert scenes["arm_motion"]["slip_recall"] is scenes["arm_motion"]["balanced_accuracy"] is None
 
 
 @pytest.mark.slow

@@ -3,12 +3,11 @@
 import csv
 import re
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
 from test_commands import composed
-from test_datasets import HAND, RATE_HZ, broken, manifest, ours, samples, table
+from test_datasets import HAND, broken, manifest, ours, samples, table
 
 from tactslip_torch.commands import data as data_tool
 from tactslip_torch.data.file_recordings import FileRecordings
@@ -90,20 +89,6 @@ def test_a_file_that_is_damaged_in_its_samples_is_a_problem(root, capsys, monkey
     assert run("check", root, ROWS, "samples=false") == 0
 
 
-def test_what_is_missing_by_rule_is_not_called_broken(tmp_path):
-    content = samples(0)
-    content[:, 100:120] = torch.nan
-    content[0, 300] = torch.inf
-    table(tmp_path / "a.csv", content)
-    manifest(tmp_path, "a.csv,wood,0.5-0.6", columns="file,material,missing_s")
-    source = FileRecordings(tmp_path)
-    found = source.inspect(source.ids[0])
-    assert found.broken == {0: (1, 1.5)}
-    finite = content.where(content.isfinite(), 0.0)
-    assert found.least == finite.amin(-1).tolist()
-    assert found.greatest == finite.amax(-1).tolist()
-
-
 # summary -------------------------------------------------------------------------------------
 
 
@@ -130,40 +115,7 @@ def test_summary_tells_and_draws_what_there_is(root, tmp_path, capsys):
         assert len(image.convert("RGB").getcolors(1 << 24)) > 10
 
 
-def test_a_simulated_set_is_called_so(tmp_path, capsys):
-    ours(tmp_path / "a.npz", provenance={"simulated": True})
-    manifest(tmp_path, "a.npz,wood,0,,,")
-    run("summary", tmp_path, f"output={tmp_path / 'a.png'}", "samples=false")
-    assert capsys.readouterr().out.count("SIMULATED") == 2
-    run("check", tmp_path)
-    assert "SIMULATED" in capsys.readouterr().out
-
-
 # convert -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["h5", "rosbag2"])  # the contract has all of them
-def test_a_set_becomes_one_of_another_format(root, tmp_path, name, capsys):
-    before = FileRecordings(root, channels=HAND.to_rows())
-    (root / "b.csv").rename(root / "bb.csv")
-    text = (root / "manifest.csv").read_text()
-    (root / "manifest.csv").write_text(text.replace("b.csv", "bb.csv"))
-    done = run("convert", root, ROWS, f"to={name}", f"output={tmp_path / 'out'}")
-    assert [one.made for one in done] == [True] * 4
-    after = FileRecordings(tmp_path / "out")
-    assert after.problems == after.warnings == ()
-    assert (after.ids, after.hand) == (before.ids, before.hand)
-    (root / "bb.csv").rename(root / "b.csv")
-    for recording in before.ids:
-        one, other = before.load(recording), after.load(recording)
-        assert torch.equal(one.samples, other.samples)
-        assert one.samples.dtype == other.samples.dtype
-        assert before.timeline(recording) == after.timeline(recording)
-        assert one.units == other.units
-        assert dict(other.provenance)["simulated"] is False
-    told = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert ["paper", "4", "4", "12.0"] in [row[:4] for row in told]
-    assert sorted(p.name for p in (tmp_path / "out" / "day 2").iterdir())
 
 
 def converted(root, out, *overrides):
@@ -210,21 +162,6 @@ def test_the_first_that_fails_stops_it_or_is_left_out_on_request(
     (root / "b.csv").write_bytes(content)
     monkeypatch.setattr(FileRecordings, "load", whole)
     assert converted(root, out) == [False, False, True, False]
-
-
-def test_gaps_are_missing_in_the_copy_and_other_units_are_made_anew(tmp_path):
-    times = np.delete(np.arange(600), slice(100, 120)) / RATE_HZ
-    table(tmp_path / "set" / "a.csv", samples(0, 580), times=times)
-    manifest(tmp_path / "set", "a.csv,wood,0,,,slip")
-    given = ("data.gaps=missing", "to=npz", f"output={tmp_path / 'out'}")
-    assert run("convert", tmp_path / "set", *given)[0].made
-    copy = FileRecordings(tmp_path / "out")
-    assert copy.timeline(copy.ids[0]).missing_s == ((0.5, 0.6),)
-    assert copy.load(copy.ids[0]).samples[:, 100:120].isnan().all()
-    assert run("check", tmp_path / "out") == 0
-    assert not run("convert", tmp_path / "set", *given)[0].made
-    assert run("convert", tmp_path / "set", *given, "data.units=counts")[0].made
-    assert FileRecordings(tmp_path / "out").units == "counts"
 
 
 @pytest.mark.parametrize(

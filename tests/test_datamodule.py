@@ -4,7 +4,7 @@ from small_set import RATE_HZ, SmallSet, small_maker
 
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.splits import random_bins, unseen4
+from tactslip_torch.data.splits import unseen4
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
@@ -45,17 +45,6 @@ def test_the_cache_saves_the_work_and_a_damaged_entry_is_made_anew(tmp_path, cap
     assert torch.equal(first.features, again.features)
     assert "damaged" in caplog.text
     assert path.read_bytes() != bytes(content)
-
-
-@pytest.mark.parametrize(
-    "change", [{"layout": "half_second"}, {"hop_ms": 25.0}, {"bin_ms": 50.0}], ids=str
-)
-def test_another_rule_is_another_cache_entry(tmp_path, change):
-    source = SmallSet()
-    cache = FeatureCache(tmp_path)
-    small_maker(source, cache)(RecordingId("a", 0), split_of(source))
-    small_maker(source, cache, **change)(RecordingId("a", 0), split_of(source))
-    assert source.loads == (1 if change == {"bin_ms": 50.0} else 2)
 
 
 def test_shuffled_labels_keep_their_counts_and_lose_their_order():
@@ -126,12 +115,3 @@ def test_loaders_give_the_recordings_of_their_roles_in_order(num_workers):
     assert trained == data.split.having("train")
     assert len(trained) == 8
     assert [batch.recording for batch in data.test_dataloader()] == sorted(source.ids)
-
-
-def test_the_random_split_puts_bins_of_one_recording_on_both_sides():
-    source = SmallSet()
-    split = random_bins(source.ids, seen=["a", "b"])[0]
-    roles = small_maker(source)(RecordingId("a", 0), split).roles
-    assert roles["train"].any()
-    assert roles["test"].any()
-    assert torch.equal(roles["train"], ~roles["test"])

@@ -15,7 +15,6 @@ from test_commands import composed
 
 from tactslip_torch.data.file_recordings import FileRecordings, file_digest
 from tactslip_torch.data.formats import named_format
-from tactslip_torch.data.manifest import Truth
 from tactslip_torch.data.public_sets import STEMS, authors_raw, named_recordings, nominal
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.hand import Channel, HandLayout
@@ -695,19 +694,6 @@ def test_paths_say_what_recordings_are(folder):
     assert (other.onsets_s, other.slip_s) == ((), ((0.5, 1.5),))
 
 
-def test_labels_stand_in_names_themselves(tmp_path):
-    for name in ("slip/pen_a", "slip/pen_b", "non-slip/pen_a", "unsure/pen_a"):
-        table(tmp_path / f"{name}.csv", samples(0, 150))
-    found = named_recordings(tmp_path, pattern=r"(?P<label>[^/]+)/(?P<material>[a-z]+)_.\.csv")
-    told = [(found.entry(r).file, r.cycle, found.entry(r).truth) for r in found.ids]
-    assert told == [
-        ("non-slip/pen_a.csv", 0, Truth(label="non-slip")),
-        ("slip/pen_a.csv", 1, Truth(label="slip")),
-        ("slip/pen_b.csv", 2, Truth(label="slip")),
-        ("unsure/pen_a.csv", 3, None),
-    ]
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -767,24 +753,6 @@ def test_the_authors_files_are_the_papers_hand_and_protocol(tmp_path):
     paper = nominal((20.0, 40.0, 60.0), 100.0, 2.0)
     assert (paper.onsets_s, paper.speeds_mm_s) == ((2.0, 9.0, 13.5), (20.0, 40.0, 60.0))
     assert [end - start for start, end in paper.sliding_s] == pytest.approx([5, 2.5, 5 / 3])
-
-
-def test_a_manifest_can_say_onsets_better_and_a_long_slide_is_cut(tmp_path):
-    authors(tmp_path / "abs-slip1.txt", duration_s=3.6)
-    authors(tmp_path / "abs-slip2.txt")
-    authors(tmp_path / "abs-slip3.txt", duration_s=3.0)
-    (tmp_path / "other.txt").write_text("")
-    marked = "file,material,trial,onsets_s,sliding_s\nabs-slip2.txt,M1,2,2.1,2.1-3.9\n"
-    (tmp_path / "marked.csv").write_text(f"{marked}abs-slip1.txt,M1,1,,\nother.txt,M2,2,,\n")
-    source = authors_raw(tmp_path, **SHORT, manifest="marked.csv", strict=False)
-    assert lines_of(source) == [
-        "marked.csv:4: file 'other.txt' has no name that says what it is",
-        "abs-slip3.txt: sliding_s: 3.4-3.9 s leaves the recording of 3 s",
-        "abs-slip3.txt: onsets_s: 3.4 s is behind the end, 3 s",
-    ]
-    cut, told = map(source.timeline, source.ids)
-    assert cut.sliding_s[1] == pytest.approx((3.4, 3.6))
-    assert told.onsets_s == pytest.approx((2.1,))
 
 
 def test_what_is_wrong_with_the_authors_names(tmp_path):

@@ -69,11 +69,3 @@ def test_sensors_die_and_come_back_in_the_middle_of_a_stream(detector, samples):
     score = torch.cat([part.score for part in parts])
     torch.testing.assert_close(score[kept], whole.score[kept], rtol=1e-9, atol=1e-9)
     assert (score[~kept] != whole.score[~kept]).all()
-
-
-def test_a_hand_that_is_wholly_dead_tells_nothing(detector, samples):
-    found = StreamingDetector(detector, dtype=torch.float64, masked_channels=HAND.names).push(
-        samples.T
-    )
-    assert torch.equal(found.probability, torch.full_like(found.score, 0.5))
-    assert not found.alarms

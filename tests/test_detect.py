@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 import sys
 
 import numpy as np
@@ -107,25 +106,6 @@ def offline(samples, settings=SETTINGS):
 # What is detected ------------------------------------------------------------------------------
 
 
-def test_alarms_are_those_of_the_whole_recording(run):
-    _, content = run
-    assert [entry["file"] for entry in content["recordings"]] == ["a.npz", "b.npz"]
-    for entry, samples in zip(content["recordings"], (volts(), volts(4.0, ())), strict=True):
-        decisions = offline(samples)
-        assert entry["decisions"] == {"number": len(decisions.number), "invalid": 0}
-        wanted = decisions.alarms
-        assert len(entry["alarms"]) == len(wanted)
-        for found, alarm in zip(entry["alarms"], wanted, strict=True):
-            assert found["alarm_s"] == alarm.alarm_s
-            assert found["onset_s"] == alarm.onset_s
-            assert found["is_valid"] is True
-            for name in ("score", "probability", "statistic"):
-                assert found[name] == pytest.approx(getattr(alarm, name), rel=1e-4)
-            is_off = (~decisions.is_on) & (decisions.available_s > alarm.alarm_s)
-            assert found["end_s"] == float(decisions.available_s[is_off][0])
-    assert len(content["recordings"][0]["alarms"]) >= 2
-
-
 def test_the_truth_stands_beside_them(run):
     _, content = run
     first, second = content["recordings"]
@@ -148,20 +128,6 @@ def test_the_truth_stands_beside_them(run):
     assert events["num_false_alarms"] == len(false)
 
 
-def test_an_alarm_that_stands_before_the_slip_and_to_the_end_is_early(model, tmp_path):
-    """Loud from before the onset to the end: one alarm, which never ends."""
-    samples = volts(4.0, ((1.9, 4.0),))
-    truth = {"onsets_s": (2.0,), "sliding_s": ((2.0, 4.0),), "speeds_mm_s": (20.0,)}
-    save(tmp_path / "a.npz", recording(samples, **truth))
-    (entry,) = detected(model, tmp_path, tmp_path / "out", "threshold=3", "figure=false")[
-        "recordings"
-    ]
-    last = entry["alarms"][-1]
-    assert 1.9 < last["alarm_s"] < 2.0
-    assert (last["end_s"], last["outcome"]) == (None, "early")
-    assert [onset["outcome"] for onset in entry["truth"]["onsets"]] == ["early"]
-
-
 def test_an_alarm_behind_the_first_release_is_not_early(model, tmp_path):
     samples = volts(4.0, ((1.9, 4.0),))
     truth = {"onsets_s": (2.0,), "sliding_s": ((2.0, 4.0),), "speeds_mm_s": (20.0,)}
@@ -173,17 +139,6 @@ def test_an_alarm_behind_the_first_release_is_not_early(model, tmp_path):
     assert onset["first_release_s"] == 1.9
     assert [onset["delay_s"], last["delay_s"]] == pytest.approx([last["alarm_s"] - 2.0] * 2)
     assert onset["delay_first_s"] == pytest.approx(last["alarm_s"] - 1.9)
-
-
-def test_every_word_about_the_origin_is_there(run):
-    _, content = run
-    assert content["format"] == "tactslip_torch onsets 1"
-    assert content["simulated"] is content["detector"]["trained_on_simulated"] is True
-    assert content["settings"]["threshold"] == 2.0
-    assert content["settings"]["is_own_threshold"] is True
-    assert content["detector"]["bin_s"] == 0.05
-    assert set(content["versions"]) == {"tactslip_torch", "torch", "code"}
-    assert content["failed"] == []
 
 
 def test_the_files_agree_with_each_other(run):
@@ -231,56 +186,7 @@ def test_a_detector_with_thresholds_abstains_between_them(tmp_path):
         assert int(row["answer"]) == wanted
 
 
-def test_the_terminal_shows_a_table_a_rate_and_one_bar(model, tmp_path, capsys):
-    save(tmp_path / "a.npz", recording())
-    content = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
-    out, err = capsys.readouterr()
-    lines = out.splitlines()
-    assert lines[1].startswith("SIMULATED data")
-    assert len([x for x in lines if " found" in x and x[0] in "a "]) == 2
-    assert f"{len(content['recordings'][0]['alarms'])} alarms in 8.0 s of 1 recordings" in out
-    assert "of 2 slips 2 found, median delay" in out
-    assert out.endswith(f"onsets in {tmp_path / 'out'}\n")
-    assert "onsets" in err
-    assert "8/8" in err
-    assert "s of signal/s" in err
-    assert not (tmp_path / "out" / "a_onsets.png").exists()
-
-
 # What it is told ---------------------------------------------------------------------------------
-
-
-def test_another_threshold_can_be_given(model, tmp_path):
-    save(tmp_path / "a.npz", recording())
-    content = detected(model, tmp_path / "a.npz", tmp_path / "out", "threshold=1e6", "figure=false")
-    entry = content["recordings"][0]
-    assert entry["alarms"] == []
-    assert [onset["outcome"] for onset in entry["truth"]["onsets"]] == ["missed", "missed"]
-    assert content["settings"]["threshold"] == 1e6
-    assert content["settings"]["is_own_threshold"] is False
-    rows = rows_of(tmp_path / "out" / "onsets.csv")
-    assert [(row["outcome"], row["alarm_s"]) for row in rows] == [("missed", "")] * 2
-    assert [row["true_onset_s"] for row in rows] == ["2.0", "5.0"]
-
-
-def test_masked_channels_are_not_used(model, tmp_path):
-    save(tmp_path / "a.npz", recording())
-    place = tmp_path / "a.npz"
-    content = detected(
-        model, place, tmp_path / "out", "masked_channels=[PVDF2,SG1]", "figure=false"
-    )
-    assert content["masked_channels"] == ["SG1", "PVDF2"]
-    numbers = content["recordings"][0]["decisions"]
-    assert numbers["invalid"] == numbers["number"] > 0
-    whole = detected(model, place, tmp_path / "whole", "figure=false")
-    assert whole["masked_channels"] == []
-    assert whole["recordings"][0]["decisions"]["invalid"] == 0
-
-
-def test_a_figure_may_show_a_part(model, tmp_path, drawn):
-    save(tmp_path / "a.npz", recording())
-    detected(model, tmp_path / "a.npz", tmp_path / "out", "view=[1.5,20]")
-    assert drawn[0].axes[0].get_xlim() == (1.5, 8.0)
 
 
 @pytest.mark.parametrize("kind", ["npy", "npz"])
@@ -315,35 +221,6 @@ def test_a_recording_nobody_annotated_has_no_false_alarms(model, tmp_path):
     content = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
     alarms = content["recordings"][0]["alarms"]
     assert len(content["recordings"][0]["truth"]["false_alarms_s"]) == len(alarms) > 0
-
-
-def test_samples_in_float64_are_scored_in_float64(model, tmp_path):
-    save(tmp_path / "a.npz", recording(volts().double()))
-    (entry,) = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")["recordings"]
-    for found, wanted in zip(entry["alarms"], offline(volts().double()).alarms, strict=True):
-        assert found["score"] == pytest.approx(wanted.score, rel=1e-9)
-
-
-def test_missing_samples_and_dead_channels_are_flagged(model, tmp_path, capsys):
-    lost, dead = volts(), volts()
-    lost[:, 12000:12400] = math.nan
-    dead[2] = 0.0
-    save(tmp_path / "dead.npz", recording(dead))
-    save(tmp_path / "lost.npz", recording(lost))
-    content = detected(model, tmp_path, tmp_path / "out")
-    of_dead, of_lost = content["recordings"]
-    wanted = [int((~offline(samples).is_valid).sum()) for samples in (dead, lost)]
-    assert [of_dead["decisions"]["invalid"], of_lost["decisions"]["invalid"]] == wanted
-    assert min(wanted) > 0
-    assert "of the decisions are not valid" in capsys.readouterr().out
-
-
-def test_files_of_one_stem_keep_their_figures_apart(model, tmp_path):
-    save(tmp_path / "a.npz", quiet())
-    np.save(tmp_path / "a.npy", volts(2.0, ()).numpy().T)
-    detected(model, tmp_path, tmp_path / "out", "sample_rate_hz=2000")
-    pictures = sorted(path.name for path in (tmp_path / "out").glob("*.png"))
-    assert pictures == ["a.npy_onsets.png", "a.npz_onsets.png"]
 
 
 # Long recordings ---------------------------------------------------------------------------------
@@ -491,17 +368,6 @@ def test_a_detector_without_a_threshold_says_how_to_get_one(tmp_path, monkeypatc
     assert "no alarm threshold; train with +exp=onset" in line
 
 
-def test_an_error_of_ours_is_not_called_a_bad_recording(model, tmp_path, monkeypatch):
-    save(tmp_path / "a.npz", recording())
-
-    def broken(stream, samples):
-        raise ZeroDivisionError("a bug")
-
-    monkeypatch.setattr(module.StreamingDetector, "push", broken)
-    with pytest.raises(ZeroDivisionError):
-        detect(composed(f"model={model}", f"input={tmp_path}"), tmp_path / "out")
-
-
 # Files of others ---------------------------------------------------------------------------------
 
 
@@ -514,22 +380,6 @@ def write_table(path, samples, order, times_s=None):
         header, columns = ["time", *header], [times_s, *columns]
     table = torch.stack([column.double() for column in columns], dim=1).numpy()
     np.savetxt(path, table, delimiter=",", header=",".join(header), comments="", fmt="%.17g")
-
-
-def test_a_table_of_others_gives_the_same_onsets(model, tmp_path):
-    content = recording()
-    save(tmp_path / "ours" / "a.npz", content)
-    (tmp_path / "theirs").mkdir()
-    times_s = 1e6 + torch.arange(content.samples.shape[1]).double() / RATE_HZ
-    write_table(tmp_path / "theirs" / "a.csv", content.samples, [2, 0, 3, 1], times_s)
-    ours = detected(model, tmp_path / "ours", tmp_path / "out1", "figure=false")
-    theirs = detected(model, tmp_path / "theirs", tmp_path / "out2", "figure=false")
-    (mine,), (other,) = ours["recordings"], theirs["recordings"]
-    assert mine["alarms"]
-    times = [[alarm["alarm_s"] for alarm in each["alarms"]] for each in (mine, other)]
-    assert times[0] == times[1]
-    assert other["simulated"] is None
-    assert other["duration_s"] == mine["duration_s"]
 
 
 def test_a_gap_in_the_times_is_missing_samples_and_a_clock_a_little_off_is_none(model, tmp_path):

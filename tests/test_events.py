@@ -203,55 +203,6 @@ def test_order_and_shift_change_no_bit(rng):
     assert event_metrics(shifted, RULES, LATENCY) == before
 
 
-# ---------------------------------------------------------------------------------------- edges
-EDGES = {
-    0.799: ("missed", True),
-    0.8: ("early", False),
-    0.999: ("early", False),
-    1.0: ("found", False),
-    1.5: ("found", False),
-    1.5000001: ("missed", False),
-    3.1: ("missed", False),
-    3.1000001: ("missed", True),
-}
-
-
-@pytest.mark.parametrize("alarm", EDGES)
-def test_an_alarm_at_an_edge(alarm):
-    outcome, is_false = EDGES[alarm]
-    assert outcomes([alarm]) == [outcome]
-    assert false_alarms([alarm]) == ((alarm,) if is_false else ())
-
-
-RELEASED_EDGES = {  # the skin lets go from 0.94 to 1.02 s, half of the load at 1.0 s
-    0.739: ("missed", True),
-    0.74: ("early", False),
-    0.939: ("early", False),
-    0.94: ("found", False),
-    1.5: ("found", False),
-    1.5000001: ("missed", False),
-}
-
-
-@pytest.mark.parametrize("alarm", RELEASED_EDGES)
-def test_early_is_before_the_first_release_and_late_is_counted_from_the_onset(alarm):
-    outcome, is_false = RELEASED_EDGES[alarm]
-    assert outcomes([alarm], released_s=((0.94, 1.02),)) == [outcome]
-    assert false_alarms([alarm], released_s=((0.94, 1.02),)) == ((alarm,) if is_false else ())
-
-
-def test_a_status_that_ends_before_the_first_release_leaves_the_slip_to_be_found():
-    for end, outcome in ((0.93, "found"), (0.95, "early")):
-        several = outcomes([0.9, 0.97], alarm_ends_s=(end, 2.0), released_s=((0.94, 1.02),))
-        assert several == [outcome]
-
-
-def test_an_alarm_behind_the_first_release_of_the_next_slip_is_not_of_this_one():
-    slips = {"onsets": (1.0, 1.4), "slides": ((1.0, 1.2), (1.4, 3.0))}
-    assert outcomes([1.3], **slips) == ["found", "early"]
-    assert outcomes([1.3], **slips, released_s=((1.0, 1.0), (1.3, 1.5))) == ["missed", "found"]
-
-
 def test_rounding_moves_no_alarm_over_an_edge():
     assert 0.9 < 1.1 - 0.2  # as floats see it
     assert outcomes([0.9], [1.1]) == ["early"]
@@ -341,22 +292,6 @@ def test_delays_from_the_onset_and_the_first_release(
     parts = metrics["latency_ms"]
     whole = parts["look_ahead"] + parts["bin_fill"] + parts["decision"]
     assert parts["delay"] == pytest.approx(whole)
-
-
-def test_what_is_not_known_of_a_slip_is_left_out():
-    many = [
-        watched([1.05], released_s=((0.95, 1.0),), recording="a"),
-        watched([1.1], speeds=(0.0,), recording="b"),
-    ]
-    events = [recording_events(one, RULES, LATENCY) for one in many]
-    assert math.isnan(events[1].onsets[0].first_release_s)
-    metrics = pooled_metrics(events, **QUICK)
-    assert metrics["delay_ms"]["median"]["value"] == pytest.approx(75.0)
-    assert metrics["delay_first_ms"]["median"]["value"] == pytest.approx(100.0)
-    assert metrics["slid_mm"]["median"]["value"] == pytest.approx(1.0)
-    nothing = pooled_metrics(events[1:], **QUICK)
-    assert nothing["delay_first_ms"] is nothing["slid_mm"] is None
-    json.dumps(metrics, allow_nan=False)
 
 
 def test_estimates_are_held_against_the_onsets_found(rng):

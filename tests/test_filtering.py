@@ -197,20 +197,6 @@ def test_few_bins_are_filtered_as_many_are_and_only_where_it_is_wanted(channels,
             )
 
 
-def test_a_frame_of_one_sample_leaves_a_signal_as_it_is():
-    x = torch.tensor([1.0, -0.0, 3.0, torch.nan, torch.inf], dtype=torch.float64)
-    ours = savgol_filter(x, 1)
-    assert ours.numpy().tobytes() == x.numpy().tobytes()
-    assert ours.data_ptr() != x.data_ptr()
-    whole = recording(40)
-    layer = ChannelFilter([1, 5, 1, 1])
-    assert torch.equal(layer(whole)[[0, 2]], whole[[0, 2]])
-    assert torch.equal(layer.valid(whole)[[0, 2]], whole[[0, 2], 2:38])
-    with torch.device("meta"):  # of what is made, not of what is given
-        inside = layer.valid(whole[:, 1:])
-    torch.testing.assert_close(inside, layer.valid(whole)[:, 1:])
-
-
 def test_channel_filter_errors():
     layer = ChannelFilter(LENGTHS)
     for call in (layer, layer.valid):
@@ -267,17 +253,6 @@ def test_own_kernels_are_convolutions_that_keep_constants_and_come_back(align):
     assert again.config() == layer.config()
     assert torch.equal(again(x), ours)
     assert set(ChannelFilter([3]).config()) == {"window_lengths", "polyorder", "align"}
-
-
-@aligned
-@pytest.mark.parametrize("num_samples", [11, 80])
-def test_bins_of_an_extended_recording_are_the_recording_filtered_whole(align, num_samples):
-    own, x = with_own_kernels(align), recording(num_samples)
-    plain = ChannelFilter(own.window_lengths, align=align)
-    whole = extended(x, plain)
-    assert torch.equal(whole[:, own.context_before : own.context_before + num_samples], x)
-    for layer in (own, plain):
-        torch.testing.assert_close(layer.valid(whole), layer(x), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

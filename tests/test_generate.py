@@ -15,11 +15,7 @@ from tactslip_torch import HandLayout, simulate
 from tactslip_torch.commands import generate as module
 from tactslip_torch.commands.entry import folder_problem, one_line
 from tactslip_torch.commands.generate import generate
-from tactslip_torch.data.file_recordings import FileRecordings
-from tactslip_torch.data.folder import RecordingFolder, Written
 from tactslip_torch.data.formats import FORMATS
-from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.report.recordings import written_table
 from tactslip_torch.simulation.scene import Scene
 
 PAPER = HandLayout.paper24()
@@ -93,20 +89,6 @@ def test_files_hold_the_recordings_of_the_source_bit_for_bit(tmp_path, capsys):
     assert out.endswith(f"recordings in {tmp_path}\n")
 
 
-def test_what_was_generated_is_read_as_it_was_made(tmp_path, capsys):
-    """So a training on the files is one on the source: same bins, features and scores."""
-    run(tmp_path)
-    assert {line["simulated"] for line in manifest(tmp_path)} == {"false"}
-    assert "SIMULATED" not in capsys.readouterr().out
-    made, read = TinyRecordings(0, 3, ["A", "B"]), FileRecordings(tmp_path)
-    assert (read.ids, read.hand) == (made.ids, made.hand)
-    assert (read.sample_rate_hz, read.is_simulated) == (made.sample_rate_hz, False)
-    for recording in made.ids:
-        assert torch.equal(read.load(recording).samples, made.load(recording).samples)
-        one, other = read.timeline(recording), made.timeline(recording)
-        assert all(getattr(one, name) == getattr(other, name) for name in vars(other))
-
-
 def test_any_number_of_processes_writes_the_same_bytes(tmp_path):
     found = [run(tmp_path / str(n), workers=n) for n in (0, 2)]
     one, other = [contents(tmp_path / str(n)) for n in (0, 2)]
@@ -129,17 +111,6 @@ def test_sessions_and_kinds_of_scenes_have_files_and_rows_of_their_own(tmp_path,
     rows = [line.split()[:3] for line in capsys.readouterr().out.splitlines()]
     for row in (["paper", "2", "2"], ["quiet", "2", "2"], ["all", "4", "4"]):
         assert row in rows
-
-
-def test_the_table_counts():
-    line = {"scene": "paper", "simulated": "true"}
-    written = [Written(line, True, 10.25, 2_000_000), Written(line, False, 5.0, 500_000)]
-    said = written_table([one._asdict() for one in written], 3.25)
-    head, names, row, last = said.splitlines()
-    assert head.startswith("SIMULATED")
-    assert row.split() == ["paper", "2", "1", "15.2", "2.5"]
-    assert names.split() == ["scene", "recordings", "made", "now", "seconds", "of", "signal", "MB"]
-    assert last == "took 3.2 s"
 
 
 # What is kept --------------------------------------------------------------------------------
@@ -245,16 +216,6 @@ def test_bad_input_is_one_line_and_touches_nothing(tmp_path, overrides, said):
     assert not list(tmp_path.iterdir())
 
 
-def test_two_recordings_never_share_a_file(tmp_path):
-    class Clash(TinyRecordings):
-        ids = ()
-
-    source = Clash(0, 1, ["A"])
-    source.ids = (RecordingId("A_b", 0, "c"), RecordingId("A", 0, "b_c"))
-    with pytest.raises(ValueError, match="A_b/0/c and A/0/b_c would both become A_b_c_00"):
-        RecordingFolder(source, tmp_path, "npz", {}).check()
-
-
 def test_a_folder_that_cannot_be_made_is_said_in_one_line(tmp_path):
     (tmp_path / "file").write_text("mine")
     for place in (tmp_path / "file", tmp_path / "file" / "below" / "it"):
@@ -298,13 +259,3 @@ def test_the_figures_show_each_material_filtered(tmp_path, drawn):
     assert whole[2] == near[2] == "Recordings: scene paper, cycle 1"
     assert whole[3] is None
     assert near[3] == [(pytest.approx(1.1), 4.5)] * 2  # two seconds before 3.1 s, to the end
-
-
-def test_simulated_recordings_are_called_so_with_their_fidelity(tmp_path, drawn):
-    run(tmp_path, *CARRIED, "seed=2", figure=True)
-    rows, _, title, views = drawn["onset_arm_motion.png"]
-    assert title == ("SIMULATED recordings: scene arm_motion, cycle 0, fidelity kinematic, seed 2")
-    assert all(row.onsets_s == () and len(row.non_slip_s) == 3 for row in rows)
-    for row, (start, end) in zip(rows, views, strict=True):
-        assert start == pytest.approx(max(0.0, row.non_slip_s[1][0] - 2.0))
-        assert end - start <= 5.0

@@ -159,17 +159,6 @@ def test_values_are_those_of_a_stream(kind, align, rule):
         torch.testing.assert_close(value.detach(), getattr(expected, name), **close)
 
 
-def test_several_streams_at_once_and_float32():
-    settings = settings_of(RULES[0])
-    streams = torch.stack([signal(400, seed) for seed in (1, 2)])
-    together = stream_statistic(DETECTOR, settings, streams)
-    for row, stream in enumerate(streams):
-        alone = stream_statistic(DETECTOR, settings, stream)
-        torch.testing.assert_close(together.statistic[row], alone.statistic)
-    narrow = stream_statistic(DETECTOR, settings, streams.float())
-    assert {part.dtype for part in narrow} == {torch.float32}
-
-
 def test_gradients_of_a_stream_are_slopes(rng):
     """Along random directions of some volts each, against a central difference."""
     settings = settings_of(Cusum(drift=-0.5, evidence=0.4))
@@ -185,28 +174,6 @@ def test_gradients_of_a_stream_are_slopes(rng):
         with torch.no_grad():
             slope = (statistic(samples + step * way) - statistic(samples - step * way)) / (2 * step)
         torch.testing.assert_close((pull * way).sum(), slope, rtol=1e-4, atol=1e-6)
-
-
-def test_what_a_log_likelihood_ratio_rests_on():
-    """No gradient to channels that are not in use or missing, nor to later samples."""
-    detector, settings = detector_of("PVDF"), settings_of(RULES[0])
-    samples = signal(600, 4)
-    samples[0, 100] = torch.nan  # a gauge: nobody reads it
-    samples[3, 50] = torch.inf  # the first film bins
-    samples.requires_grad_()
-    found = stream_statistic(detector, settings, samples)
-    (pull,) = torch.autograd.grad(found.llr[0], samples)  # CUSUM may stand at 0, without a slope
-    assert not pull[[0, 1, 3]].any()
-    assert pull[2].any()
-    assert not pull[:, 100 + detector.look_ahead :].any()
-
-
-def test_a_stream_without_any_sensor_says_nothing():
-    samples = torch.full((4, 300), torch.nan, dtype=torch.float64, requires_grad=True)
-    found = stream_statistic(DETECTOR, settings_of(RULES[0]), samples)
-    assert not found.llr.any()
-    (pull,) = torch.autograd.grad(found.statistic.sum(), samples)
-    assert not pull.any()
 
 
 def test_what_is_no_recording_is_refused():

@@ -2,7 +2,6 @@ import pytest
 
 from tactslip_torch import Channel, HandLayout
 
-FINGERS = ("little", "ring", "middle", "index")
 ROWS = [
     {"name": "pad", "kind": "SG", "finger": "thumb", "segment": "distal"},
     {"name": "film", "kind": "PVDF", "finger": "thumb", "segment": "distal"},
@@ -16,18 +15,6 @@ def test_the_papers_hand_is_in_file_order():
     assert len(hand) == 24
     assert hand.indices("SG") == tuple(range(14))
     assert hand.indices("PVDF") == tuple(range(14, 24))
-
-
-def test_fingers_carry_films_on_two_segments_and_the_thumb_on_both():
-    hand = HandLayout.paper24()
-    for finger in FINGERS:
-        own = [c for c in hand.channels if c.finger == finger]
-        assert [c.segment for c in own if c.kind == "SG"] == ["distal", "middle", "proximal"]
-        assert [c.segment for c in own if c.kind == "PVDF"] == ["distal", "middle"]
-    thumb = [c for c in hand.channels if c.finger == "thumb"]
-    films = {c.segment for c in thumb if c.kind == "PVDF"}
-    assert films == {c.segment for c in thumb if c.kind == "SG"}
-    assert len(films) == 2
 
 
 def test_rows_go_round():

@@ -227,24 +227,6 @@ def test_the_slider_goes_by_false_alarms_where_the_model_knows_them():
 
 
 @pytest.mark.parametrize(
-    ("threshold", "said"),
-    [
-        (8.5, "at most 0.5 an hour"),  # between the highest that let one through and the next
-        (20.0, "at most 0.5 an hour"),
-        (None, "at most 0.5 an hour"),  # one that nothing reaches
-        (8.0, "0.5 an hour"),
-        (1.0, "700 an hour"),
-        (0.5, "at least 700 an hour"),
-    ],
-)
-def test_a_threshold_beyond_what_was_counted_is_told_as_such(threshold, said):
-    curve = [[9.0, 0.0], [8.0, 0.5], [6.0, 2.0], [1.0, 700.0]]
-    rule = {"name": "cusum", "ceiling": 30.0}
-    told = scale_of({"threshold_curve": curve, "threshold": threshold, "rule": rule})
-    assert told["ownText"] == said
-
-
-@pytest.mark.parametrize(
     ("ceiling", "low", "high"), [(8.0, 0.0, 8.0), (None, -3.0, 7.0)], ids=["bounded", "free"]
 )
 def test_the_slider_goes_by_the_statistic_where_no_rates_are_known(ceiling, low, high):

@@ -1,6 +1,5 @@
 """Which sensors matter: sets whose answer is known, machines refitted the slow way, the command."""
 
-import csv
 import json
 import shutil
 import sys
@@ -26,7 +25,6 @@ from tactslip_torch.analysis.importance import (
     difference,
     first_order,
     score_gradients,
-    units_of,
     without,
 )
 from tactslip_torch.commands.entry import conf_dir
@@ -34,11 +32,9 @@ from tactslip_torch.commands.importance import main, sensors
 from tactslip_torch.commands.train import train
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.selection import ClassMoments, t_scores
-from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import PAPER_KERNEL
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.report.importance import best_table, sensors_csv, sensors_figure, sensors_table
 
 OF_FEATURE = ["a", "a", "b", "b", "c", "c"]  # of each feature
 UNITS = {name: frozenset(name) for name in "abc"}
@@ -108,15 +104,6 @@ def test_accuracy_is_the_mean_over_groups_bin_by_bin_in_every_draw():
         assert float(accuracy) == pytest.approx(by_hand(is_right, bins, drawn))
 
 
-def test_a_group_of_one_class_is_passed_over():
-    sample = BinSample(10)
-    sample.update("M/0", "M", torch.zeros(4, 1), torch.tensor([True, True, False, False]))
-    sample.update("N/0", "N", torch.zeros(2, 1), torch.tensor([True, True]))
-    bins = sample.bins()
-    is_right = bins.group == 0
-    assert float(balanced_accuracy(count_right(is_right, bins))) == 1.0
-
-
 def test_a_paired_interval_is_nothing_between_equals_and_holds_the_difference():
     bins = sampled(5, {})
     draw = torch.rand(len(bins.is_slip), generator=torch.Generator().manual_seed(2))
@@ -182,17 +169,6 @@ def test_bins_of_other_roles_choose_nothing():
 
 
 # Sets of channels --------------------------------------------------------------------------------
-
-
-def test_units_are_every_channel_once_by_channel_finger_and_kind():
-    hand = HandLayout.from_rows(
-        {"name": f"E{i}", "kind": kind, "finger": finger, "segment": "s", "adapting": "slow"}
-        for i, (kind, finger) in enumerate([("x", "f"), ("y", "f"), ("x", "g")])
-    )
-    units = units_of(hand)
-    assert units["finger"] == {"f": {"E0", "E1"}, "g": {"E2"}}
-    assert units["kind"] == {"x": {"E0", "E2"}, "y": {"E1"}}
-    assert units["channel"] == {name: {name} for name in hand.names}
 
 
 def test_a_ranking_takes_the_largest_scores_of_the_channels_it_may():
@@ -334,112 +310,7 @@ def test_every_channel_finger_and_kind_has_its_row(found):
     assert content["simulated"] is False
 
 
-def test_what_is_lost_is_the_difference_of_accuracies(found):
-    _, content = found
-    whole = content["with_all"]["reselected"]["balanced_accuracy"]
-    for steps in content["best"].values():
-        for step in steps:
-            for role, accuracy in step["balanced_accuracy"].items():
-                assert step["lost"][role]["lost"] == pytest.approx(whole[role] - accuracy)
-        assert steps[-1]["lost"]["unseen"]["lost"] == 0  # all of them are the whole hand
-    fingers = {row["name"]: row["alone"] for row in content["units"] if row["unit"] == "finger"}
-    first = content["best"]["finger"][0]
-    assert fingers[first["joins"]] == first["balanced_accuracy"]
-    assert first["balanced_accuracy"]["held_out"] == max(f["held_out"] for f in fingers.values())
-    # two fingers: what is left without one is the other
-    other = next(name for name in fingers if name != first["joins"])
-    row = next(row for row in content["units"] if row["name"] == other)
-    assert row["lost_reselected"]["test"]["lost"] == pytest.approx(
-        whole["test"] - first["balanced_accuracy"]["test"]
-    )
-
-
-def test_tables_and_csv_have_the_numbers_of_json(found, tmp_path):
-    folder, content = found
-    with (folder / "sensors.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    for row, of_json in zip(rows, content["units"], strict=True):
-        assert row["name"] == of_json["name"]
-        lost = of_json["lost_reselected"]["unseen"]
-        assert float(row["lost_reselected_unseen_high"]) == lost["high"]
-    joins = {row["name"]: row["joins_as"] for row in rows if row["unit"] == "channel"}
-    assert joins[content["best"]["channel"][0]["joins"]] == "1"
-    assert all(f"\n{name} " in sensors_table(content) for name in [*CHANNELS, "index", "thumb"])
-    lines = [line.split() for line in best_table(content).splitlines() if line[:1].isdigit()]
-    assert [line[1] for line in lines][:4] == [s["joins"] for s in content["best"]["channel"]]
-    simulated = content | {"simulated": True}
-    assert "SIMULATED" in sensors_table(simulated)
-    assert "SIMULATED" not in sensors_table(content)
-    sensors_csv(simulated, tmp_path / "sensors.csv")
-    assert (tmp_path / "sensors.csv").read_text().endswith("True\n")
-
-
 # The figure --------------------------------------------------------------------------------------
-
-
-def content_of(hand):
-    generator = torch.Generator().manual_seed(0)
-
-    def some():
-        return float(torch.rand(1, generator=generator))
-
-    def lost():
-        middle = some() - 0.5
-        return {"lost": middle, "low": middle - 0.1, "high": middle + 0.1}
-
-    roles = ("held_out", "unseen")
-    units = [
-        {
-            "unit": "channel",
-            "name": name,
-            "features_in_use": 2,
-            "gradient": {"non_slip": some(), "slip": some()},
-            "lost": {role: lost() for role in roles},
-            "alone": {role: 0.5 + some() / 2 for role in roles},
-        }
-        for name in hand.names
-    ]
-    steps = [
-        {
-            "joins": name,
-            "lost": {role: lost() for role in roles},
-            "balanced_accuracy": {role: 0.5 + some() / 2 for role in roles},
-        }
-        for name in hand.names[:5]
-    ]
-    return {
-        "simulated": True,
-        "settings": {"reselect": "ranked"},
-        "num_bins": dict.fromkeys(roles, 10),
-        "channels": hand.to_rows(),
-        "units": units,
-        "with_all": {"reselected": {"balanced_accuracy": dict.fromkeys(roles, 0.9)}},
-        "best": {"channel": steps},
-    }
-
-
-def biotac_like():
-    return HandLayout.from_rows(
-        [
-            {"name": f"{f}{i}", "kind": kind, "finger": f, "segment": "pad", "adapting": adapting}
-            for f in ("left", "right")
-            for i, (kind, adapting) in enumerate(
-                [("electrode", "slow")] * 19 + [("pressure", "slow"), ("vibration", "fast")]
-            )
-        ]
-    )
-
-
-def test_any_hand_can_be_drawn(drawn, tmp_path):
-    hand = biotac_like()
-    sensors_figure(content_of(hand), tmp_path / "a.png")
-    assert_png(tmp_path / "a.png")
-    assert "SIMULATED" in drawn[0].get_suptitle()
-    shown = drawn[0].axes[0]
-    fingers = list(dict.fromkeys(channel.finger for channel in hand.channels))
-    words = [text.get_text() for text in shown.texts]
-    assert [word for word in words if word in fingers] == fingers
-    assert sum(len(marks.get_offsets()) for marks in shown.collections) == len(hand)
 
 
 # The command -------------------------------------------------------------------------------------

@@ -123,16 +123,6 @@ def test_the_table_has_every_descriptor_once():
     assert len({*of_time, *of_spectra}) == 17
 
 
-def test_the_markdown_is_aligned_and_complete():
-    table, legend = invariance_table().split("\n\n")
-    lines = table.splitlines()
-    assert len(lines) == 2 + len(INVARIANCES)
-    bars = [[i for i, c in enumerate(line) if c == "|"] for line in lines]
-    assert all(places == bars[0] for places in bars)
-    assert "equivariant" in lines[2]
-    assert max(map(len, legend.splitlines())) <= 100
-
-
 def test_the_page_carries_the_table():
     text = PAGE.read_text(encoding="utf-8")
     begin, end = "<!-- invariances -->", "<!-- /invariances -->"

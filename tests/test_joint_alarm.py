@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,15 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import detector_of, signal
 from test_rules import by_hand
-from test_streaming import MIDDLE, joined, settings_of
-from test_streaming import assert_same as same_bins
+from test_streaming import MIDDLE, settings_of
 
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.onset.decisions import Decider, is_usable, score_stream
+from tactslip_torch.onset.decisions import Decider
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.onset.rules import Cusum, KOfN
-from tactslip_torch.onset.streaming import StreamingDetector
 
 RATE = 2000.0
 DETECTOR = detector_of()
@@ -40,12 +37,6 @@ def classifier_of(hop=10, seed=0):
 
 def joint_settings(rule=RULES[0], bin_hop=50, hop=10):
     return replace(settings_of(rule, bin_hop), onset=classifier_of(hop))
-
-
-def assert_same(found, expected):
-    same_bins(found, expected)
-    assert torch.equal(found.by_onset, expected.by_onset)
-    torch.testing.assert_close(found.onset_score, expected.onset_score, rtol=0, atol=1e-8)
 
 
 # Decider.join ------------------------------------------------------------------------------------
@@ -132,95 +123,3 @@ def test_any_cut_and_several_streams_are_as_each_whole(cuts, rule, hops, streams
 
 
 # Streams -----------------------------------------------------------------------------------------
-
-
-def offline(settings, samples):
-    scores = score_stream(DETECTOR, samples, settings.hop_samples)
-    decider = Decider(settings, RATE, 100, DETECTOR.look_ahead)
-    tells = is_usable(scores.score, scores.is_missing, DETECTOR.needed_index)
-    bins = decider.decide(scores.score, scores.is_valid, tells)
-    return decider.join(bins, settings.onset.score_recording(samples))
-
-
-def stream_of(settings, dtype=torch.float64, **options):
-    return StreamingDetector(DETECTOR, settings, dtype=dtype, **options)
-
-
-def in_pieces(stream, samples, cuts=()):
-    places = [0, *sorted(min(cut, samples.shape[-1]) for cut in cuts), samples.shape[-1]]
-    parts = [stream.push(samples[:, a:b].T) for a, b in pairwise(places)]
-    return joined([*parts, stream.flush()])
-
-
-@given(
-    num_samples=st.sampled_from([0, 9, 10, 124, 2500, 4003]),
-    cuts=st.lists(st.integers(0, 4003), max_size=20),
-    rule=st.sampled_from(RULES),
-    hops=st.sampled_from([(50, 10), (7, 10), (50, 3)]),
-    dtype=st.sampled_from([torch.float64, torch.float32]),
-    bad=st.lists(st.integers(0, 4002), max_size=2),
-)
-def test_any_cut_of_a_stream_gives_what_the_whole_recording_gives(
-    num_samples, cuts, rule, hops, dtype, bad
-):
-    settings, samples = joint_settings(rule, *hops), signal(4003, 5, dtype)
-    for place in bad:
-        samples[place % 4, place] = torch.nan
-    samples = samples[:, :num_samples]
-    found = in_pieces(stream_of(settings, dtype), samples, cuts)
-    assert found.score.dtype == dtype
-    assert_same(found, offline(settings, samples))
-    assert len(found.number) == num_samples // hops[1]
-
-
-def test_both_raise_alarms_in_a_stream():
-    found = in_pieces(stream_of(joint_settings()), signal(20_000, 5), range(0, 20_000, 333))
-    assert {alarm.raised_by for alarm in found.alarms} == {"onset", "status"}
-
-
-def test_gaps_are_filled_or_begin_another_stream():
-    settings, samples = joint_settings(), signal(9000, 6)
-    stream, times = stream_of(settings), 7.0 + np.arange(9000) / RATE
-    times[3000:] += 40 / RATE  # is filled
-    times[6000:] += 101 / RATE  # is not
-    cuts = [0, 1500, 3000, 4500, 6000, 7500, 9000]
-    parts = [stream.push(samples[:, a:b].T, float(times[a])) for a, b in pairwise(cuts)]
-    found = joined([*parts, stream.flush()])
-    hole = torch.full((4, 40), torch.nan, dtype=torch.float64)
-    first = torch.cat([samples[:, :3000], hole, samples[:, 3000:6000]], -1)
-    pieces = [offline(settings, first), offline(settings, samples[:, 6000:])]
-    starts_s = torch.tensor([7.0, float(times[6000])], dtype=torch.float64)
-    starts_s = starts_s.repeat_interleave(torch.tensor([len(p.number) for p in pieces]))
-    expected = joined(pieces)
-    for name in ("available_s", "onset_s"):
-        moved = getattr(expected, name) + starts_s
-        torch.testing.assert_close(getattr(found, name), moved, rtol=0, atol=1e-9)
-    times_s = {"available_s": expected.available_s, "onset_s": expected.onset_s}
-    assert_same(found._replace(**times_s), expected)
-    assert stream.num_gaps == 1
-
-
-@pytest.mark.parametrize("end", ["flush", "reset"])
-def test_a_stream_that_ended_is_forgotten(end):
-    settings, samples = joint_settings(), signal(3500, 6)
-    stream = stream_of(settings)
-    stream.push(signal(3333, 8).T)
-    left = getattr(stream, end)()
-    assert left is None or len(left.number) == 0  # every decision came with its last sample
-    assert_same(in_pieces(stream, samples, (1000,)), offline(settings, samples))
-
-
-def test_a_masked_channel_is_not_heard():
-    """As with samples that are missing from the first on."""
-    settings, samples = joint_settings(), signal(4000, 6)
-    found = in_pieces(stream_of(settings, masked_channels=["PVDF2"]), samples, (700, 2500))
-    samples[HAND.names.index("PVDF2")] = torch.nan
-    assert_same(found, offline(settings, samples))
-
-
-def test_memory_does_not_grow():
-    stream, held = stream_of(joint_settings()), []
-    for seed in range(120):
-        stream.push(signal(100, seed).T)
-        held.append(stream.state_bytes)
-    assert max(held[:30]) == max(held[30:])

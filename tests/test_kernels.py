@@ -191,18 +191,6 @@ def test_a_form_is_folded_in_float64_and_gradients_reach_its_bins(rng):
         assert torch.autograd.gradcheck(lambda s, b, k=kernel: machine_of(s, b, k)(z), few)
 
 
-def test_costs_of_the_papers_head_and_of_a_sum(rng):
-    """14 520 multiply-adds and 58 kB, whatever the number of bins; of a sum with each of them."""
-    for num_bins in (3, 300):
-        form = collapse(*drawn(rng, num_bins, 120)).float()
-        assert str(form.cost) == "14.5 k multiply-adds a bin and 58.1 kB"
-        assert form.cost.multiply_adds == 120 * 120 + 120
-    kept = KernelSum(*drawn(rng, 100, 9), RadialBasis(0.25))
-    assert kept.cost == (1000, 8000)
-    wide = machine_of(*drawn(rng, 3, 1001), PAPER_KERNEL)
-    assert isinstance(wide, KernelSum)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -128,26 +128,6 @@ def test_bins_are_those_laid_by_hand(layout, hop_ms, strokes, late_s, non_slip_s
         assert bool((ends[own & bins.is_slip] <= end + 1e-6).all())
 
 
-def test_a_recording_may_be_filled_by_its_stroke_or_hold_nothing():
-    whole = lay(HALF, (0.5,), ((0.5, 1.0),), 1.0)  # bins touch both ends
-    assert (int(whole.starts[0]), int(whole.starts[-1]) + 100) == (0, 2000)
-    nothing = lay(None, (), ())
-    assert len(nothing.starts) == len(nothing.is_slip) == len(nothing.position) == 0
-    assert needed_windows(nothing, 25, DURATION, RATE) == []
-    bins = lay(None, (), (), 3.0, non_slip_s=((0.0, 1.0), (1.2 + 0.1, 3.0)))
-    assert bins.starts.tolist() == [*range(0, 2000, 100), *range(2600, 6000, 100)]
-    assert needed_windows(bins, 25, 3.0, RATE) == [(0.0, 2025 / RATE), (2575 / RATE, 3.0)]
-
-
-def test_nothing_is_laid_before_the_start_of_a_recording():
-    """An onset in the first second, or at once, has the non-slip bins that were recorded."""
-    for onset, num_before in ((0.46, 9), (0.005, 0)):
-        bins = lay(None, (onset,), ((onset, 3.0),), 3.0)
-        assert int(bins.starts.min()) >= 0
-        assert int((~bins.is_slip).sum()) == num_before
-        assert bins.position[bins.is_slip][0] == 0
-
-
 # Labels of windows ---------------------------------------------------------------------------
 
 
@@ -298,21 +278,6 @@ def test_windows_are_all_that_filtering_the_bins_needs(name, rng):
     whole = bins_at(channel_filter(samples), bins.starts, bins.bin_samples)
     cut = bins_at(channel_filter(partial), bins.starts, bins.bin_samples)
     torch.testing.assert_close(cut, whole, rtol=0, atol=0)
-
-
-def test_windows_reach_an_end_that_is_close_and_merge_where_they_touch():
-    """Within two contexts of an end the filter sees the true edge."""
-    for start, reaches in ((0, True), (49, True), (50, False)):
-        onset = 0.5 + start / RATE
-        windows = needed_windows(lay(HALF, (onset,), ((onset, 2.0),)), 25, DURATION, RATE)
-        assert (windows[0][0] == 0) == reaches
-        onset = DURATION - onset
-        windows = needed_windows(lay(HALF, (onset,), ((onset, DURATION),)), 25, DURATION, RATE)
-        assert (windows[-1][1] == DURATION) == reaches
-    assert len(needed_windows(lay(), 25, DURATION, RATE)) == 3  # one per stroke
-    apart = lay(LabelRule(hop_ms=150.0), (2.0,), ((2.0, 2.03),))  # 200 samples between them
-    counts = [len(needed_windows(apart, context, DURATION, RATE)) for context in (0, 99, 100)]
-    assert counts == [len(apart.starts), len(apart.starts), 1]
 
 
 def test_shuffled_labels_keep_their_number_and_depend_on_seed_and_place():

@@ -60,15 +60,6 @@ def test_what_is_missed_is_named():
     assert Latency(0.0, 50.0, 5.0, 1000.0).load == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize(
-    ("deadline_ms", "compute_us", "hop_ms"),
-    [(200, 500, 50), (72.8, 500, 10), (72.7, 500, 5), (60, 500, 5), (200, 200, 5)],
-)
-def test_the_longest_hop_that_keeps_the_limits_else_the_shortest(deadline_ms, compute_us, hop_ms):
-    limits = Limits(deadline_ms, compute_us, [50.0, 5.0, 10.0, 25.0])
-    assert limits.latency(Latency(12.5, 50.0, 5.0, 300.0), 300.0).hop_ms == hop_ms
-
-
 def test_the_hop_leaves_head_room_where_one_does():
     limits = Limits(80.0, 500.0, [5.0, 10.0, 25.0])
     parts = Latency(4.6, 50.0, 5.0, 1.0)

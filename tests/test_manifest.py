@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactslip_torch.data.file_recordings import FileTimeline, on_time, scaled
+from tactslip_torch.data.file_recordings import FileTimeline, on_time
 from tactslip_torch.data.manifest import (
     Truth,
     manifest_of,
@@ -76,15 +76,6 @@ def test_yaml_says_the_same_as_csv(root):
         (of_yaml,) = listed(root, text, "manifest.yaml").entries
         assert of_yaml.truth == of_csv.truth
         assert of_yaml.recording == of_csv.recording
-
-
-@pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_columns_are_separated_as_spreadsheets_do_it(root, separator):
-    text = separator.join(["File", "Object", "Onsets s"]) + "\r\n"
-    text += separator.join(["a.csv", "wood", '"2.0; 9.0"']) + "\r\n"
-    found = listed(root, b"\xef\xbb\xbf" + text.encode())
-    assert found.problems == ()
-    assert found.entries[0].truth.onsets_s == (2.0, 9.0)
 
 
 def test_trials_that_nobody_numbered_are_numbered_in_order(root):
@@ -258,13 +249,6 @@ def test_a_path_out_of_the_folder_is_refused(root, file, line):
         raise ValueError(found[0])
 
 
-def test_a_path_inside_may_be_written_as_windows_does_and_be_a_link(root):
-    (root / "link.csv").symlink_to(root / "a.csv")
-    found = listed(root, 'file,material\n"day 2\\d.csv",wood\n./b.csv,wood\nlink.csv,wood\n')
-    assert found.problems == ()
-    assert [entry.file for entry in found.entries] == ["day 2/d.csv", "b.csv", "link.csv"]
-
-
 # On the time of the recording ------------------------------------------------------------------
 
 
@@ -285,23 +269,6 @@ def test_a_slide_of_which_only_the_onset_is_known_ends_with_what_comes_first():
     assert times.sliding_s == ((2.0, 2.25), (2.25, 2.75), (5.0, 5.1), (9.75, 10.0))
     assert times.speeds_mm_s == (0.0,) * 4
     assert times.annotated_onsets_s == times.onsets_s
-
-
-def test_onsets_are_taken_from_slides_or_annotations_where_there_are_no_others():
-    slides, _ = truth_of({"sliding_s": "2-7; 9-end", "speeds_mm_s": "20"})
-    times, _ = on_time(slides, 12.0)
-    assert times.onsets_s == (2.0, 9.0)
-    assert times.sliding_s == ((2.0, 7.0), (9.0, 12.0))
-    assert times.speeds_mm_s == (20.0, 20.0)
-    marked, _ = truth_of({"annotated_onsets_s": "2.5"})
-    assert on_time(marked, 12.0)[0].onsets_s == (2.5,)
-
-
-def test_releases_around_an_onset_are_kept():
-    truth, wrong = truth_of({"onsets_s": "2; 9", "released_s": "1.96-2.1; 9-9"})
-    assert not wrong
-    assert on_time(truth, 10.0)[0].released_s == ((1.96, 2.1), (9.0, 9.0))
-    assert on_time(scaled(truth, 0.5), 5.0)[0].released_s == ((0.98, 1.05), (4.5, 4.5))
 
 
 def test_what_leaves_the_recording_is_named_and_what_is_off_by_a_sample_is_cut():

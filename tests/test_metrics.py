@@ -16,7 +16,6 @@ from tactslip_torch.report.metrics import (
     confusion_matrix,
     covered_fractions,
     merged_answers,
-    merged_metrics,
     split_metrics,
     weights_at_share,
 )
@@ -78,36 +77,6 @@ def test_groups_are_scores_of_their_own_bins():
     assert not {"per_scene", "per_position"} & set(bin_metrics(truth, predicted, materials, speeds))
 
 
-def test_of_several_scenes_groups_count_the_papers_bins_alone():
-    truth, predicted = random_bins(2)
-    groups = labels()
-    scores = bin_metrics(truth, predicted, *groups)
-    rows = [i for i, scene in enumerate(groups[2]) if scene == "paper"]
-    materials, speeds, places = some(rows, groups[0], groups[1], groups[3])
-    papers = bin_metrics(truth[rows], predicted[rows], materials, speeds, None, places)
-    for kind in ("per_material", "per_speed", "per_position"):
-        assert scores[kind] == papers[kind]
-    assert list(scores["per_scene"]) == ["taps", "paper", "grips"]
-    elsewhere = ["taps" if scene == "paper" else "grips" for scene in groups[2]]
-    none = bin_metrics(truth, predicted, *groups[:2], elsewhere, groups[3])
-    assert none["per_material"] == none["per_speed"] == none["per_position"] == {}
-    only = bin_metrics(truth, predicted, *groups[:2], ["taps"] * 500)  # of one kind all count
-    assert sum(of["num_bins"] for of in only["per_material"].values()) == 500
-
-
-@pytest.mark.parametrize("by", ["halves", "scenes"])
-@pytest.mark.parametrize("num_groups", [2, 4])
-def test_merged_scores_equal_those_of_all_bins_together(by, num_groups):
-    truth, predicted = random_bins(3)
-    groups = labels()[:num_groups]
-    if by == "halves" or num_groups == 2:
-        parts = [range(150), range(150, 500)]
-    else:
-        parts = [[i for i in range(500) if groups[2][i] == s] for s in ("taps", "paper", "grips")]
-    scores = [bin_metrics(truth[r], predicted[r], *some(r, *groups)) for r in map(list, parts)]
-    assert merged_metrics(scores) == bin_metrics(truth, predicted, *groups)
-
-
 @pytest.mark.parametrize("slip", [True, False])
 def test_a_class_without_bins_has_no_recall(slip):
     scores = split_metrics(confusion_matrix(torch.full((8,), slip), torch.arange(8) < 6))
@@ -155,15 +124,6 @@ RECORDINGS = {
 }
 
 
-def test_answer_counts_are_those_of_a_loop():
-    is_slip, _ = random_bins(4)
-    answer = torch.arange(500) * 7 % 11 % 3 - 1
-    wanted = [[0, 0, 0], [0, 0, 0]]
-    for truth, given in zip(is_slip.tolist(), answer.tolist(), strict=True):
-        wanted[int(truth)][given + 1] += 1
-    assert answer_counts(is_slip, answer) == wanted
-
-
 def test_coverage_is_a_mean_over_recordings_that_have_the_class():
     found = answer_metrics(RECORDINGS, 0.8)
     assert found == {
@@ -189,15 +149,6 @@ def test_coverage_is_a_mean_over_recordings_that_have_the_class():
     assert covered_fractions(torch.tensor(list(RECORDINGS.values())), 0).tolist() == [1.0, 0.5]
     exactly = {str(i): [[0, 0, 0], [0, 1, 19]] for i in range(3)}
     assert answer_metrics(exactly, 0.95)["slip"]["reached"] == 1
-
-
-def test_of_nothing_there_is_no_score():
-    found = answer_metrics({}, 0.9)
-    assert found["abstained"] is found["decided_accuracy"] is found["decided_balanced"] is None
-    assert set(found["slip"].values()) == {None, 0}
-    undecided = answer_metrics({"a/0": [[4, 0, 0], [5, 0, 0]]}, 0.9)
-    assert undecided["abstained"] == undecided["slip"]["coverage"] == 1
-    assert undecided["decided_accuracy"] is None
 
 
 def test_folds_are_pooled_by_recording():

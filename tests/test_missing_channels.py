@@ -135,20 +135,6 @@ def test_gaussians_of_many_bins_are_those_they_were_drawn_from(rng):
     torch.testing.assert_close(found.covariance, true.covariance, atol=0.03, rtol=0)
 
 
-def test_a_bin_of_weight_two_counts_as_two(rng):
-    z = torch.from_numpy(rng.standard_normal((60, 3)))
-    is_slip = torch.arange(60) % 2 == 0
-    weights = torch.ones(60)
-    weights[:10] = 2
-    twice = ClassGaussians.fit(torch.cat([z, z[:10]]), torch.cat([is_slip, is_slip[:10]]))
-    found = ClassGaussians.fit(z, is_slip, weights)
-    torch.testing.assert_close(found.mean, twice.mean)
-    variances = (each.covariance.diagonal(dim1=-2, dim2=-1) for each in (found, twice))
-    torch.testing.assert_close(
-        *variances
-    )  # what is beside them is shrunk by how few bins there are
-
-
 def test_few_bins_constant_and_repeated_features_still_give_gaussians(rng):
     z = torch.from_numpy(rng.standard_normal((9, 20)))
     z[:, 3], z[:, 5] = 0.5, z[:, 4]
@@ -203,16 +189,6 @@ def test_a_certain_score_is_left_to_the_bit(calibration, dtype):
     found = widened_llr(calibration, score, torch.zeros_like(score))
     assert found.dtype == dtype
     assert torch.equal(found, calibration.llr(score))
-
-
-def test_the_less_certain_a_score_the_nearer_to_even_and_never_across():
-    score = torch.tensor([-2.0, -0.1, 0.1, 2.0], dtype=torch.float64)
-    variance = torch.tensor([0.0, 0.1, 1.0, 10.0, 1e6], dtype=torch.float64)[:, None]
-    found = widened_llr(
-        Isotonic((-3.0, 3.0), (-6.0, 6.0)), *torch.broadcast_tensors(score, variance)
-    )
-    assert torch.equal(found.sign(), score.sign().expand(5, 4))
-    assert (found.abs().diff(dim=0) <= 0).all()
 
 
 def test_what_saturates_stays_finite():

@@ -142,13 +142,6 @@ def test_group_scores_prefer_what_holds_in_every_group(rng):
     assert scores[0] > 5 * scores[2]
 
 
-def test_degree_two_on_all_features_needs_few_bins():
-    few, many = (candidates(recipe(), num) for num in (1000, 10_000))
-    whole = [s for s in few if s.num_features is None and s.kernel.degree == 2]
-    assert whole
-    assert not [s for s in many if s.num_features is None and s.kernel.degree == 2]
-
-
 def test_scenes_have_the_weight_that_is_asked_for(rng):
     names = ("M1|arm_motion", "M1|paper", "M2|arm_motion", "M2|paper")
     sample = sample_of(rng, names)
@@ -170,12 +163,3 @@ def test_scenes_have_the_weight_that_is_asked_for(rng):
 def test_one_group_cannot_be_left_out(rng):
     with pytest.raises(ValueError, match="needs two with bins of both classes, got 1"):
         chosen(sample_of(rng, ("M1",)), recipe())
-
-
-def test_kernels_come_by_degree():
-    # at degree 1 the offset weighs the constant alone, which is not penalised
-    assert recipe(offsets=[0.5, 1.0]).kernels == (
-        Polynomial(1, FREE_CONSTANT),
-        Polynomial(2, 0.5),
-        Polynomial(2, 1.0),
-    )

@@ -22,7 +22,6 @@ from engine_bins import (
 from small_detector import raw_bins, small_detector
 
 from tactslip_torch import FeaturePool, HandLayout, native
-from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import build
 
@@ -112,33 +111,6 @@ def test_instruction_sets_agree_on_the_papers_hand(level, monkeypatch):
     for num in (1, 20):
         torch.testing.assert_close(fresh(bins[:num]), plain[:num], rtol=1e-12, atol=1e-12)
     assert_equals_reference(plain, made(pool, backend="torch")(bins), pool.names, mixed=False)
-
-
-@needs_engine
-@pytest.mark.parametrize("descriptor", DESCRIPTORS)
-def test_each_descriptor_alone(descriptor):
-    selected = [i for i, name in enumerate(NAMES) if name.descriptor == descriptor]
-    for kind in ("tied", "constants"):
-        assert_is_reference(bins_of(kind, 10, HAND, 100, generator()), selected=selected)
-
-
-@needs_engine
-@pytest.mark.parametrize("seed", range(3))
-def test_random_parts_in_any_order_and_repeated(seed, rng):
-    pool = FeaturePool(some_hand("GFFF"))
-    for size, kind in zip((1, 5, 60), ("random", "dead_channel", "near_constant"), strict=True):
-        selected = rng.integers(len(pool.names), size=size).tolist()
-        bins = bins_of(kind, 20, pool.hand, 100, generator(seed))
-        assert_is_reference(bins, pool, selected, kinds=(False,))
-
-
-@needs_engine
-def test_spectra_alone_know_which_branches_are_rounding():
-    size = 10.0 ** -torch.arange(30)[:, None, None]  # of vibration; branches go one by one
-    bins = 1 + size * noise(30)
-    in_frequency = [i for i, name in enumerate(NAMES) if name.domain == "freq"]
-    alone, among = made(POOL, in_frequency)(bins), made(POOL)(bins)[:, in_frequency]
-    torch.testing.assert_close(alone, among, rtol=1e-9, atol=1e-9)
 
 
 @needs_engine
@@ -278,13 +250,6 @@ def test_leading_axes_strides_copies_and_modes(backend):
         assert torch.equal(made(POOL, [5, 90, 17])(bins), flat)
 
 
-@pytest.mark.parametrize("kind", [torch.tensor, np.array, tuple])
-def test_a_selection_is_any_sequence_of_whole_numbers(kind):
-    assert POOL.select(kind([7, 3])).selected == (7, 3)
-    with pytest.raises(TypeError):
-        made(POOL, [3.7])
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -417,21 +382,6 @@ def test_a_gradient_asked_for_after_use_is_given():
     detector.head.linear.requires_grad_()
     detector.score_raw(bins).sum().backward()
     assert detector.head.linear.grad.abs().max() > 0
-
-
-def test_pooling_follows_masks_of_any_shape_and_gradients_of_its_constants():
-    layer = ChannelPooling.fit(HAND, POOL.names, POOL(noise(50)), ["mean", "std"])
-    place = {name: index for index, name in enumerate(POOL.names)}
-    features = POOL(noise(7))[:, [place[name] for name in layer.inputs]]
-    mask = torch.arange(len(HAND)) == 0
-    each = layer(features, mask.expand(7, -1))
-    for backend in ("auto", "torch"):
-        torch.testing.assert_close(layer(features, mask[None], backend), each)
-        torch.testing.assert_close(layer(features[0], mask, backend), each[0])
-        with pytest.raises(ValueError, match=f"expected {len(layer.inputs)} features, got 5"):
-            layer(features[:, :5], backend=backend)
-    layer.knee.requires_grad_()
-    assert layer(features).requires_grad
 
 
 def test_half_precision_is_torchs():

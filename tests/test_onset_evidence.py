@@ -198,14 +198,6 @@ def test_a_fast_channel_is_left_out_while_what_is_missing_is_remembered(value):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
 
 
-def test_a_slow_channel_with_a_missing_sample_is_left_out():
-    evidence = evidence_of()
-    x = samples_of(evidence, 1.2)
-    without = oracle(evidence, x.numpy(), {3})[0]
-    x[3, -1] = torch.nan
-    torch.testing.assert_close(columns_of(evidence, x)[0][-1], torch.from_numpy(without[-1]))
-
-
 def test_a_silent_fast_channel_is_left_out_and_none_at_all_is_told():
     evidence = evidence_of()
     x = samples_of(evidence)
@@ -217,12 +209,6 @@ def test_a_silent_fast_channel_is_left_out_and_none_at_all_is_told():
     assert not bool(columns_of(evidence, x)[1].any())
     score = classifier_of(evidence).score_recording(x)
     assert score.tolist() == [NOTHING_YET] * 300
-
-
-def test_a_hand_without_slow_channels_has_columns_of_fast_ones():
-    evidence = evidence_of("FF")
-    x = samples_of(evidence)
-    np.testing.assert_allclose(columns_of(evidence, x)[0], oracle(evidence, x.numpy())[0])
 
 
 # The classifier, whole and in pieces -------------------------------------------------------------
@@ -265,24 +251,6 @@ def test_any_cut_gives_the_scores_of_the_recording(cuts, dtype):
     samples = getattr(SAMPLES, dtype)()
     found = in_pieces(OnsetStream(CLASSIFIER), samples, cuts)
     torch.testing.assert_close(found, CLASSIFIER.score_recording(samples), rtol=0, atol=1e-8)
-
-
-def test_sample_by_sample_a_score_comes_with_the_last_of_its_hop():
-    stream, expected = OnsetStream(CLASSIFIER), CLASSIFIER.score_recording(SAMPLES[:, :2200])
-    for num in range(1, 2201):
-        score = stream.push(SAMPLES[:, num - 1 : num])
-        assert len(score) == (num % 9 == 0)
-        torch.testing.assert_close(
-            score, expected[num // 9 - len(score) : num // 9], rtol=0, atol=1e-8
-        )
-
-
-def test_a_stream_may_be_masked():
-    rest = [0, 1, 3, 4, 5]
-    evidence = replace(CLASSIFIER.evidence, hand=hand_of("SFSFS"))
-    expected = replace(CLASSIFIER, evidence=evidence).score_recording(SAMPLES[rest])
-    found = in_pieces(OnsetStream(CLASSIFIER), SAMPLES, [17, 3000], torch.arange(6) == 2)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("size", [9, 50, 63])

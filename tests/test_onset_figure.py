@@ -188,20 +188,6 @@ def legend_of(figure):
     return {text.get_text() for text in figure.legends[0].get_texts()}
 
 
-def test_films_are_blue_and_yellow_by_the_decided_status(draw, films):
-    axes, times = draw().axes[0], np.arange(2800) / RATE_HZ
-    is_slip = (times >= 0.5) & (times < 1.2)
-    for place, volts in enumerate(films):
-        rest, slip = [line for line in axes.lines if line.get_gid() == f"channel {place}"]
-        assert (to_hex(rest.get_color()), to_hex(slip.get_color())) == (REST.lower(), SLIP.lower())
-        lane = rest.get_ydata()[0] - volts[0]
-        for line, own in ((rest, ~is_slip), (slip, is_slip)):
-            y = np.asarray(line.get_ydata())
-            np.testing.assert_allclose(y[own], volts[own] + lane)
-            assert np.isfinite(y).sum() <= own.sum() + 2  # where the colours meet, no hole
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["PVDF1", "PVDF2", "PVDF3"]
-
-
 def test_marks_stand_where_things_happened(draw):
     figure = draw(title="SIMULATED recording a.npz")
     films, _, chance = figure.axes
@@ -235,54 +221,11 @@ def test_an_onset_classifier_has_a_panel_with_its_threshold(draw):
     assert (np.nanmax(values), list(threshold.get_ydata())) == (2.0, [1.5, 1.5])
 
 
-@pytest.mark.parametrize("name", ["slip", "invalid", "abstains"])
-def test_a_status_of_one_decision_is_seen_in_a_long_recording(draw, name):
-    num = 20_000
-    traces = Traces({"PVDF1": 0}, 10.0, HOP_S, (0.0, num * HOP_S))
-    times, is_on = HOP_S * np.arange(1, num + 1), np.arange(num) == 7003
-    off = np.zeros(num)
-    given = {"slip": off, "invalid": off, "abstains": off} | {name: is_on}
-    traces.add_samples(np.zeros((1, num // 10)))
-    columns = given["slip"], 1 - given["invalid"], given["abstains"], off
-    traces.add_decisions(times, off, *columns)
-    marks = marks_of(draw(traces))
-    ((first, last),) = marks[2 if name == "abstains" else 0, name]
-    assert first <= times[7003] < last < first + 0.5
-
-
-def test_what_is_out_of_view_or_not_known_is_not_drawn(draw, films):
-    figure = draw(traces_of(films, view=(0.45, 1.0)))
-    marks = marks_of(figure)
-    assert marks[0, "alarm"] == [0.5]
-    assert not {"onset", "estimate"} & {name for _, name in marks}
-    assert marks[1, f"truth {SLIP}"] == [(0.45, 1.0)]
-    assert figure.axes[2].get_xlim() == (0.45, 1.0)
-    unknown = draw(traces_of(films, num_decisions=20), truth=None)
-    assert [text.get_text() for text in unknown.axes[1].get_yticklabels()] == ["decided"]
-    assert not {"onset, true", "abstains", "not valid"} & legend_of(unknown)
-    assert "first release, true" not in legend_of(figure)
-    released = [{"onset_s": 0.42, "first_release_s": 0.4}]
-    released = draw(truth={"onsets": released, "sliding_s": [(0.42, 1.1)]})
-    assert marks_of(released)[0, "first release"] == [0.4]
-    assert "first release, true" in legend_of(released)
-    without_slip = draw(truth={"onsets": [], "sliding_s": []})
-    assert "truth" in [text.get_text() for text in without_slip.axes[1].get_yticklabels()]
-
-
 @pytest.mark.parametrize("level", [np.nan, 0.0, 3e38])
 @pytest.mark.parametrize("num_decisions", [0, 1])
 def test_dead_films_and_few_decisions_are_drawn_without_a_warning(draw, level, num_decisions):
     films = np.stack([np.full(200, level), np.zeros(200)])
     draw(traces_of(films, (0.0, 0.1), num_decisions), alarms=[])
-
-
-def test_of_many_marks_each_is_fine(draw, rng):
-    few, many = (
-        next(part for part in draw(alarms=alarms).axes[0].collections if part.get_gid() == "alarm")
-        for alarms in ([(1.0, 1.0)], [(time, time) for time in rng.uniform(0, 1.4, 300)])
-    )
-    assert many.get_linewidth()[0] < few.get_linewidth()[0] / 2
-    assert len(many.get_paths()) == 300
 
 
 # Tables ----------------------------------------------------------------------------------------
@@ -328,16 +271,6 @@ def test_every_alarm_has_its_outcome():
         ("early", 3.0, pytest.approx(-0.1)),
         ("late", 5.0, pytest.approx(0.7)),
     ]
-
-
-def test_an_alarm_between_the_first_release_and_the_onset_is_not_early():
-    onsets = [
-        {"onset_s": 1.0, "first_release_s": 0.95, "outcome": "found", "delay_s": -0.03},
-        {"onset_s": 3.0, "first_release_s": 2.95, "outcome": "early", "delay_s": None},
-    ]
-    truth = {"onsets": onsets, "false_alarms_s": [], "early_s": 0.2}
-    wanted = {0.94: "early", 0.97: "found", 0.99: "repeated", 2.75: "early", 2.98: "repeated"}
-    assert {alarm: alarm_outcome(alarm, truth)["outcome"] for alarm in wanted} == wanted
 
 
 def test_rows_are_alarms_and_missed_onsets_in_order_of_time():

@@ -19,7 +19,6 @@ from tactslip_torch.analysis.pareto import (
     Group,
     ParetoSearch,
     Search,
-    distinct,
     landmarks,
     nondominated,
     worth_naming,
@@ -35,7 +34,7 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.report.pareto import none_meets, pareto_table
+from tactslip_torch.report.pareto import none_meets
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.recipe import (
@@ -329,21 +328,6 @@ def test_the_front_is_what_nothing_beats(rng):
     assert nondominated([]) == []
 
 
-def test_a_detector_found_twice_is_one_candidate():
-    latency = Latency(0.0, 50.0, 5.0, 100.0)
-    first = made_up(latency)
-    again = replace(first.selection, selected=(40, 3, 17, 300))
-    same = [
-        replace(first, group=first.group._replace(channels="pvdf")),
-        replace(first, selection=again),
-    ]
-    others = [
-        made_up(latency, **change)
-        for change in ({"penalty": 0.1}, {"degree": 2}, {"align": "centred"})
-    ]
-    assert distinct([first, *same, *others]) == [first, *others]
-
-
 def test_landmarks_are_the_best_the_cheap_and_the_small():
     def found(*rows):
         return list(landmarks(rows).values())
@@ -363,18 +347,6 @@ def test_landmarks_are_the_best_the_cheap_and_the_small():
     pooled = [replace(each, columns="pooled mean") for each in made]
     small = [at(60.0, 100.0, accuracy, 20) for accuracy in (0.4, 0.5)]
     assert set(worth_naming([*made, *pooled, *small])) == {made[1], pooled[1], small[1]}
-
-
-def test_worth_timing_goes_by_layers():
-    none, wide = Limits(1.0, 1.0, [5.0]), Limits(1000.0, 1e6, [5.0])
-    line = [at(60.0 + i, 100.0 * (i + 1), 0.5 + 0.04 * i) for i in range(10)]
-    behind = [at(60.5 + i, 110.0 * (i + 1), 0.45 + 0.04 * i) for i in range(10)]
-    # first all of the front; of the next layer the most accurate, then a spread by compute
-    chosen = worth_timing([*behind, *line], 13, none)
-    assert chosen == [*line, behind[9], behind[0], behind[8]]
-    assert worth_timing(line, 1, wide) == [line[9]]
-    # all near: half by accuracy, the rest spread
-    assert worth_timing(line, 6, wide) == [line[9], line[8], line[7], line[0], line[3], line[6]]
 
 
 def test_what_is_close_to_the_limits_is_timed(rng):
@@ -411,23 +383,6 @@ def test_a_machine_of_all_bins_is_that_of_all_bins_but_a_large_quadratic_one(sea
         made.most_summed = 120
     sampled = "40 training bins of each material and class"
     assert fitted_to == (sampled if degree == 2 else "all training bins")
-
-
-def test_test_bins_come_with_the_context_of_their_filter(searched, monkeypatch):
-    made, candidates = searched
-    detector = made.make(only(candidates, "all", "all", "t", 1, 3))
-    given, predict_raw = [], detector.predict_raw
-    monkeypatch.setattr(detector, "predict_raw", lambda raw: given.append(raw) or predict_raw(raw))
-    found = made.evaluated(detector)
-    expected, maker = [], made.makers["centred"]
-    for recording in made.fold.having("test"):
-        starts = maker.lay_bins(maker.source.timeline(recording)).starts.tolist()
-        samples = maker.source.load(recording).samples
-        inside = [start for start in starts if 25 <= start <= samples.shape[1] - 125]
-        expected += [samples[:, start - 25 : start + 125] for start in inside]
-    assert torch.equal(torch.cat(given), torch.stack(expected))
-    assert found["num_bins"] == len(expected)
-    assert found["balanced_accuracy"] > 0.5
 
 
 # The command -------------------------------------------------------------------------------------
@@ -525,27 +480,6 @@ def test_unseen_materials_are_never_read_and_test_cycles_by_the_chosen_one_alone
     assert found["chosen"]["test"]["num_bins"] > 0
 
 
-def test_the_table_says_what_the_files_do(written):
-    _, found, _ = written
-    table, chosen = pareto_table(found), found["chosen"]
-    for row in found["front"]:
-        assert f"{row['latency']['worst_ms']:.2f}" in table
-    best = found["named"]["most_accurate"]
-    assert best["validation"] == max(row["validation"] for row in found["front"])
-    assert f"A most accurate: {100 * best['validation']:.2f} %" in table
-    assert found["named"]["few"]["num_features"] <= 20
-    without = pareto_table(found | {"named": found["named"] | {"cheap": None}})
-    assert "B at most 1 point worse, at most 1/3 of its compute: none of those timed" in without
-    assert found["definition"] in table
-    assert found["validation"] in table
-    assert f"{100 * chosen['test']['balanced_accuracy']:.2f} %" in table
-    assert f"{found['tried']} tried there, {found['not_tried']} not tried" in table
-    assert "SIMULATED" not in table
-    assert "SIMULATED" in pareto_table(found | {"simulated": True})
-    busy = pareto_table(found | {"chosen": chosen | {"interrupted": 0.0612}})
-    assert "machine busy: 6.1 % of calls interrupted" in busy
-
-
 def fails(monkeypatch, capsys, tmp_path, *arguments):
     """Exit status and the last line that the command leaves on standard error."""
     monkeypatch.setattr(sys, "argv", ["pareto", *TINY, f"hydra.run.dir={tmp_path}", *arguments])
@@ -598,18 +532,6 @@ def test_ctrl_c_is_one_line_and_leaves_no_detector(monkeypatch, capsys, tmp_path
     status, line = fails(monkeypatch, capsys, tmp_path, *EASY, *FEW)
     assert (status, line) == (130, "interrupted: no detector is written")
     assert not list(tmp_path.glob("*.pt"))
-
-
-def test_the_last_try_is_for_the_one_with_most_head_room():
-    limits = Limits(80.0, 500.0, [5.0])
-    able = [at(60.0, 400.0 - 20 * i, 0.6 - i / 100) for i in range(10)]
-    quick = at(60.0, 50.0, 0.52)
-    able[7] = quick
-    assert command._tries(able, limits, 3) == [*able[:2], quick]
-    assert command._tries(able, limits, 1) == able[:1]
-    assert command._tries(able, limits, 9) == [*able[:8], able[9]]  # the quick one was met
-    assert command._tries(able, limits, 99) == able
-    assert command._tries([], limits, 5) == []
 
 
 def test_what_is_missed_least_is_said():

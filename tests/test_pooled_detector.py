@@ -13,14 +13,10 @@ from hydra.utils import instantiate
 from test_commands import TINY, composed, run_train
 
 from tactslip_torch import SlipDetector
-from tactslip_torch.analysis.certificate import certify
-from tactslip_torch.analysis.importance import Refit, without
 from tactslip_torch.commands.importance import sensors
 from tactslip_torch.commands.train import train
 from tactslip_torch.deploy.check import simulated_bins
 from tactslip_torch.deploy.export import export_detector
-from tactslip_torch.features.bin_sample import SampledBins
-from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.streaming import StreamingDetector
 
@@ -78,15 +74,6 @@ def test_it_pools_both_kinds_and_leaves_out_what_jumps(detector):
     assert not jumping & {name.descriptor for name in detector.extractor.names}
     assert detector.head.is_linear
     assert detector.gaussians is None
-
-
-def test_its_file_holds_all_of_it(detector, recording, whole, tmp_path):
-    detector.save(tmp_path / "again.pt")
-    again = SlipDetector.load(tmp_path / "again.pt")
-    assert torch.equal(score_stream(again, recording, HOP).score, whole.score)
-    assert again.selected_names == detector.selected_names
-    assert torch.equal(again.pooling.least_range, detector.pooling.least_range)
-    assert torch.equal(score_stream(copy.deepcopy(detector), recording, HOP).score, whole.score)
 
 
 def test_a_damaged_pooling_is_refused(detector, tmp_path):
@@ -171,36 +158,7 @@ def test_dead_channels_are_left_out_of_their_pools(detector, recording):
     torch.testing.assert_close(detector.predict(holed).score, judged.score, rtol=1e-10, atol=1e-12)
 
 
-def test_few_bins_are_judged_as_many(detector, recording):
-    bins = recording.unfold(-1, 400, 400).transpose(0, 1)[:40, :, : detector.pool.bin_samples]
-    for dead in ((), DEAD):
-        many = detector.predict(bins, masked_channels=list(dead))
-        few = [detector.predict(part, masked_channels=list(dead)) for part in bins.split(2)]
-        score = torch.cat([each.score for each in few])
-        torch.testing.assert_close(score, many.score, rtol=1e-9, atol=1e-12)
-
-
-def test_without_any_channel_a_score_is_finite_and_not_valid(detector, recording):
-    judged = detector.predict(
-        recording[None, :, : detector.pool.bin_samples],
-        masked_channels=list(detector.pool.hand.names),
-    )
-    assert judged.score.isfinite().all()
-    assert not judged.is_valid.any()
-
-
 # Streams and graphs ------------------------------------------------------------------------------
-
-
-def test_a_stream_is_the_recording(detector, recording):
-    stream = StreamingDetector(detector, dtype=torch.float64)
-    pieces = [stream.push(part.T) for part in recording.split(333, dim=-1)]
-    pieces.append(stream.flush())
-    score = torch.cat([piece.score for piece in pieces])
-    hop = stream.settings.hop_samples
-    wanted = score_stream(detector, recording, hop)
-    torch.testing.assert_close(score, wanted.score[: len(score)], rtol=1e-9, atol=1e-12)
-    assert 0 <= len(wanted.score) - len(score) <= 1
 
 
 @pytest.fixture(scope="module")
@@ -246,16 +204,6 @@ def test_an_order_statistic_and_both_kinds_of_column_are_exported(detector, run,
 # Commands ----------------------------------------------------------------------------------------
 
 
-def test_certify_measures_it(detector, recording):
-    length = detector.context_before + detector.pool.bin_samples + detector.context_after
-    bins = recording.unfold(-1, length, 300).transpose(0, 1).contiguous()
-    found = certify(detector, bins[::2], {"test": bins[1::2]}, simulated=True, extremes=4).content
-    assert found["sets"]["calibration"]["outside_range"] == 0
-    flips = [facts["flips"]["outside_margin"] for facts in found["sets"].values()]
-    assert flips == [0, 0]
-    assert found["sets"]["test"]["error"]["worst_sd"] < 1e-4
-
-
 @pytest.fixture(scope="module")
 def pooled_run(tmp_path_factory):
     """On four channels; its columns are of those of films and gauges, in pairs."""
@@ -285,25 +233,6 @@ def test_sensors_are_left_out_of_the_pools(pooled_run, tmp_path):
     assert found["best"]["channel"][-1]["num_features"] == len(detector.selected)
     assert found["best"]["channel"][-1]["lost"]["test"]["lost"] == 0.0
     assert rows["PVDF1"]["gradient"]["slip"] > 0
-
-
-def test_refitted_columns_are_those_of_a_hand_without_the_channel(detector, recording):
-    bins = recording.unfold(-1, 400, 400).transpose(0, 1)[:, :, : detector.pool.bin_samples]
-    features = detector.pool(bins)
-    num = len(features)
-    sample = SampledBins(
-        features.float(), torch.arange(num) % 2 == 0, torch.zeros(num).long(), ("M",),
-        torch.zeros(num).long(), ("M/0",), torch.arange(num), torch.ones(num).double(),
-    )  # fmt: skip
-    refit = Refit(
-        sample, torch.ones(num).double(), {}, detector.scaler, Polynomial(1, 0.5), (0.1,),
-        detector.pooling, detector.selected,
-    )  # fmt: skip
-    names = [name.channel for name in detector.pool.names]
-    found = refit._scaled(sample, without(detector.selected, DEAD, names))
-    is_missing = torch.tensor([name in DEAD for name in detector.pool.hand.names])
-    given = features[:, list(detector.selected)].float().double()
-    torch.testing.assert_close(found, detector.scaled(given, is_missing.expand(num, -1)))
 
 
 @pytest.mark.parametrize("override", ["num_features=3", "reselect=shared"])

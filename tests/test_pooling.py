@@ -147,24 +147,6 @@ def test_select_and_with_channels_take_no_more_than_they_need(rng):
     torch.testing.assert_close(found[:, 1:], few(inputs_of(few, features)))
 
 
-def test_leading_axes_and_the_round_trip(rng):
-    layer, features = fitted(rng, "sorted")
-    given = inputs_of(layer, features)
-    wanted = layer(given)
-    torch.testing.assert_close(layer(given.unflatten(0, (3, 4, 5))).flatten(0, 2), wanted)
-    again = ChannelPooling.from_dict(HAND, layer.to_dict(), layer.state_dict())
-    assert again.names == layer.names
-    torch.testing.assert_close(again(given), wanted, rtol=0, atol=0)
-
-
-def test_a_single_channel_has_its_mean_alone():
-    hand = HandLayout.from_rows([{"name": "P", "kind": "PVDF", "finger": "f", "segment": "s"}])
-    pool = FeaturePool(hand, level=1)
-    names = pooled_names(hand, pool.names, ["mean", "std"])
-    assert {name.statistic for name in names} == {"mean"}
-    assert len(names) == len(pool.names)
-
-
 @pytest.mark.parametrize("setting", ["largest", [], ["mean", "mode"]])
 def test_unknown_statistics_are_refused(setting):
     with pytest.raises(ValueError, match=r"features\.pooling must be sorted, null or some of mean"):

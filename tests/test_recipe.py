@@ -106,16 +106,6 @@ def test_tails_are_compressed_and_clipped_on_request(rng):
     assert (scaler.maximum < 10).all()
 
 
-def test_near_duplicates_are_passed_over(rng):
-    parts = make_parts(rng)
-    for _, features, _ in parts:  # feature 10 says what feature 4 says
-        features[:, 10] = features[:, 4] + 1e-3 * torch.from_numpy(rng.standard_normal(40)).float()
-    assert {4, 10} <= set(selected(Recipe(num_features=3), parts).selected)
-    without = set(selected(Recipe(num_features=3, most_correlation=0.9), parts).selected)
-    assert len({4, 10} & without) == 1
-    assert {3, 2} <= without
-
-
 @pytest.mark.parametrize("balance", ["undersample", "weights"])
 def test_a_sample_stands_for_all_bins_with_both_classes_of_one_weight(balance, rng):
     recipe, parts = Recipe(sample_bins=7, balance=balance), make_parts(rng, share=0.8)
@@ -135,11 +125,6 @@ def test_balanced_accuracy_by_hand():
     weights = torch.tensor([3.0, 1.0, 1.0, 1.0, 1.0, 3.0], dtype=torch.float64)
     assert balanced_accuracy(says, truth, weights) == pytest.approx((3 / 4 + 3 / 6) / 2)
     assert balanced_accuracy(says[:2], truth[:2]) is None
-
-
-def test_groups_are_materials_or_fifths_of_the_cycles():
-    assert Recipe().group(RecordingId("M1", 7)) == "M1"
-    assert Recipe(group_by="cycle").group(RecordingId("M1", 7)) == "2"
 
 
 @pytest.mark.parametrize(
@@ -223,15 +208,6 @@ def test_validation_and_calibration_equal_refits_without_the_group(rng):
     best = max(row["mean"] for row in plan.validation)
     chosen = next(row for row in plan.validation if row["mean"] == best)
     assert (plan.penalty, plan.calibration) == (chosen["penalty"], chosen["calibration"])
-
-
-def test_size_offset_and_penalty_are_chosen_together(rng):
-    recipe = Recipe(num_features=[5, 2], offsets=[0.5, 2.0], penalties=(0.1, 1.0))
-    plan = planned(recipe, make_parts(rng))
-    assert len(plan.validation) == 8
-    best = max(plan.validation, key=lambda row: row["mean"])
-    assert plan.selection.size == best["num_features"]
-    assert (plan.kernel.to_dict(), plan.penalty) == (best["kernel"], best["penalty"])
 
 
 def test_what_cannot_be_validated_is_taken_from_the_middle(rng, caplog):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from drawing import assert_png, rows_of
-from matplotlib.text import Text
 
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.events import (
@@ -31,14 +30,10 @@ from tactslip_torch.report.results import (
     reliability_figure,
     reliability_table,
     selected_features_figure,
-    selected_table,
-    solve_line,
     splits_table,
-    timing_table,
     tuning_figure,
     tuning_tables,
     validation_figure,
-    validation_table,
     write_results,
 )
 from tactslip_torch.report.style import table
@@ -235,45 +230,6 @@ def test_the_papers_numbers_stand_beside_its_own_scenes_alone(drawn, tmp_path, s
     assert sorted(rows_of(line)[0][-6] for line in lines[2:]) == sorted(expected)
 
 
-def test_timing_and_solve_are_told():
-    rows = rows_of(timing_table({"total": 50.0, "features": 20.0}))
-    assert rows[1:] == [["features", "20.00", "40.00"], ["total", "50.00", "100.00"]]
-    assert rows_of(timing_table({}))[1:] == [["total", "0.00", "-"]]
-    facts = {"method": "eigen", "rank": 7, "size": 9, "condition": "inf", "error": 2.2e-16}
-    line = "solved by eigen: 7 of 9 unknowns, condition inf, relative error of the weights about"
-    assert solve_line(facts) == f"{line} 2e-16"
-    left_out = facts | {"left_out": 0.01, "error": 0.01}
-    assert solve_line(left_out) == f"{line} 1e-02, unless what is left out is null"
-
-
-def test_selected_features_are_counted_beside_the_papers():
-    rows = rows_of(selected_table(features()))
-    for row in (
-        *(["kind", "SG", "14", "6"], ["PVDF", "10", "114"], ["middle", "5", "21"]),
-        *(["index", "5", "48"], ["domain", "time", "24", "-"], ["D1", "0", "0"]),
-        *(["peak_factor", "0", "#1"], ["mode", "0", "0"], ["energy", "8", "0"]),
-    ):
-        assert row in rows
-    assert rows[-2] == ["all", "24", "120"]
-
-
-def test_choices_mark_the_best_and_name_the_worst_group():
-    lines = validation_table(metrics_of(validation=CHOICES)).splitlines()
-    assert lines[0].startswith("SIMULATED")
-    cells = [line.split() for line in lines[2:]]
-    assert cells[0] == ["60", "degree", "2,", "c", "0.5", "0.1", "80.00", "70.00", "M2"]
-    assert cells[1] == ["*", "60", "degree", "2,", "c", "0.5", "1", "85.00", "80.00", "M1"]
-    more = [
-        row | {"use": use, "chosen": use == "pooled", "worst": {"at_best_threshold": 0.5}}
-        for row in CHOICES[:2]
-        for use in ("channel", "pooled")
-    ]
-    nested = {"mean": 0.8, "balanced_accuracy": {"M1": 0.7, "M2": 0.9}}
-    lines = validation_table(metrics_of(validation=more, nested_validation=nested)).splitlines()
-    assert len(lines) == 2 + 3 + 1  # the best of each structure, and the one that was chosen
-    assert lines[-1].endswith("evaluated on it: 80.00 % (M1 70.00, M2 90.00)")
-
-
 def test_tuning_says_what_was_learned():
     metrics = metrics_of(tuning=tuning())
     metrics["splits"] = {"test": metrics["splits"]["test"]}
@@ -369,27 +325,6 @@ def test_a_figure_is_written_whole_and_says_what_is_simulated(drawn, tmp_path, n
     FIGURES[name](path, simulated)
     assert_png(path)
     assert ("SIMULATED" in drawn[0].get_suptitle()) == simulated
-
-
-@pytest.mark.parametrize("kinds", [("SG",), ("IMU", "SG"), tuple("abcdefghi")])
-def test_selected_features_of_another_hand_stand_alone(drawn, tmp_path, kinds):
-    row = {"channel": "X1", "component": "D6", "domain": "freq", "descriptor": "mean"}
-    rows = [row | {"name": "X1", "kind": kind, "finger": "palm"} for kind in kinds]
-    selected_features_figure(rows, tmp_path / "selected.png", simulated=False)
-    bars = drawn[0].axes[0]
-    heights = {layer.get_label(): sum(b.get_width() for b in layer) for layer in bars.containers}
-    assert {kind: heights[kind] for kind in kinds} == dict.fromkeys(kinds, 1)
-    words = [text.get_text() for axes in drawn[0].axes for text in axes.findobj(Text)]
-    assert not any("paper" in word or "[" in word for word in words)
-    assert "paper" not in selected_table(rows)
-
-
-def test_a_rule_has_one_line_in_the_legend_however_it_is_written(drawn, tmp_path):
-    numbers = events_of()
-    events = {"test": {"k_of_n": numbers}, "stream": {"k of n": numbers, "cusum": numbers}}
-    events_figure(metrics_of(events=events), tmp_path / "events.png")
-    labels = [text.get_text() for text in drawn[0].legends[0].get_texts()]
-    assert labels[:3] == ["k of n", "cusum", "median"]
 
 
 def test_a_failed_write_keeps_the_older_figure(tmp_path, monkeypatch):

@@ -66,15 +66,6 @@ def test_scores_equal_scipy(variance, share, rng):
     np.testing.assert_allclose(actual, expected, rtol=1e-10)
 
 
-def test_the_default_is_pooled_and_both_agree_on_balanced_classes(rng):
-    features, _ = draw(rng)
-    moments = moments_of(features, np.arange(80) < 30)
-    assert torch.equal(t_scores(moments), t_scores(moments, "pooled"))
-    assert ((t_scores(moments, "welch") - t_scores(moments)).abs() > 1e-6).any()
-    balanced = moments_of(features, np.arange(80) % 2)
-    torch.testing.assert_close(t_scores(balanced, "welch"), t_scores(balanced), rtol=1e-12, atol=0)
-
-
 @given(
     cuts=st.lists(st.integers(0, 80), max_size=6),
     order=st.randoms(use_true_random=False),
@@ -110,17 +101,6 @@ def test_a_feature_that_never_moves(variance):
     features[:, 1] = 7.0
     features[3:, 2] = 1.0
     assert t_scores(moments_of(features, labels), variance).tolist() == [0, 0, math.inf]
-
-
-@pytest.mark.parametrize("variance", VARIANCES)
-@pytest.mark.parametrize("level", [0.1, 1 / 3, 2.736, -1e-3, 1e17 / 7])
-@pytest.mark.parametrize("num_parts", [1, 7])
-def test_a_constant_of_any_value_never_outranks_a_feature(variance, level, num_parts, rng):
-    """A dead channel's features are equal in every bin, whatever the rounding of their mean."""
-    features = torch.full((701, 1), level)
-    labels = torch.from_numpy(rng.uniform(size=701) < 0.3)
-    parts = [moments_of(features[i::num_parts], labels[i::num_parts]) for i in range(num_parts)]
-    assert t_scores(ClassMoments.merged(parts), variance).tolist() == [0]
 
 
 @given(
@@ -192,17 +172,6 @@ def test_distinct_features_equal_the_definition(most_correlation, num, rng):
     )
     assert actual.dtype == torch.long
     assert actual.tolist() == distinct(scores, features, is_slip, num, most_correlation)
-
-
-def test_the_best_of_the_skipped_fill_what_is_missing_in_order(rng):
-    source = torch.from_numpy(rng.standard_normal(30)).float()
-    features = torch.stack([source, 2 * source, -source, source**2, 3 * source], dim=1)
-    is_slip = torch.arange(30) % 2 == 0
-    scores = torch.tensor([1.0, 5.0, 4.0, 3.0, 2.0])
-    assert rank_distinct(scores, features, is_slip, 2, 0.9).tolist() == [1, 3]
-    assert rank_distinct(scores, features, is_slip, 4, 0.9).tolist() == [1, 3, 2, 4]
-    assert rank_distinct(scores, features, is_slip, 5, 0.9).tolist() == [1, 3, 2, 4, 0]
-    assert rank_distinct(scores, features, is_slip, 3, 1.0).tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize("level", [0.0, 0.1, 1e30, 1e-45])

@@ -14,17 +14,11 @@ from tactslip_torch.analysis.signal_checks import (
     QUIET,
     SIGNAL_CHECKS,
     SUSTAINED,
-    SignalCheck,
     Signals,
     check_signals,
-    d1_fraction,
     filtered,
-    num_barely_responding,
-    pvdf_onset_burst,
     pvdf_slide_over_rest,
     pvdf_speed_growth,
-    sg_offset_spread,
-    sg_rise_v,
     sg_variation,
 )
 from tactslip_torch.hand import HandLayout
@@ -70,11 +64,6 @@ def test_a_check_holds_on_recordings_and_fails_on_shuffled_ones(recordings, name
     spoilt = check.values(changed(recordings, shuffled))
     assert spoilt.keys() == values.keys()
     assert not any(map(check.allows, spoilt.values())), spoilt
-
-
-def test_levels_that_fall_are_no_rise(recordings):
-    spoilt = BY_NAME["sg_rise"].values(changed(recordings, np.negative))
-    assert not any(map(BY_NAME["sg_rise"].allows, spoilt.values())), spoilt
 
 
 def test_rough_and_tacky_materials_are_the_loudest(recordings):
@@ -137,44 +126,6 @@ def test_statistics_of_tones_are_their_levels():
     assert pvdf_slide_over_rest(seen) == pytest.approx(6.0, rel=1e-3)
     assert pvdf_speed_growth(seen) == pytest.approx(1.5, rel=1e-3)
     assert sg_variation([made(sg=tone(0.5, (2.0, 3.0, 6.0)))]) == pytest.approx(6.0, rel=1e-3)
-
-
-def test_a_burst_is_the_onset_over_the_slide():
-    pvdf = tone(1.0, (1.0, 1.0, 1.0))
-    for onset_s in made().onsets_s:
-        pvdf[:, round((onset_s - 0.02) * RATE_HZ) : round((onset_s + 0.04) * RATE_HZ)] *= 5.0
-    assert pvdf_onset_burst([made(pvdf=pvdf)]) == pytest.approx(5.0, rel=1e-3)
-
-
-def test_channels_that_show_no_onset_are_counted():
-    dull, keen = tone(1.0, (1.0, 1.0, 1.0)), tone(1.0, (9.0, 9.0, 9.0))
-    seen = [made(pvdf=np.concatenate([dull, keen, dull])), made(pvdf=np.concatenate([keen, dull]))]
-    assert num_barely_responding(seen) == 1.5
-
-
-def test_the_rise_is_the_step_of_the_mean_level():
-    t = np.arange(32000) / RATE_HZ
-    sg = np.stack([0.3 * (t > 2.0) - 1.0, 0.1 * (t > 2.0) + 2.0])
-    assert sg_rise_v([made(sg=sg)]) == pytest.approx(0.2)
-
-
-def test_the_spread_of_offsets_counts_in_variations():
-    sg = np.concatenate([tone(0.01, (1, 1, 1)) + offset for offset in (-1.0, 1.0)])
-    assert sg_offset_spread([made(sg=sg)]) == pytest.approx(100.0, rel=1e-3)
-
-
-def test_the_finest_detail_is_what_alternates():
-    slow, fast = tone(1.0, (1, 1, 1), hertz=20.0), tone(1.0, (1, 1, 1), hertz=900.0)
-    assert d1_fraction([made(pvdf=slow)]) < 1e-4
-    assert d1_fraction([made(pvdf=fast)]) > 0.8
-
-
-def test_a_contrast_is_the_least_over_the_largest():
-    check = SignalCheck("contrast", "", pvdf_slide_over_rest, ("a", "b"), 1.5, over=("c", "d"))
-    levels = {"a": 3.0, "b": 4.0, "c": 1.0, "d": 2.0}
-    recordings = {name: [made(pvdf=tone(1.0, (v, v, v)))] for name, v in levels.items()}
-    (value,) = check.values(recordings).values()
-    assert value == pytest.approx(1.5, rel=1e-3)
 
 
 # --- filtering ----------------------------------------------------------------------------------

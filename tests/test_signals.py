@@ -5,11 +5,10 @@ import pytest
 import torch
 from drawing import assert_png
 
-from tactslip_torch.hand import Channel, HandLayout
+from tactslip_torch.hand import HandLayout
 from tactslip_torch.report.recordings import (
     DrawnRecording,
     Trial,
-    channel_colours,
     dataset_figure,
     ranges_table,
     signals_figure,
@@ -117,27 +116,6 @@ def test_onsets_are_marked_and_slides_and_handling_shaded_as_far_as_in_view(
 )
 def test_five_seconds_around_a_stroke(truth, stroke, view):
     assert row(**truth).around(stroke, 2.0, 3.0) == view
-
-
-def test_fingers_are_told_apart_by_colour_and_segments_by_paleness():
-    colours = dict(zip(HAND.names, channel_colours(CHANNELS), strict=True))
-    assert len(set(colours.values())) == 14  # a gauge and a film of one place share theirs
-    assert sum(colours["SG1"]) < sum(colours["SG2"]) < sum(colours["SG3"])
-    assert colours["SG1"] == colours["PVDF1"]
-
-
-def test_other_kinds_stand_in_columns_by_how_they_adapt(draw):
-    ways = {"electrode": "fast", "force": "slow", "SG": None, "PVDF": None}
-    channels = [
-        Channel(f"{kind}{i}", kind, "index", "distal", way)
-        for i in range(2)
-        for kind, way in ways.items()
-    ]
-    recording = DrawnRecording("a", torch.randn(8, 200), RATE_HZ, units="counts")
-    axes = draw(recording, channels=HandLayout(channels).to_rows()).axes
-    titles = [one.get_title(loc="left").split(",")[0] for one in axes]
-    assert titles == ["force", "force", "SG", "SG", "electrode", "PVDF"]
-    assert axes[0].get_ylabel() == "a\ncounts"
 
 
 # What a set holds --------------------------------------------------------------------------------

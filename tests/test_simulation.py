@@ -10,16 +10,12 @@ import torch
 from scene_files import (
     CONTACTS,
     NAMES,
-    RATE_HZ,
     contacts,
     is_within,
     scene_of,
     scene_on,
-    volts,
-    whole_grid,
 )
 
-from tactslip_torch import Channel, HandLayout
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.simulation import (
     SEEN_MATERIALS,
@@ -140,16 +136,6 @@ def test_scenes_that_handle_the_hand_say_where_and_the_others_do_not():
     assert truths["arm_motion"].onsets_s == truths["pulled"].arm_s == ()
 
 
-def test_carrying_ends_before_a_slide_and_with_the_recording():
-    carried, slide = Stroke(40.0, 20.0, 0.5, "both"), Stroke(40.0, 20.0, 0.1)
-    scene = Scene("M3", strokes=(carried, slide, replace(carried, pause_s=1.0)))
-    truth = timeline(scene)
-    starts, stops = zip(*truth.arm_s, strict=True)
-    assert truth.non_slip_s == ((starts[0], starts[1]), (starts[2], truth.duration_s))
-    longer = timeline(replace(scene, tail_s=1.0, strokes=(carried, replace(slide, pause_s=1.0))))
-    assert longer.non_slip_s == ((starts[0], stops[0] + 0.3),)
-
-
 def test_a_recording_carries_truth_and_provenance_and_the_dtype_asked_for():
     scene = Scene("copper", seed=3, cycle=7, strokes=SHORT)
     truth, double = timeline(scene), simulate(scene, dtype=torch.float64)
@@ -165,22 +151,6 @@ def test_a_recording_carries_truth_and_provenance_and_the_dtype_asked_for():
     assert torch.equal(single, double.samples.float())
     steps = double.samples / (10.0 / 2**16)
     torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("rate_hz", [1000.0, 8000.0])
-def test_other_rates_tell_the_same_story(rate_hz):
-    scene = Scene("M2", strokes=SHORT, sample_rate_hz=rate_hz, contact=Contact(lifted_fraction=0))
-    recording = simulate(scene, channels="PVDF7", dtype=torch.float64)
-    assert recording.onsets_s == timeline(replace(scene, sample_rate_hz=2000.0)).onsets_s
-    film, onset = recording.samples[20], round(recording.onsets_s[0] * rate_hz)
-    burst = film[onset : onset + round(0.05 * rate_hz)].abs().max()
-    assert burst > 5 * film[: onset - round(0.2 * rate_hz)].abs().max()
-
-
-def test_other_hands_work():
-    channels = (Channel("tip", "PVDF", "left", "pad"), Channel("root", "SG", "right", "pad"))
-    recording = simulate(Scene("M1", HandLayout(channels), strokes=SHORT), channels=["tip"])
-    assert recording.samples.isfinite().all(1).tolist() == [True, False]
 
 
 def test_a_scenes_dictionary_is_plain_json_and_loses_nothing():
@@ -214,31 +184,6 @@ def test_paper_scenes_are_the_protocol_and_take_flat_overrides():
     assert scenes[0].contact == Contact(friction_noise_mv=3, presliding_mm=(0.2, 2.0))
     assert scenes[0].disturbances.burst_rate_hz == 0.1
     assert scenes[0].sensors.num_bits == 12
-
-
-def test_texture_frequency_is_speed_over_wavelength():
-    """Lines of M3's weave: over *travel* their spectrum peaks at one place at every speed."""
-    contact = Contact(lifted_fraction=0.0, friction_noise_mv=0.0, texture_scale=10.0)
-    quiet = Disturbances(mains_mv=0.0, arm_transient_mv=0.0, burst_rate_hz=0.0)
-    scene = Scene("M3", contact=contact, disturbances=quiet, cycle=1)
-    films, peaks_hz = volts(scene, channels=["PVDF7", "PVDF8"])[20:22], []
-    for start_s, end_s in timeline(scene).sliding_s:
-        x = films[:, round((start_s + 0.2) * RATE_HZ) : round((end_s - 0.2) * RATE_HZ)]
-        hertz = np.fft.rfftfreq(x.shape[1], 1 / RATE_HZ)
-        power = np.abs(np.fft.rfft(x * np.hanning(x.shape[1]))).T ** 2
-        power = power.sum(1) * (hertz > 8)
-        peaks_hz.append(np.sum(hertz * power**2) / np.sum(power**2))
-    wavelengths_mm = np.array([20, 40, 60]) / np.array(peaks_hz)
-    assert np.all((wavelengths_mm > 0.4) & (wavelengths_mm < 1.8))
-    assert peaks_hz[0] < 0.7 * peaks_hz[1] < 0.7 * peaks_hz[2]
-
-
-def test_noise_has_unit_power_and_no_seam_and_a_block_depends_on_its_index_alone():
-    grid = whole_grid(120000)
-    noise = grid.white_noise((0, "test", 3))
-    assert noise.std() == pytest.approx(1, abs=0.01)
-    assert np.abs(np.corrcoef(noise[:10]) - np.eye(10)).max() < 0.2
-    np.testing.assert_array_equal(grid.only(slice(4, 5)).white_noise((0, "test", 3)), noise[4:5])
 
 
 # --- sets ---------------------------------------------------------------------------------------

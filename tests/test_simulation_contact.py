@@ -13,10 +13,8 @@ from test_signal_checks import BY_NAME, HAND, changed, shuffled
 from tactslip_torch import native
 from tactslip_torch.analysis.signal_checks import filtered
 from tactslip_torch.simulation import (
-    MATERIALS,
     SEEN_MATERIALS,
     Contact,
-    Disturbances,
     Scene,
     Stroke,
     paper_scenes,
@@ -100,17 +98,6 @@ def test_bristles_release_the_first_element_before_the_onset(model):
     assert max(gross) == pytest.approx(last_s, abs=2e-3)
 
 
-def test_annotations_jitter_by_what_is_asked():
-    truths = [timeline(Scene("M2", cycle=cycle)) for cycle in range(60)]
-    offsets_ms = 1e3 * np.array(
-        [np.subtract(truth.annotated_onsets_s, truth.onsets_s) for truth in truths]
-    )
-    assert 12 < offsets_ms.std() < 18
-    assert abs(offsets_ms.mean()) < 4
-    exact = timeline(Scene("M2", disturbances=Disturbances(label_jitter_ms=0.0)))
-    assert exact.annotated_onsets_s == exact.onsets_s
-
-
 def test_friction_stays_in_its_cone_sticks_before_and_falls_after_letting_go():
     scene = Scene("M6", cycle=2)
     grasp, (states, t) = draw_grasp(scene), contacts(scene)
@@ -128,28 +115,6 @@ def test_friction_stays_in_its_cone_sticks_before_and_falls_after_letting_go():
         inside = np.any([(t >= start_s) & (t <= end_s) for start_s, end_s in spans], axis=0)
         assert np.all(state.slide[~inside] == 0)
         assert 0.99 < state.slide.max() <= 1.0
-
-
-def test_lifted_elements_never_slip_and_about_a_tenth_is_lifted():
-    lifted = np.concatenate([draw_grasp(Scene("M1", cycle=c)).load_n == 0 for c in range(60)])
-    assert 0.06 < lifted.mean() < 0.14
-    grasp = draw_grasp(Scene("M1", contact=Contact(lifted_fraction=0.999)))
-    assert len(grasp.touching) == 1
-    slips = quasi_static_slips(grasp, Scene("M1").arm)
-    assert np.isnan(slips.start_s[:, grasp.load_n == 0]).all()
-
-
-def test_friction_asked_for_is_kept_whatever_is_drawn():
-    surface = draw_grasp(Scene("M5", contact=Contact(mu_s=0.5, mu_k=0.4)))
-    assert (surface.mu_s, surface.mu_ratio) == (0.5, pytest.approx(0.8))
-    typical = MATERIALS["M5"].mu_s
-    drawn = [draw_grasp(Scene("M5", seed=seed)).mu_s for seed in range(12)]
-    assert min(drawn) < typical < max(drawn)
-    for seed, mu_s in enumerate(drawn):
-        for mu_k in (0.5 * typical, typical):
-            surface = draw_grasp(Scene("M5", seed=seed, contact=Contact(mu_k=mu_k)))
-            assert surface.mu_s * surface.mu_ratio == pytest.approx(mu_k, rel=1e-12)
-            assert surface.mu_s == max(mu_s, mu_k)
 
 
 def test_film_passes_no_constant_and_a_fast_step_whole():
@@ -269,13 +234,6 @@ def test_provenance_and_keys_name_the_backend_of_bristles(monkeypatch):
             keys.append(source.key(source.ids[0]))
         assert [key.get("integrator", {}).get("backend") for key in keys] == backends
         assert Scene.from_dict(keys[0]) == replace(scene, fidelity=fidelity)
-
-
-def test_where_nothing_slides_all_contacts_are_one():
-    strokes = (Stroke(40.0, 20.0, 0.1, "both"),)
-    recordings = [simulate(scene_on(model, "M6", strokes=strokes)) for model in CONTACTS]
-    assert all(torch.equal(one.samples, recordings[0].samples) for one in recordings)
-    assert recordings[-1].onsets_s == ()
 
 
 @pytest.fixture(scope="module", params=BRISTLES)

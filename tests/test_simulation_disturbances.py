@@ -19,13 +19,11 @@ from scene_files import (
     volts,
 )
 from scipy.signal import butter, sosfiltfilt
-from scipy.stats import kstest
 
 from tactslip_torch.simulation import Handling, Imperfections, Scene, Stroke, timeline
 from tactslip_torch.simulation._contact import Grasp, draw_grasp
 from tactslip_torch.simulation._disturbances import (
     Handled,
-    _motor_level_mv,
     _quiet,
     losses,
     machine_runs,
@@ -44,7 +42,6 @@ QUIET = {
     "motor_vibration_mv": 0.0,
     "arm_transient_mv": 0.0,
 }
-NO_OFFSETS = {"sg_session_offset_v": 0.0, "sg_offset_v": 0.0, "pvdf_offset_mv": 0.0}
 
 
 def highpassed(samples: np.ndarray, corner_hz: float) -> np.ndarray:
@@ -131,14 +128,6 @@ def test_warming_is_slow_and_each_channels_own():
     assert np.ptp(np.log(far_mv[SLOW])) > 0.5
 
 
-def test_a_range_of_motor_vibration_is_drawn_per_recording_and_moves_nothing_else():
-    first = scene_of("arm_motion", "M3", motor_vibration_mv=(1.0, 30.0))
-    levels = [_motor_level_mv(replace(first, cycle=cycle)) for cycle in range(200)]
-    assert kstest(np.log(levels) / np.log(30.0), "uniform").pvalue > 0.01
-    again = scene_of("arm_motion", "M3", motor_vibration_mv=levels[0])
-    assert np.array_equal(volts(first), volts(again))
-
-
 # --- faults -------------------------------------------------------------------------------------
 
 NO_FAULTS = {"dead": [], "saturated": [], "swapped": [], "drops_per_s": 0.0}
@@ -168,22 +157,6 @@ def test_faults_change_the_file_and_leave_the_truth_alone(name):
             sound[:, index] = sound[:, index - 1]
     assert np.array_equal(broken, sound)
     assert not np.array_equal(broken, volts(sound_scene))
-
-
-def test_losses_come_at_their_rate_and_length():
-    counts, lengths = [], []
-    for cycle in range(30):
-        scene = scene_of("dropped_samples", "M2", cycle, drop_ms=[5.0, 50.0])
-        spans = losses(scene, 30000)
-        assert spans == sorted(spans)
-        assert all(1 <= first < end <= 30000 for first, end in spans)
-        counts.append(len(spans))
-        lengths += [end - first for first, end in spans if end < 30000]
-    assert abs(sum(counts) - 30 * 30) < 4 * np.sqrt(30 * 30)  # 2 a second for 15 s
-    assert 10 <= min(lengths) < 15
-    assert 90 < max(lengths) <= 101
-    assert np.median(lengths) == pytest.approx(2 * np.sqrt(5 * 50), rel=0.1)  # log-uniform
-    assert losses(scene_of("paper", "M2"), 30000) == []
 
 
 # --- handling -----------------------------------------------------------------------------------
@@ -356,37 +329,6 @@ def imperfect(material: str, **changes: float) -> np.ndarray:
     """What imperfections add to the samples of a quiet recording, ``[C, T]``."""
     (key,) = changes
     return added("paper", material, key, **{**QUIET, **changes})
-
-
-def test_local_noise_is_there_at_rest_and_each_elements_own():
-    noise = part(imperfect("M3", local_noise_mv=2.0), 0.0, 1.9)  # before the first stroke
-    grasp = draw_grasp(scene_of("paper", "M3"))
-    down = touching(grasp)
-    assert np.abs(noise[~down]).max() == 0
-    films = np.flatnonzero(down)[np.flatnonzero(down) >= 14]
-    element = grasp.element_of_channel[films]
-    level_mv = 1e3 * rms(noise[films]) / np.sqrt(grasp.load_n[element])
-    assert 2.0 / 2 < np.median(level_mv) < 2.0 * 2  # a dozen draws of spread .5 and gains of .3
-    other = element[:, None] != element
-    assert np.abs(np.corrcoef(noise[films]))[other].max() < 0.3
-
-
-@pytest.mark.parametrize(("key", "spread"), [("share_wander", 0.25), ("gain_drift", 0.1)])
-def test_loads_and_gains_wander_slowly_by_their_spread(key, spread):
-    """At rest before any stroke an SG channel's preload is its load."""
-    still = {"strokes": [], "tail_s": 60.0, **QUIET, **NO_OFFSETS}
-    scene = scene_of("paper", "M3", **still)
-    slow = np.flatnonzero(touching(draw_grasp(scene))[SLOW])
-    log_factor = np.log(volts(replace_by(scene, key, spread))[slow] / volts(scene)[slow])
-    assert np.median(rms(log_factor)) == pytest.approx(spread, rel=0.2)
-    assert np.abs(np.diff(log_factor)).max() < 0.01  # no jump from sample to sample
-    element = draw_grasp(scene).element_of_channel[slow]
-    alike = np.abs(np.corrcoef(log_factor[:, ::100]))
-    assert np.median(alike[element[:, None] != element]) < 0.3
-
-
-def replace_by(scene: Scene, key: str, value: float) -> Scene:
-    return replace(scene, imperfections=replace(scene.imperfections, **{key: value}))
 
 
 def test_pick_up_is_one_signal_with_a_coupling_of_each_channel():

@@ -85,16 +85,6 @@ def test_the_draw_depends_on_the_seed_and_the_material_alone():
     assert len({tuple(cycles) for cycles in tests}) == 5
 
 
-@pytest.mark.parametrize(
-    ("cycles", "fraction", "num_train"), [(2, 0.99, 1), (2, 0.01, 1), (5, 0.8, 4)]
-)
-def test_both_sides_have_a_cycle_if_there_are_two(cycles, fraction, num_train):
-    split = seen6(recordings(cycles=cycles), seen=SEEN, train_fraction=fraction)[0]
-    for material in SEEN:
-        counts = [len(of_role(split, role, material)) for role in ("train", "test")]
-        assert counts == [num_train, cycles - num_train]
-
-
 # Scenes --------------------------------------------------------------------------------------
 
 
@@ -177,33 +167,8 @@ def test_one_fold_for_every_material():
     assert leave_one_material_out(mixed, materials=None) == named
 
 
-def test_all_of_the_others_can_be_trained_on():
-    """Small sets have no cycle to spare, and are judged on what was left out alone."""
-    one_each = recordings(SEEN, cycles=1)
-    for fold, left_out in zip(
-        leave_one_material_out(one_each, train_fraction=1), SEEN, strict=True
-    ):
-        assert of_role(fold, "unseen") == {r for r in one_each if r.material == left_out}
-        assert of_role(fold, "train") == {r for r in one_each if r.material != left_out}
-        assert fold.having("test") == []
-
-
 def mounted(sessions=("", "2", "3"), materials=SEEN):
     return recordings(materials, 10, sessions)
-
-
-def test_cycles_of_a_session_are_drawn_on_their_own():
-    three = seen6(mounted(), seen=SEEN)[0]
-    for session in ("", "2"):
-        alone = seen6(mounted((session,)), seen=SEEN)[0]
-        assert alone.roles == {r: role for r, role in three.roles.items() if r.session == session}
-    tests = {
-        (m, s): frozenset(r.cycle for r in of_role(three, "test", m) if r.session == s)
-        for m in SEEN
-        for s in ("", "2", "3")
-    }
-    assert {len(cycles) for cycles in tests.values()} == {2}
-    assert len(set(tests.values())) > 3  # not the same cycles in every session
 
 
 def test_one_fold_for_every_session():

@@ -15,7 +15,6 @@ from streams import detector_of, onset_of, signal
 
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import (
-    KEY,
     AlarmSettings,
     Decider,
     Decisions,
@@ -152,7 +151,7 @@ def joined_offline(settings, samples, masked=None):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("kind", ["", "nan", "all nan", "now and then", "dead", "rail"])
+@pytest.mark.parametrize("kind", ["", "nan", "now and then", "dead"])
 def test_fast_evidence_in_any_cut_is_that_of_the_whole_recording(kind, dtype):
     samples = spoilt(kind, signal(6000, 6).to(dtype))
     samples = torch.cat([samples, signal(3000, 7).to(dtype)], -1)
@@ -160,22 +159,22 @@ def test_fast_evidence_in_any_cut_is_that_of_the_whole_recording(kind, dtype):
     expected = joined_offline(settings, samples)
     assert 0 < int(expected.by_onset.sum()) < int(expected.by_onset.numel()) / 2
     assert len({alarm.raised_by for alarm in expected.alarms}) == 2
-    for cuts in ([], range(7, 9000, 7), range(0, 9000, 10), [5, 3000, 3001, 8000]):
+    for cuts in (range(37, 9000, 37), [5, 3000, 3001, 8000]):
         found = in_pieces(stream_of(settings=settings, dtype=dtype), samples, cuts)
         assert_same(found, expected)
         torch.testing.assert_close(found.onset_score, expected.onset_score, rtol=0, atol=1e-12)
         assert torch.equal(found.by_onset, expected.by_onset)
 
 
-@pytest.mark.parametrize("masked", [["PVDF1"], ["SG1", "SG2"], ["PVDF1", "PVDF2"]])
+@pytest.mark.parametrize("masked", [["PVDF1"], ["PVDF1", "PVDF2"]])
 def test_fast_evidence_leaves_out_channels_that_are_masked(masked):
     samples = signal(6000, 6)
     stream = stream_of(settings=with_onset(), masked_channels=masked)
     is_masked = torch.tensor([name in masked for name in DETECTOR.pool.hand.names])
     expected = joined_offline(stream.settings, samples, is_masked).onset_score
-    found = in_pieces(stream, samples, range(0, 6000, 10)).onset_score
+    found = in_pieces(stream, samples, range(0, 6000, 130)).onset_score
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
-    assert bool((found > -1e30).any()) == (len(masked) < 2 or masked[0] == "SG1")
+    assert bool((found > -1e30).any()) == (len(masked) < 2)
 
 
 # What is missing or broken ---------------------------------------------------------------------
@@ -205,8 +204,7 @@ def spoilt(kind, samples):
     return samples
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
+@pytest.mark.parametrize(("rule", "dtype"), zip(RULES, (torch.float32, torch.float64), strict=True))
 @pytest.mark.parametrize(
     "kind",
     ["nan", "all nan", "now and then", "dead", "rail", "huge", "larger than float32", "denormal"],
@@ -230,17 +228,6 @@ def test_broken_samples_are_flagged_and_gone_when_they_are_over(kind, rule, dtyp
     torch.testing.assert_close(
         found.score[~touched], healthy.score[~touched], rtol=close, atol=close
     )
-
-
-def test_what_says_nothing_leaves_the_statistic_alone():
-    rule = Cusum()
-    stream = stream_of(settings=settings_of(rule, threshold=1e9))
-    found = in_pieces(stream, spoilt("all nan", signal(6000, 6)), range(0, 6000, 250))
-    starts = HOP * found.number
-    within = (starts - 25 >= 2000) & (starts + 125 <= 4000)
-    assert (found.llr[within] == 0).all()
-    assert len(found.statistic[within].unique()) == 1
-    assert len(found.statistic[~within].unique()) > 50
 
 
 # Times ------------------------------------------------------------------------------------------
@@ -278,46 +265,6 @@ def test_a_time_may_come_in_any_form(as_):
         as_(2.0) if as_ is not torch.tensor else torch.tensor(2.0, dtype=torch.float64),
     )
     assert float(found.available_s[0]) == 2.0 + 125 / RATE
-
-
-@pytest.mark.parametrize("each", [False, True])
-@pytest.mark.parametrize("num_lost", [1, 30, 100])
-def test_a_short_gap_is_filled_with_nan(num_lost, each):
-    samples = signal(2000, 6)
-    holed = samples.clone()
-    holed[:, 770 : 770 + num_lost] = torch.nan
-    expected = timed(stream_of(), holed)
-    assert not expected.is_valid.all()
-    stream, parts = stream_of(), []
-    for first, stop in ((0, 400), (400, 770), (770 + num_lost, 1400), (1400, 2000)):
-        times = np.arange(first, stop) / RATE
-        parts.append(stream.push(samples[:, first:stop].T, times if each else float(times[0])))
-    found = joined([*parts, stream.flush()])
-    torch.testing.assert_close(found.available_s, expected.available_s, rtol=0, atol=1e-9)
-    torch.testing.assert_close(found.onset_s, expected.onset_s, rtol=0, atol=1e-9)
-    expected = expected._replace(available_s=found.available_s, onset_s=found.onset_s)
-    assert_same(found, expected)
-    assert stream.num_gaps == 0
-
-
-def test_gaps_within_a_push_are_seen_in_the_times_of_its_samples():
-    samples = signal(2000, 6)
-    is_there = torch.ones(2000, dtype=torch.bool)
-    is_there[[300, 301, 777, 1500]] = False
-    is_there[900:960] = False
-    holed = samples.where(is_there, torch.nan)
-    expected = in_pieces(stream_of(), holed)
-    stream = stream_of()
-    found = joined(
-        [
-            stream.push(samples[:, is_there].T, is_there.nonzero()[:, 0].double() / RATE),
-            stream.flush(),
-        ]
-    )
-    torch.testing.assert_close(found.available_s, expected.available_s, rtol=0, atol=1e-9)
-    assert torch.equal(found.is_alarm, expected.is_alarm)
-    assert torch.equal(found.is_valid, expected.is_valid)
-    assert torch.equal(found.llr, expected.llr)
 
 
 @pytest.mark.parametrize("within", [False, True])
@@ -458,34 +405,6 @@ def test_what_was_pushed_may_be_overwritten(as_array, size):
     assert_same(joined([*parts, stream.flush()]), in_pieces(stream_of(), samples))
 
 
-def test_errors_are_one_line_and_change_nothing():
-    stream, samples = stream_of(), signal(600, 6)
-    expected = in_pieces(stream_of(), samples)
-    parts = [stream.push(samples[:, :300].T)]
-    good = np.zeros((3, 4))
-    for bad, time_s, message in [
-        (np.zeros((3, 5)), None, r"expected samples \[n, 4\] .*SG1 to PVDF2\), got \(3, 5\)"),
-        (torch.zeros(4), None, r"expected samples \[n, 4\].*got \(4,\)"),
-        (np.zeros(4), None, r"expected samples \[n, 4\].*got \(4,\)"),
-        (torch.zeros(1, 3, 4), None, r"expected samples \[n, 4\].*got \(1, 3, 4\)"),
-        (np.zeros((3, 4), np.int16), None, r"volts, floating numbers, got int16"),
-        (np.zeros((3, 4), complex), None, r"floating numbers, got complex128"),
-        (torch.zeros(3, 4, dtype=torch.bool), None, r"floating numbers, got torch.bool"),
-        (np.full((3, 4), None), None, r"floating numbers, got object"),
-        (good, [0.1, 0.2], r"time_s must be .* of all 3, got float64 \(2,\)"),
-        (good, np.zeros((3, 1)), r"time_s must be .* got float64 \(3, 1\)"),
-        (good, np.zeros(3, np.float32), r"time_s must be .* got float32 \(3,\)"),
-        (good, "now", r"time_s must be .* got <U3 \(\)"),
-        (good, float("nan"), r"time_s must be finite"),
-        (good, np.array([0.0, np.inf, 1.0]), r"time_s must be finite"),
-    ]:
-        with pytest.raises(ValueError, match=message) as raised:
-            stream.push(bad, time_s)
-        assert "\n" not in str(raised.value)
-    parts += [stream.push(samples[:, 300:].T), stream.flush()]
-    assert_same(joined(parts), expected)
-
-
 def test_what_cannot_be_set_is_refused():
     for options, message in [
         ({"dtype": torch.float16}, r"dtype must be torch.float32 or torch.float64, got .*float16"),
@@ -496,41 +415,6 @@ def test_what_cannot_be_set_is_refused():
             StreamingDetector(DETECTOR, settings_of(), **options)
     with pytest.raises(ValueError, match=r"no alarm threshold"):
         StreamingDetector(DETECTOR)
-
-
-def test_settings_come_from_the_detectors_file(tmp_path):
-    detector = detector_of()
-    detector.info[KEY] = settings_of(RULES[1]).to_dict()
-    detector.save(tmp_path / "detector.pt")
-    stream = StreamingDetector(type(detector).load(tmp_path / "detector.pt", backend="auto"))
-    assert (stream.dtype, stream.settings) == (torch.float32, settings_of(RULES[1]))
-    assert (stream.hop_s, stream.bin_s, stream.look_ahead_s) == (0.01, 0.05, 0.0125)
-    samples = signal(900, 6, torch.float32)
-    assert_same(in_pieces(stream, samples), offline(detector, settings_of(RULES[1]), samples))
-
-
-@pytest.mark.parametrize("end", ["flush", "reset"])
-@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
-def test_a_stream_begins_anew(end, rule):
-    stream, samples = stream_of(settings=settings_of(rule)), signal(1200, 6)
-    stream.push(signal(777, 9).T, 55.0)
-    stream.push(signal(777, 9).T, 99.0)
-    assert stream.num_gaps == 1
-    getattr(stream, end)()
-    assert_same(in_pieces(stream, samples, [5, 600]), offline(DETECTOR, settings_of(rule), samples))
-    stream.reset()
-    assert stream.num_gaps == 0
-
-
-def test_an_empty_stream_has_no_decisions():
-    stream = stream_of()
-    for found in (
-        stream.push(np.zeros((0, 4))),
-        stream.push(np.zeros((0, 4)), 5.0),
-        stream.flush(),
-    ):
-        assert [len(entries) for entries in found] == [0] * len(found)
-        assert found.alarms == ()
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])

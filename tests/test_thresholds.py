@@ -36,12 +36,6 @@ def test_poisson_interval_is_that_of_chi_square(count: int, level: float) -> Non
     assert poisson_interval(count, level) == pytest.approx((low, high), rel=1e-9, abs=1e-300)
 
 
-def test_no_alarm_in_an_hour_leaves_three_point_seven_possible() -> None:
-    found = alarm_rate([0, 0], [0.5, 0.5])
-    assert (found.alarms, found.per_hour, found.low) == (0, 0, 0)
-    assert found.high == pytest.approx(math.log(40))  # exp(-high) = 0.025
-
-
 @pytest.mark.parametrize(("count", "level"), [(-1, 0.95), (math.inf, 0.9), (1, 0.0), (1, 1.0)])
 def test_poisson_interval_of_nonsense(count: float, level: float) -> None:
     with pytest.raises(ValueError, match=r"must not be negative|must lie between"):
@@ -72,19 +66,6 @@ def test_interval_holds_the_bootstrap_and_that_of_clusters() -> None:
     assert found.low == pytest.approx(min(drawn[0], low * size / hours.sum()), rel=0.05)
     assert found.high == pytest.approx(max(drawn[1], high * size / hours.sum()), rel=0.05)
     assert found.high > 1.3 * poisson_interval(int(total), 0.9)[1] / hours.sum()
-
-
-def test_bootstrap_alone_sets_an_end_that_it_reaches_farther() -> None:
-    # short recordings full of alarms: which are drawn decides how long was watched
-    counts, hours = np.array([40, 40, 0, 0]), np.array([0.001, 0.001, 1.0, 1.0])
-    found = alarm_rate(counts.tolist(), hours.tolist())
-    assert found.high == pytest.approx(bootstrap(counts, hours, 0.95)[1], rel=0.01)
-    assert found.high == pytest.approx(40_000)  # four short ones, one time in sixteen
-
-
-def test_recordings_not_watched_at_all_are_not_drawn() -> None:
-    found = alarm_rate([40, 40, 0, 0, 0], [0.001, 0.001, 1.0, 1.0, 0.0])
-    assert found.high == pytest.approx(40_000)  # drawn alone it would have no rate
 
 
 @pytest.mark.parametrize(
@@ -280,11 +261,3 @@ def test_false_alarms_are_those_of_the_latch_in_quiet(values, how, seed: int) ->
     quiet = np.random.default_rng(seed).random(len(values)) < 0.5
     expected = by_latch([values], [quiet], [[False] * len(values)], 1, how)
     assert false_alarms(np.array(values) >= 1, quiet, **how) == expected
-
-
-def test_no_value_beyond_those_tried_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thresholds, "_LEAST_QUIET", 1)
-    monkeypatch.setattr(thresholds, "_MOST_TRIED", 5)
-    monkeypatch.setattr(thresholds, "_TRIED_ONE_BY_ONE", 2)
-    peaks = np.repeat(np.arange(20.0), 2) * np.tile([1, 0], 20)  # each an alarm of its own
-    assert lowest_threshold([peaks], [np.ones(40, bool)], 5, **PLAIN) == 15

@@ -105,14 +105,6 @@ def test_ranges_without_bins_take_in_any_other():
     assert len(statistics.seen_batches) == 2
 
 
-def test_layout_labels_and_gradients_do_not_matter():
-    name, group, features, is_slip = make_recordings()[1]
-    strided = torch.stack([features, features], dim=-1)[..., 0].requires_grad_()
-    statistics = statistics_of([(name, group, strided, is_slip.long())])
-    assert bits_of(statistics) == bits_of(statistics_of([(name, group, features, is_slip)]))
-    assert not statistics.minimum.requires_grad
-
-
 def broken_bins(value):
     features = torch.zeros(5, NUM)
     features[2, 1] = value
