@@ -122,7 +122,7 @@ _OPCODES = frozenset(
     for line in (
         "PROTO STOP MARK EMPTY_DICT EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINUNICODE BININT",
         "BININT1 BININT2 LONG1 NONE NEWTRUE NEWFALSE BINPUT LONG_BINPUT BINGET LONG_BINGET",
-        "SETITEM SETITEMS GLOBAL BINPERSID REDUCE",
+        "SETITEM SETITEMS GLOBAL BINPERSID REDUCE EMPTY_LIST APPEND APPENDS BINFLOAT",
     )
     for name in line.split()
 )
@@ -208,6 +208,21 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not isinstance(content.get("format"), str):
         raise ValueError(f"{path} is damaged or no file of ours; make it again")
     return content
+
+
+def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What is in a checkpoint of a training of ours, held against its schema.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is none, or damaged.
+    """
+    try:
+        content = _read(regular_file(path, 2**33))
+    except ValueError as error:
+        raise ValueError(f"{error}; give last.ckpt of a run, or its folder") from None
+    found: dict[str, Any] = checked(os.fspath(path), content, CHECKPOINT)
+    return found
 
 
 def read_json(path: str | os.PathLike[str], form: str, most_bytes: int = 2**24) -> dict[str, Any]:
@@ -319,6 +334,22 @@ def _either(first: Wanted, second: Wanted) -> Callable[[Any], str | None]:
     return wanted
 
 
+def _tuple_of(each: Wanted, most: int) -> Callable[[Any], str | None]:
+    """In a checkpoint, which is no JSON."""
+
+    def wanted(value: Any) -> str | None:
+        is_tuple = isinstance(value, tuple) and len(value) <= most
+        is_right = is_tuple and not any(_problem(x, each, "") for x in value)
+        return None if is_right else f"at most {most} such values"
+
+    return wanted
+
+
+def _tensor_of_finite(value: Any) -> str | None:
+    is_right = isinstance(value, Tensor) and value.dtype.is_floating_point
+    return None if is_right and bool(value.isfinite().all()) else "a tensor of finite numbers"
+
+
 _positive, _share = _number(1e-30, 1e30), _number(0, 1)
 _finite, _seconds = _number(-1e300, 1e300), _number(0, 1e9)
 _threshold = _number(-1e300, math.inf)
@@ -405,6 +436,33 @@ _INFO = {
     "train_sessions?": _names,
     "*": _any,
 }
+_epoch = _number(0, 2, whole=True)
+_CHECKPOINT = {
+    "format": _one_of("tactslip_torch checkpoint 1"),
+    "epoch": _epoch,
+    "fingerprint": _text,
+    "loops": {
+        "fit_loop": {
+            "epoch_progress": {"*": {"*": _epoch}},
+            "*": _any,
+        },
+        "*": _any,
+    },
+    "plan": {
+        "kernel": _KERNEL,
+        "penalty": _number(1e-300, math.inf),
+        "fractions": _tuple_of(_share, 2),
+        "bin_weight": _number(0, 1e300),
+        "num_bins": _count,
+        "imputation": _tensor_of_finite,
+        "gaussians?": {"*": _tensor_of_finite},
+        "selected": _tuple_of(_number(0, 10**7, whole=True), 10**6),
+        "scaler": {"*": _tensor_of_finite},
+        "abstain?": _ABSTAIN,
+        "*": _any,
+    },
+    "*": _any,
+}
 _SUMS = {
     "num_features": _number(1, 10**5, whole=True),
     "degree?": _one_of(1, 2),
@@ -416,6 +474,7 @@ DETECTOR, SUMS, STATISTICS = (
     "tactslip_torch statistics 4",
 )
 SIDECAR = "tactslip_torch onnx 1"
+CHECKPOINT = "tactslip_torch checkpoint 1"
 SCHEMAS: Mapping[str, Wanted] = {
     DETECTOR: {
         "channels": _CHANNELS,
@@ -452,5 +511,6 @@ SCHEMAS: Mapping[str, Wanted] = {
         },
         "*": _any,
     },
+    CHECKPOINT: _CHECKPOINT,
 }
 """What the metadata of each format must be."""

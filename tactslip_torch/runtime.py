@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import glob
 import hashlib
 import json
 import math
 import multiprocessing
 import os
 import secrets
+import shutil
 import stat
 import threading
 from collections import deque
@@ -20,6 +23,11 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
+
+try:
+    import fcntl
+except ImportError:  # Windows: temporary files of killed processes stay
+    fcntl = None  # type: ignore[assignment]
 
 __version__ = "0.1.0"
 PACKAGE = Path(__file__).resolve().parent
@@ -196,7 +204,11 @@ def check_number(name: str, value: Any, *, least: float | None = None, whole: bo
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary name beside ``path`` to write to; renamed to ``path`` when all went well.
 
-    A failure leaves what was at ``path`` before, and no temporary file.
+    A failure leaves what was at ``path`` before, and no temporary file. What a killed process left
+    is removed: those that live hold a lock on theirs.
+
+    Raises:
+        OSError: that names the folder, if its disk is full.
 
     Example:
         >>> with whole_file(getfixture("tmp_path") / "a.txt") as temporary:
@@ -206,13 +218,46 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    for left in path.parent.glob(f".{glob.escape(path.stem)}.????????.tmp{path.suffix}"):
+        if (lock := _locked(left)) is not None:
+            left.unlink(missing_ok=True)
+            os.close(lock)
     unique = secrets.token_hex(4)  # process ids repeat on other hosts and in containers
     temporary = path.with_name(f".{path.stem}.{unique}.tmp{path.suffix}")
+    lock = _locked(temporary)
     try:
         yield temporary
         temporary.replace(path)
+    except Exception as error:  # torch raises others than OSError
+        if not isinstance(error, OSError) and shutil.disk_usage(path.parent).free >= _BLOCK:
+            raise
+        if isinstance(error, OSError) and error.errno != errno.ENOSPC:
+            raise
+        said = f"no space left on the disk of {path.parent}; {path.name} was not written"
+        raise OSError(errno.ENOSPC, said) from error
     finally:
         temporary.unlink(missing_ok=True)
+        if lock is not None:
+            os.close(lock)
+
+
+_BLOCK = 2**16
+
+
+def _locked(path: Path) -> int | None:
+    """A file, made if it is not there, that no other process can lock as long as this one lives."""
+    if fcntl is None:
+        return None
+    try:
+        descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:

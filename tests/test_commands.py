@@ -1,6 +1,8 @@
 """The commands as a user runs them: what they leave behind, and what they say of bad input."""
 
 import json
+import os
+import pickle
 import shutil
 from types import SimpleNamespace
 
@@ -330,6 +332,32 @@ def test_a_checkpoint_of_other_bins_is_refused(tiny, tmp_path, change):
     config = composed(*TINY, "cache=off", checkpoint, change)
     with pytest.raises(ValueError, match="gathered from other training bins"):
         train(config, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "is damaged or no file of ours"),
+        (pickle.dumps({"plan": 3}), "is damaged or no file of ours"),
+        (0.5, "is damaged or no file of ours"),  # of a whole one
+        ("folder", "no last.ckpt in .*/ckpt: a run writes it after its first pass"),
+        ("pipe", "is a device or pipe, expected a file"),
+        (None, "no file at .*/ckpt"),
+    ],
+)
+def test_what_is_no_checkpoint_is_refused_in_one_line(tiny, tmp_path, content, said):
+    path = tmp_path / "ckpt"
+    if content == "folder":
+        path.mkdir()
+    elif content == "pipe":
+        os.mkfifo(path)
+    elif content is not None:
+        whole = (tiny.folder / "last.ckpt").read_bytes()
+        path.write_bytes(whole[: len(whole) // 2] if content == 0.5 else content)
+    config = composed(*TINY, f"cache={tiny.cache}", f"ckpt_path={path}")
+    with pytest.raises((ValueError, FileNotFoundError), match=said) as caught:
+        train(config, tmp_path)
+    assert "\n" not in str(caught.value)
 
 
 def test_random_bins_have_train_and_test_in_every_recording(tmp_path):

@@ -317,6 +317,18 @@ def test_what_is_no_file_is_refused_without_a_wait(tmp_path):
         load_table(__file__, FORM, 10)
 
 
+def test_what_a_killed_process_left_is_removed_and_what_is_being_written_is_not(tmp_path):
+    path = tmp_path / "a.txt"
+    (tmp_path / ".a.0123abcd.tmp.txt").write_text("half")
+    with whole_file(path) as first:
+        first.write_text("first")
+        with whole_file(path) as second:
+            assert sorted(tmp_path.iterdir()) == sorted([first, second])
+            second.write_text("second")
+    assert path.read_text() == "first"
+    assert names_in(tmp_path) == ["a.txt"]
+
+
 # --- batches seen and digests -------------------------------------------------------------------
 
 

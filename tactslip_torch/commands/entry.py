@@ -24,7 +24,9 @@ CONF_HINT = "train.yaml"
 EXIT_BAD_INPUT = 2
 BAD_INPUT = (
     ValueError,
-    KeyError,
+    LookupError,
+    OverflowError,
+    EOFError,
     TypeError,
     OSError,
     InstantiationException,

@@ -30,6 +30,7 @@ from tactslip_torch.features.pooling import pooled_names
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.decisions import KEY, Scorer
+from tactslip_torch.own_files import read_checkpoint
 from tactslip_torch.report.results import print_results, tuning_figure, write_results
 from tactslip_torch.runtime import is_first_process, whole_file
 from tactslip_torch.training.adaptation import FILE as STATISTICS
@@ -375,20 +376,31 @@ def export_fold(detector: SlipDetector, folder: Path) -> dict[str, dict[str, flo
 
 
 def _checkpoint(given: str | None, fold: Split) -> Path | None:
-    """The checkpoint to resume: the file given, or that of the run folder given, if it got so far.
+    """The checkpoint to resume: the file given, or that of the fold in the run folder given.
+
+    A fold that a run of several did not reach starts anew.
 
     Raises:
-        FileNotFoundError: if there is nothing at the path.
+        FileNotFoundError: if there is nothing at the path, or in the folder no checkpoint at all.
+        ValueError: if it is none, or damaged.
     """
     if given is None:
         return None
     path = Path(given)
-    if not path.exists():
-        raise FileNotFoundError(f"no checkpoint or run folder at {path}")
-    if path.is_file():
-        return path
-    found = [path / fold.name / "last.ckpt", path / "last.ckpt"]
-    return next((candidate for candidate in found if candidate.is_file()), None)
+    if path.is_dir():
+        found = [path / fold.name / "last.ckpt", path / "last.ckpt"]
+        if not any(path.glob("*/last.ckpt")) and not found[1].exists():
+            raise FileNotFoundError(
+                f"no last.ckpt in {path}: a run writes it after its first pass; train without "
+                "ckpt_path (features come from the cache)"
+            )
+        existing = [candidate for candidate in found if candidate.exists()]
+        if not existing:
+            log.warning("no checkpoint of %s in %s: it starts anew", fold.name, path)
+            return None
+        path = existing[0]
+    read_checkpoint(path)
+    return path
 
 
 main = entry_point("train", train)

@@ -36,6 +36,7 @@ from tactslip_torch.onset.events import (
     pooled_metrics,
     recording_events,
 )
+from tactslip_torch.own_files import CHECKPOINT, FORGED
 from tactslip_torch.report.metrics import (
     answer_counts,
     answer_metrics,
@@ -313,21 +314,29 @@ class SlipLearner(L.LightningModule):
         """Keep what the first pass planned, and of which bins."""
         if self._plan is None:
             return
+        checkpoint["format"] = CHECKPOINT
         checkpoint["fingerprint"] = self._fingerprint()
         checkpoint["plan"] = self._plan.to_dict()
+        checkpoint["state_dict"] = {}  # Lightning's own adds nothing
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take up what ``on_save_checkpoint`` kept.
 
         Raises:
-            ValueError: if it was gathered from other recordings than those to be trained on.
+            ValueError: if it was gathered from other recordings than those to be trained on, or
+                its plan is none.
         """
+        checkpoint["state_dict"] = self.state_dict()
         if checkpoint.get("fingerprint") != self._fingerprint():
             raise ValueError(
                 "the checkpoint was gathered from other training bins; resume with the code, "
                 "data, labels, split, recipe and seed it was made with"
             )
-        self._plan = Plan.from_dict(checkpoint["plan"], self.recipe, self.pool)
+        try:
+            self._plan = Plan.from_dict(checkpoint["plan"], self.recipe, self.pool)
+        except FORGED as error:
+            said = str(error).splitlines()[0]
+            raise ValueError(f"the checkpoint is damaged: {said}; train again") from error
         self._is_resumed = True  # baselines need the first pass's sample: drawn in the second
 
     def on_test_start(self) -> None:
