@@ -146,11 +146,11 @@ class Abstaining(Benchmark[Sizes]):
                 kept = [mean(row["covered"] for row in of) for of in by(own, "asked").values()]
                 axes.plot(asked, kept, "o-", color=color, label=way)
             axes.plot(asked, asked, "--", color=LIGHT)
-            axes.set_title(words, fontsize=10)
+            axes.set_title(words)
             axes.set_xlabel("coverage asked for")
         panels[0].set_ylabel("coverage kept")
         handles = panels[0].get_legend_handles_labels()
-        drawing.legend(*handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+        drawing.legend(*handles, loc="outside lower center", ncols=3)
 
 
 def _choices(names: Sequence[str], sizes: Sizes) -> list[tuple[str, ...]]:

@@ -184,10 +184,10 @@ class Adapting(Benchmark[Sizes]):
                 means = [mean(100 * row[key] for row in of) for of in these.values()]
                 counts = [count for (count,) in these]
                 axes.plot(counts, means, "o-", color=COLORS[place], label=way)
-            axes.set_title(title, fontsize=10)
+            axes.set_title(title)
             axes.set_xlabel("recordings added")
         panels[0].set_ylabel("balanced accuracy, %, mean of materials")
-        panels[0].legend(frameon=False, fontsize=8)
+        panels[0].legend()
 
 
 _KEYS = ("new", "old")

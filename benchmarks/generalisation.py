@@ -24,7 +24,6 @@ from torch import Tensor
 
 from benchmarks import ROOT
 from benchmarks.harness import (
-    LIGHT,
     OURS,
     PEER,
     Benchmark,
@@ -190,16 +189,15 @@ class Generalisation(Benchmark[Sizes]):
                 at = place + (0.12 if color == PEER else -0.12)
                 by_seed.plot([at] * len(values), values, "o", color=color, alpha=0.7)
         by_seed.set_xticks(range(3), [label.replace(" ", "\n") for label in labels])
-        by_seed.set_title("balanced accuracy, %, a dot a seed", fontsize=10)
+        by_seed.set_title("balanced accuracy, %, a dot a seed")
         for axes, title in ((found, "slips found, %"), (called, "moving arm called slip, %")):
             axes.set_xscale("log")
             axes.set_xticks(LEVELS_MV, [f"{mv:g}" for mv in LEVELS_MV])
             axes.set_xlabel("motor vibration, mV")
-            axes.set_title(f"{title} of bins", fontsize=10)
+            axes.set_title(f"{title} of bins")
             axes.set_ylim(bottom=0)
-            axes.grid(color=LIGHT)
         found.set_ylim(0, 101)
-        found.legend(fontsize=8, handlelength=3.5, frameon=False)
+        found.legend(handlelength=3.5)
 
 
 # What a detector says ----------------------------------------------------------------------------

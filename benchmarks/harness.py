@@ -414,16 +414,14 @@ def bars(
                 number(value), (value, place), (3, 0), textcoords="offset points", va="center",
                 size=7,
             )  # fmt: skip
-    axes.set_yticks(range(len(names)), names, fontsize=8)
-    axes.set_ylim(len(names) - 0.4, -0.6)
+    style.lanes(axes, names)
     if is_log:
         axes.set_xscale("log")
         plain_decades(axes.xaxis)
     axes.margins(x=0.12)
     axes.set_xlabel(about)
-    axes.grid(axis="x", color=LIGHT)
     if len(series) > 1:
-        axes.legend(fontsize=8, frameon=False)
+        axes.legend()
 
 
 def plain_decades(axis: Axis) -> None:
@@ -433,7 +431,7 @@ def plain_decades(axis: Axis) -> None:
 
 
 def finish(drawing: Figure, report: Report, about: str, path: Path) -> None:
-    """Title, bare frames, and the file.
+    """Title, and the file.
 
     Args:
         drawing: with its axes drawn.
@@ -441,13 +439,9 @@ def finish(drawing: Figure, report: Report, about: str, path: Path) -> None:
         about: the title; that data are simulated is added.
         path: of the PNG.
     """
-    for axes in drawing.axes:
-        axes.set_axisbelow(True)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
     quick = "; QUICK, means nothing" if report["quick"] else ""
     simulated = ", simulated" if report.get("simulated", True) else ""
-    drawing.suptitle(f"{about}{simulated}{quick}", fontsize=11)
+    drawing.suptitle(f"{about}{simulated}{quick}")
     with whole_file(path) as temporary:
         drawing.savefig(temporary, dpi=160, format="png", facecolor="white")
 
@@ -548,6 +542,7 @@ class Benchmark(ABC, Generic[S]):
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Fill the figure, where no command has drawn it."""
 
+    @style.styled
     def figures(self, report: Report, path: Path) -> None:
         """Write the figure, or take those of a command."""
         for name, ending in self.drawn.items():

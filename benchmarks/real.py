@@ -37,7 +37,6 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from benchmarks.harness import (
     GREY,
-    LIGHT,
     OURS,
     PEER,
     QUICK_LINE,
@@ -65,6 +64,7 @@ from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.statistics import TrainingStatistics
+from tactslip_torch.report.style import styled
 from tactslip_torch.runtime import bar, whole_file
 from tactslip_torch.training.alarm import DebouncedAlarm
 from tactslip_torch.training.datamodule import FeatureMaker
@@ -740,10 +740,10 @@ class Real(Benchmark[Sizes]):
         curves.set_ylim(1 - _CORNER, 1.0)
         curves.set_xlabel("stable touch called slip")
         curves.set_ylabel("slip detected")
-        curves.set_title("ROC curves, their corner; dots: at 0, where it decides", fontsize=9)
-        drawing.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-        curves.grid(color=LIGHT)
+        curves.set_title("ROC curves, their corner; dots: at 0, where it decides")
+        drawing.legend(loc="outside lower center", ncols=3)
 
+    @styled
     def figures(self, report: Report, path: Path) -> None:
         """Ours, and what ``detect`` has drawn of one recording."""
         super().figures(report, path)
@@ -942,11 +942,10 @@ def _draw_objects(axes: Axes, rows: Mapping[str, Any], colors: Mapping[str, str]
             size=7,
             color="#555555",
         )
-    axes.set_yticks(range(len(rows)), list(rows), fontsize=8)
+    axes.set_yticks(range(len(rows)), list(rows))
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlabel("balanced accuracy, %: dots objects, bar all windows")
-    axes.set_title("objects that were left out", fontsize=9)
-    axes.grid(axis="x", color=LIGHT)
+    axes.set_title("objects that were left out")
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from omegaconf import OmegaConf
 from benchmarks import ROOT
 from benchmarks.harness import (
     GREY,
-    LIGHT,
     OURS,
     PEER,
     Benchmark,
@@ -42,6 +41,7 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.report import published
 from tactslip_torch.report.metrics import split_metrics
 from tactslip_torch.report.results import BASELINES
+from tactslip_torch.report.style import styled
 from tactslip_torch.simulation.scene import CALIBRATED_PATH, SEEN_MATERIALS
 from tactslip_torch.simulation.source import SimulatedRecordings
 
@@ -184,9 +184,9 @@ class Reproduction(Benchmark[Sizes]):
         axes.set_yticks(range(len(names)), [", ".join(of) for of in names], fontsize=6)
         axes.set_ylim(len(names) - 0.4, -0.6)
         axes.set_xlabel("balanced accuracy, %")
-        axes.grid(axis="x", color=LIGHT)
-        drawing.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+        drawing.legend(loc="outside lower center", ncols=3)
 
+    @styled
     def figures(self, report: Report, path: Path) -> None:
         """Every seed, recall beside the onset, scenes, and the pipeline."""
         super().figures(report, path)
@@ -205,7 +205,7 @@ class Reproduction(Benchmark[Sizes]):
         axes.axvline(-0.5, color=GREY, ls="--", lw=1)
         axes.set_xlabel("bins of 50 ms beside the labelled onset: non-slip before 0, slip from 0")
         axes.set_ylabel("recall, %, mean of seeds")
-        axes.legend(frameon=False, fontsize=8)
+        axes.legend()
         finish(drawing, report, "Recall beside the onset", path.with_stem(f"{path.stem}_places"))
         if scenes := scenes_of(scores):
             drawing = Figure(figsize=(9.2, 4.4), layout="constrained")
@@ -217,9 +217,8 @@ class Reproduction(Benchmark[Sizes]):
                         words = f"trained on {FOLDS[fold]}" if place == 0 else None
                         axes.plot(values, [place] * len(values), "o", color=color, label=words)
                 axes.set_xlabel(f"mean recall of the classes there are, %, {role}")
-                axes.grid(axis="x", color=LIGHT)
-            panels[0].set_yticks(range(len(scenes)), scenes, fontsize=8)
-            panels[0].legend(frameon=False, fontsize=8)
+            panels[0].set_yticks(range(len(scenes)), scenes)
+            panels[0].legend()
             finish(drawing, report, "Slip or the arm", path.with_stem(f"{path.stem}_confound"))
 
 

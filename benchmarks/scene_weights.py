@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.generalisation import recordings
-from benchmarks.harness import LIGHT, Benchmark, Job, Report, Table
+from benchmarks.harness import Benchmark, Job, Report, Table
 from benchmarks.subjects import composed
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import PAPER_SCENE, Split
@@ -107,8 +107,7 @@ class SceneWeights(Benchmark[Sizes]):
             axes.plot(range(1, len(rows) + 1), [row[name] for row in rows], ".-", label=name)
         axes.set_xlabel("sets of weights, the best first")
         axes.set_ylabel("error, %")
-        axes.grid(color=LIGHT)
-        axes.legend(frameon=False)
+        axes.legend()
 
 
 def training_bins(

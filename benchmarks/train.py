@@ -119,7 +119,7 @@ class Train(Benchmark[Sizes]):
                 axes.barh(kind, seconds, left=left[kind], color=color, label=label)
                 left[kind] += seconds
         axes.set_xlabel("s")
-        drawing.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+        drawing.legend(loc="outside lower center", ncols=4)
 
 
 def _training(overrides: list[str], folder: Path, kind: str) -> dict[str, Any]:

@@ -428,6 +428,7 @@ def typical(study: Study, pulls: Sequence[Pull]) -> Pull:
 # Figure -------------------------------------------------------------------------------------------
 
 
+@style.styled
 def draw(study: Study, pulls: Sequence[Pull], path: Path) -> None:
     """Write the figure: a pull on the left, all of them on the right."""
     figure = style.new_figure(
@@ -457,7 +458,6 @@ def draw_pull(figure: Figure | SubFigure, study: Study, pull: Pull) -> None:
     view_s = VIEW_S[0], max([VIEW_S[1], *(end_s + 0.03 for end_s in ends_s)])
     films, motion = figure.subplots(2, 1, sharex=True)
     draw_films(films, study, pull, recording, view_s)
-    style.clean(motion)
     time_s = np.linspace(0.0, view_s[1], 600)
     for name, own in slides.items():
         look: dict[str, Any] = {"color": COLOURS[name], "linestyle": _line(name)}
@@ -477,13 +477,12 @@ def draw_pull(figure: Figure | SubFigure, study: Study, pull: Pull) -> None:
             f"{own.slid_mm:.1f} mm  {name}" if is_held else f"dropped  {name}",
             transform=motion.transAxes,
             va="top",
-            fontsize=style.TEXT,
             color=COLOURS[name],
         )
     held = [own.slid_mm for own in slides.values() if own.slid_mm <= study.reflex.reach_mm]
     motion.set_ylim(-0.03 * max([*held, 1.0]), 1.35 * max([*held, 1.0]))
-    motion.set_ylabel("slid, mm", fontsize=style.TEXT)
-    motion.set_xlabel("time from the onset, ms (▼ alarm, ● held)", fontsize=style.TEXT)
+    motion.set_ylabel("slid, mm")
+    motion.set_xlabel("time from the onset, ms (▼ alarm, ● held)")
     motion.axvline(0, color=style.BLACK, linewidth=1)
 
 
@@ -495,7 +494,6 @@ def draw_films(
     axes: Axes, study: Study, pull: Pull, recording: Recording, view_s: tuple[float, float]
 ) -> None:
     """The fast channels in lanes, first release and onset, and the alarms."""
-    style.clean(axes, "x")
     time_s = np.arange(recording.samples.shape[-1]) / recording.sample_rate_hz - pull.onset_s
     shown = (time_s >= view_s[0]) & (time_s <= view_s[1])
     fast = study.alarms.detector.pool.hand.fast
@@ -508,10 +506,9 @@ def draw_films(
     axes.set_title(
         f"{MATERIALS[g.material].title}, friction {g.mu_s:g}, {g.load_n:g} N an element: "
         "samples, if the hand did nothing",
-        fontsize=style.TEXT,
     )
     axes.set_yticks([])
-    axes.set_ylabel(f"{len(fast)} fast channels, {lane:.2g} V apart", fontsize=style.TEXT)
+    axes.set_ylabel(f"{len(fast)} fast channels, {lane:.2g} V apart")
     axes.set_ylim(-(len(fast) - 0.3) * lane, 2.0 * lane)
     axes.set_xlim(1e3 * view_s[0], 1e3 * view_s[1])
     through = axes.get_xaxis_transform()
@@ -525,7 +522,6 @@ def draw_films(
             transform=through,
             ha=side,
             va="top",
-            fontsize=style.SMALL + 0.5,
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
         )
     for name, alarm_s in pull.alarms_s.items():
@@ -540,7 +536,7 @@ def draw_distances(figure: Figure | SubFigure, study: Study, pulls: Sequence[Pul
     num, reach_mm = len(study.loads_n), study.reflex.reach_mm
     ratios = {"height_ratios": [4, 1]}
     rows = figure.subplots(2, num, sharex=True, sharey="row", squeeze=False, gridspec_kw=ratios)
-    hand, small = study.alarms.detector.pool.hand, style.SMALL + 0.5
+    hand = study.alarms.detector.pool.hand
     for panel, below, load_n in zip(*rows, study.loads_n, strict=True):
         for method, colour in COLOURS.items():
             slid = [
@@ -566,27 +562,22 @@ def draw_distances(figure: Figure | SubFigure, study: Study, pulls: Sequence[Pul
         panel.axhspan(reach_mm, 10 * reach_mm, color=style.LIGHT, zorder=0)
         panel.set_title(
             f"{load_n:g} N an element, grip {load_n * relative_load(hand):.1f} N",
-            fontsize=style.TEXT,
         )
         below.set_xticks(study.frictions)
-        below.set_xlabel("static friction", fontsize=style.TEXT)
-    for axes in rows.flat:
-        style.clean(axes)
-        axes.tick_params(which="both", length=0)
+        below.set_xlabel("static friction")
     first, below = rows[:, 0]
     first.set(yscale="log", ylim=(_LEAST_MM, _DROPPED**4 * reach_mm))
     first.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    first.set_ylabel("slid until held, mm: median and 90 % of slips", fontsize=style.TEXT)
+    first.set_ylabel("slid until held, mm: median and 90 % of slips")
     first.text(
         study.frictions[0],
         _DROPPED**3 * reach_mm,
         "dropped",
         ha="left",
         va="center",
-        fontsize=small,
     )
     below.set(ylim=(0, 100), yticks=[0, 50, 100])
-    below.set_ylabel("dropped, %", fontsize=style.TEXT)
+    below.set_ylabel("dropped, %")
 
 
 def main(

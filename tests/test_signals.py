@@ -135,7 +135,7 @@ def test_a_set_is_drawn_by_material_above_the_traces_of_a_recording(drawn, tmp_p
     widths = [patch.get_width() for patch in bars.patches]
     assert widths == pytest.approx([3.5, 0.75, 3.75, 10.0, 0.0, 0.0])  # labelled more than there is
     assert len(traces.get_yticklabels()) == 24
-    assert "24 of 40 channels" in drawn[1].axes[1].get_title()
+    assert "24 of 40 channels" in drawn[1].axes[1].get_title("left")
 
 
 def test_tables_of_a_set():

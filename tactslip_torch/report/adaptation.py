@@ -10,12 +10,12 @@ from tactslip_torch.report.style import (
     BLUE,
     UPPER_LEFT_OUTSIDE,
     VERMILION,
-    clean,
     lanes,
     marked,
     new_figure,
     percent,
     save,
+    styled,
     table,
 )
 
@@ -58,6 +58,7 @@ def journal_table(steps: Sequence[Mapping[str, Any]]) -> str:
     return table(rows, num_left=4)
 
 
+@styled
 def adaptation_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write before and after of every material as a line between two dots.
 
@@ -79,13 +80,12 @@ def adaptation_figure(content: Mapping[str, Any], path: str | Path) -> None:
     labels = {_BEFORE: "before", BLUE: "after, old"}
     for colour, label in (labels | ({VERMILION: "after, new"} if content["new"] else {})).items():
         axes.scatter([], [], color=colour, s=42, label=label)
-    clean(axes, "x")
     lanes(axes, [name for name, _, _ in rows])
     axes.set_xlabel("balanced accuracy by the machine without the recording, %")
     result = "accepted" if content["accepted"] else "refused"
     kind = ", SIMULATED data" if content["simulated"] else ""
-    axes.set_title(f"{_action(content)}: {result}{kind}", fontsize=10, loc="left")
-    axes.legend(frameon=False, fontsize=8, **UPPER_LEFT_OUTSIDE)
+    axes.set_title(f"{_action(content)}: {result}{kind}")
+    axes.legend(**UPPER_LEFT_OUTSIDE)
     save(figure, path)
 
 

@@ -11,11 +11,11 @@ from tactslip_torch.report.style import (
     GREEN,
     GREY,
     VERMILION,
-    clean,
     marked,
     new_figure,
     percent,
     save,
+    styled,
     table,
 )
 
@@ -63,6 +63,7 @@ def point_line(point: Mapping[str, Any]) -> str:
     return f"d {point['difficulty']:+.2f}: {accuracy} % ({by_seed}), signal checks {_checks(point)}"
 
 
+@styled
 def calibration_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write accuracy against difficulty, with the target and the point kept, as a PNG.
 
@@ -96,9 +97,8 @@ def calibration_figure(content: Mapping[str, Any], path: str | Path) -> None:
     axes.plot(content["difficulty"], 100 * content["accuracy"], "o", label="kept", **style)
     axes.set_xlabel("d, prior standard deviations harder than the starting values")
     axes.set_ylabel("test accuracy on seen materials, %")
-    axes.set_title(f"SIMULATED hand\nkept: {_kept(content)}", fontsize=9)
-    axes.legend(frameon=False, fontsize=9, loc="upper right")
-    clean(axes)
+    axes.set_title(f"SIMULATED hand\nkept: {_kept(content)}")
+    axes.legend(loc="upper right")
     save(figure, path)
 
 

@@ -10,16 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from tactslip_torch.report.style import (
-    GREY,
-    INK,
-    TEXT,
-    clean,
-    colours_of,
-    lanes,
-    new_figure,
-    save,
-)
+from tactslip_torch.report.style import GREY, INK, colours_of, lanes, new_figure, save, styled
 
 Points = Mapping[str, Mapping[str, Sequence[Any]]]
 """By set or kind, of each bin ``score`` (its size), its ``error`` and whether it ``flips``."""
@@ -60,6 +51,7 @@ def number(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+@styled
 def certificate_figure(content: Mapping[str, Any], points: Points, path: str | Path) -> None:
     """Write error against ``|score|`` with margin and bound, and errors of generated extremes.
 
@@ -70,13 +62,11 @@ def certificate_figure(content: Mapping[str, Any], points: Points, path: str | P
     """
     figure = new_figure(11.0, 4.9)
     left, right = figure.subplots(1, 2, width_ratios=[1.15, 1])
-    clean(left)
-    clean(right, "x")
     _scatter(left, content, {name: points[name] for name in content["sets"]})
     _bars(right, content["extremes"])
     kind = "SIMULATED recordings" if content["simulated"] else "recordings"
-    left.set_title(f"(a) every bin of {kind}", loc="left", fontsize=11)
-    right.set_title("(b) generated extremes (grey: flagged)", loc="left", fontsize=11)
+    left.set_title(f"(a) every bin of {kind}")
+    right.set_title("(b) generated extremes (grey: flagged)")
     save(figure, path, dpi=170)
 
 
@@ -109,10 +99,10 @@ def _scatter(axes: Axes, content: Mapping[str, Any], points: Points) -> None:
     if bound:
         axes.axhline(bound, color=INK, linewidth=1.0, linestyle="--")
         axes.text(high, bound / 1.15, "bound of the head ", color=INK, ha="right", va="top")
-    axes.set_xlabel("|score| in float64; dotted: as large as its error", color=GREY)
-    axes.set_ylabel("error of the float32 score", color=GREY)
+    axes.set_xlabel("|score| in float64; dotted: as large as its error")
+    axes.set_ylabel("error of the float32 score")
     place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (0.08, 0.88)}
-    axes.legend(frameon=False, fontsize=TEXT, markerscale=2.5, **place)
+    axes.legend(markerscale=2.5, **place)
 
 
 def _bars(axes: Axes, extremes: Mapping[str, Mapping[str, Any]]) -> None:
@@ -130,11 +120,11 @@ def _bars(axes: Axes, extremes: Mapping[str, Mapping[str, Any]]) -> None:
         notes += [f"{flips} flipped"] if flips else []
         notes += ["not finite"] if kind["not_finite"] else []
         colour = _BAD if flips or kind["not_finite"] else GREY
-        axes.text(1.25 * end, place, ", ".join(notes), va="center", color=colour, fontsize=8)
+        axes.text(1.25 * end, place, ", ".join(notes), va="center", color=colour)
     axes.set(xscale="log", xlim=(floor, 60 * max(*ends, floor)))
     axes.minorticks_off()
     lanes(axes, list(extremes))
-    axes.set_xlabel("error of the float32 score: bar worst, tick median", color=GREY)
+    axes.set_xlabel("error of the float32 score: bar worst, tick median")
 
 
 def _least_positive(values: Iterable[float | None]) -> float:

@@ -9,15 +9,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from tactslip_torch.report.style import (
-    clean,
-    colours_of,
-    marked,
-    new_figure,
-    percent,
-    save,
-    table,
-)
+from tactslip_torch.report.style import colours_of, marked, new_figure, percent, save, styled, table
 
 PAPERS_UNSEEN = frozenset({"iron", "cloth", "copper", "wood"})
 
@@ -72,6 +64,7 @@ def material_rows(content: Mapping[str, Any]) -> list[dict[str, object]]:
     return rows
 
 
+@styled
 def crossval_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write the distribution over splits, and the scores of each unseen material, as a PNG.
 
@@ -110,9 +103,8 @@ def _distribution(axes: Axes, content: Mapping[str, Any], colours: Mapping[str, 
     axes.set_xlabel("balanced accuracy on the unseen materials, %")
     axes.set_ylabel("fraction of splits at or below")
     axes.set_ylim(0, 1)
-    axes.set_title("over all splits; dot: the paper's four", fontsize=10)
-    axes.legend(frameon=False, loc="upper left")
-    clean(axes)
+    axes.set_title("over all splits; dot: the paper's four")
+    axes.legend(loc="upper left")
 
 
 def _by_material(axes: Axes, content: Mapping[str, Any], colours: Mapping[str, str]) -> None:
@@ -126,8 +118,7 @@ def _by_material(axes: Axes, content: Mapping[str, Any], colours: Mapping[str, s
                 axes.errorbar(place + aside, 100 * mean(scores), yerr=spread, **style)
     axes.set_xticks(range(len(content["materials"])), content["materials"], rotation=30)
     axes.set_ylabel("balanced accuracy, %")
-    axes.set_title("each material where it is unseen: mean and sd over splits", fontsize=10)
-    clean(axes, "y")
+    axes.set_title("each material where it is unseen: mean and sd over splits")
 
 
 def _is_papers(split: Mapping[str, Any]) -> bool:

@@ -21,9 +21,7 @@ from tactslip_torch.report.style import (
     GREEN,
     GREY,
     INK,
-    SMALL,
     VERMILION,
-    clean,
     csv_writer,
     kind_colours,
     lanes,
@@ -31,6 +29,7 @@ from tactslip_torch.report.style import (
     new_figure,
     percent,
     save,
+    styled,
     table,
     words,
 )
@@ -153,6 +152,7 @@ def _interval(lost: Mapping[str, float]) -> str:
 
 
 # Figure ------------------------------------------------------------------------------------------
+@styled
 def sensors_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write the figure: two hands, the cost of absence, and accuracy against how many sensors.
 
@@ -168,11 +168,11 @@ def sensors_figure(content: Mapping[str, Any], path: str | Path) -> None:
         moved[name] = math.hypot(row["gradient"]["non_slip"], row["gradient"]["slip"]) / 2**0.5
     alone = {name: 100 * row["alone"]["held_out"] for name, row in units.items()}
     axes = figure.add_subplot(grid[0, 0])
-    axes.set_title("(a) the trained detector moves with it", loc="left", fontsize=11)
+    axes.set_title("(a) the trained detector moves with it")
     unit = "gradient times own spread, sd of the score; 0: not in use"
     _hand(axes, content["channels"], moved, (0.0, max(moved.values()) or 1.0), "{:.1f}", unit)
     axes = figure.add_subplot(grid[0, 1])
-    axes.set_title("(b) with it alone", loc="left", fontsize=11)
+    axes.set_title("(b) with it alone")
     unit = "balanced accuracy with this channel alone, held-out, %"
     _hand(axes, content["channels"], alone, (50.0, max(*alone.values(), 51.0)), "{:.0f}", unit)
     _absences(figure.add_subplot(grid[0, 2]), content)
@@ -187,7 +187,6 @@ def _absences(axes: Axes, content: Mapping[str, Any]) -> None:
     fingers = [row for row in used if row["unit"] == "finger"]
     rows = [row for row in used if row["unit"] == "channel"][:_MOST_CHANNELS] + fingers
     roles = [role for role in ("held_out", "unseen") if role in content["num_bins"]]
-    clean(axes, "x")
     for number, role in enumerate(roles):
         at = np.arange(len(rows)) + 0.3 * (number - (len(roles) - 1) / 2)
         low, lost, high = (
@@ -198,13 +197,12 @@ def _absences(axes: Axes, content: Mapping[str, Any]) -> None:
         axes.plot(lost, at, "o", color=colour, markersize=4.2, label=ROLE_WORDS[role])
     axes.axvline(0, color=INK, linewidth=0.8)
     lanes(axes, [row["name"] for row in rows])
-    axes.tick_params(axis="y", labelsize=SMALL)
     if 0 < len(fingers) < len(rows):
         axes.axhline(len(rows) - len(fingers) - 0.5, color=GREY, linewidth=0.8, linestyle=":")
-    axes.set_title("(c) lost without it", loc="left", fontsize=11)
-    axes.set_xlabel("points of balanced accuracy, 95 % intervals", fontsize=SMALL, color=GREY)
+    axes.set_title("(c) lost without it")
+    axes.set_xlabel("points of balanced accuracy, 95 % intervals")
     place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.03, 0.995)}
-    axes.legend(frameon=False, fontsize=SMALL, handletextpad=0.3, labelspacing=0.2, **place)
+    axes.legend(handletextpad=0.3, labelspacing=0.2, **place)
 
 
 def _best_few(axes: Axes, content: Mapping[str, Any]) -> None:
@@ -225,18 +223,17 @@ def _best_few(axes: Axes, content: Mapping[str, Any]) -> None:
         line = "o--" if chose else "o-"
         axes.plot(at, kept, line, color=colour, markersize=4.5, label=label)
     axes.plot([], [], ":", color=GREY, label="all sensors")
-    clean(axes, "y")
-    axes.set_xticks(at, [f"+{step['joins']}" for step in steps], rotation=50, fontsize=SMALL)
+    axes.set_xticks(at, [f"+{step['joins']}" for step in steps], rotation=50)
     for tick, step in zip(axes.get_xticklabels(), steps, strict=True):
         tick.set(color=colours[kinds[step["joins"]]], fontweight="bold")
     axes.set_xlim(0.5, len(steps) + 0.5)
     how = RESELECT_WORDS[content["settings"]["reselect"]]
     title = f"(d) the best few, in the order in which they serve held-out groups; features {how}"
-    axes.set_title(title, loc="left", fontsize=11)
-    axes.set_ylabel("balanced accuracy, %", fontsize=SMALL, color=GREY)
+    axes.set_title(title)
+    axes.set_ylabel("balanced accuracy, %")
     text = "bands: 95 % intervals of the difference to all sensors, over recordings"
-    axes.set_xlabel(text, fontsize=SMALL, color=GREY)
-    axes.legend(frameon=False, fontsize=SMALL, loc="best", ncols=2)
+    axes.set_xlabel(text)
+    axes.legend(loc="best", ncols=2)
 
 
 # The hand ----------------------------------------------------------------------------------------
@@ -272,7 +269,7 @@ def _hand(
         known = [segment for segment in _FROM_TIP if segment in segments]
         order = [*known, *(segment for segment in segments if segment not in known)]
         root = -1.3 if finger == "thumb" and place else 0.0
-        axes.text(place, root + len(order) + 0.1, finger, ha="center", fontsize=9, color=INK)
+        axes.text(place, root + len(order) + 0.1, finger, ha="center", color=INK)
         for up, segment in enumerate(reversed(order)):
             corner = (place - 0.46, root + up + 0.03)
             box = FancyBboxPatch(corner, 0.92, 0.94, boxstyle="round,pad=0,rounding_size=0.2")
@@ -291,8 +288,7 @@ def _hand(
         bar = axes.figure.colorbar(
             shown, ax=axes, location="bottom", shrink=0.6, aspect=40, pad=0.01
         )
-        bar.set_label(f"{kind}: {unit}", fontsize=SMALL, color=GREY)
-        bar.ax.tick_params(labelsize=SMALL)
+        bar.set_label(f"{kind}: {unit}")
         for x, y, row in marks[kind] if most <= _MOST_NAMED else ():
             value = values[row["name"]]
             is_deep = value > limits[0] + 0.6 * (limits[1] - limits[0])

@@ -25,12 +25,12 @@ from tactslip_torch.report.style import (
     GREY,
     INK,
     ORANGE,
-    clean,
     csv_writer,
     legend_below,
     marked,
     new_figure,
     save,
+    styled,
     table,
 )
 from tactslip_torch.runtime import write_json
@@ -380,6 +380,7 @@ def write_onsets(content: Mapping[str, Any], folder: Path) -> None:
 
 
 # Figure ------------------------------------------------------------------------------------------
+@styled
 def onset_figure(
     traces: Traces,
     path: str | Path,
@@ -412,7 +413,6 @@ def onset_figure(
     decided_s, (probability, *statuses, onset_score) = traces.decisions()
     slips, invalid, doubtful = (_spans(decided_s, status, last) for status in statuses)
     for axes in panels:
-        clean(axes, "y")
         _shade(axes, invalid, "invalid", **_INVALID)
     _draw_channels(panels[0], traces, slips)
     bars = {"decided": (max(decided_s[0], first) if len(decided_s) else last, slips)}
@@ -420,12 +420,12 @@ def onset_figure(
     _draw_status(panels[1], bars, traces.view)
     panels[2].plot(decided_s, probability, color=INK, linewidth=0.8, drawstyle="steps-post")
     panels[2].set(ylim=(-0.04, 1.04), yticks=[0, 0.5, 1])
-    panels[2].set_ylabel("P(slip)", fontsize=8)
+    panels[2].set_ylabel("P(slip)")
     _shade(panels[2], doubtful, "abstains", **_ABSTAINS)
     if onset_threshold is not None:
         panels[3].plot(decided_s, onset_score, color=INK, linewidth=0.8)
         panels[3].axhline(onset_threshold, color=ALARM, linewidth=0.8, linestyle="--")
-        panels[3].set_ylabel("onset score", fontsize=8)
+        panels[3].set_ylabel("onset score")
     panels[0].set_xlim(first, last)
     raised_s, estimates_s = ([alarm[which] for alarm in alarms] for which in (0, 1))
     for axes, times, name, style in (
@@ -436,7 +436,7 @@ def onset_figure(
         (panels[2], estimates_s, "estimate", _ESTIMATE),
     ):
         _mark(axes, times, name, **style)
-    panels[-1].set_xlabel("time, s", fontsize=9, color=GREY)
+    panels[-1].set_xlabel("time, s")
     handles: list[Any] = [
         Line2D([], [], color=REST, linewidth=2, label="decided: no slip"),
         Line2D([], [], color=SLIP, linewidth=2, label="decided: slip"),
@@ -468,7 +468,7 @@ def _draw_channels(axes: Axes, traces: Traces, slips: Segments) -> None:
     axes.set_yticks(middles, list(traces.channels), fontsize=7)
     axes.set_ylim(middles[-1] - 0.8 * height, 0.8 * height)
     axes.grid(visible=False)
-    axes.set_ylabel(f"channels, lanes {height:.2g} {traces.units} apart", fontsize=8)
+    axes.set_ylabel(f"channels, lanes {height:.2g} {traces.units} apart")
 
 
 def lane_height(lines: Iterable[Array]) -> float:
@@ -501,7 +501,7 @@ def _draw_status(
             if beams := [(start, end - start) for start, end in drawn]:
                 place = (level - 0.35, 0.7)
                 axes.broken_barh(beams, place, facecolor=colour, gid=f"{name} {colour}")
-    axes.set_yticks(range(len(bars)), list(bars), fontsize=8)
+    axes.set_yticks(range(len(bars)), list(bars))
     axes.set_ylim(len(bars) - 0.5, -0.5)
     axes.grid(visible=False)
 

@@ -13,12 +13,12 @@ from tactslip_torch.report.style import (
     BLUE,
     GREEN,
     VERMILION,
-    clean,
     legend_below,
     marked,
     new_figure,
     percent,
     save,
+    styled,
     table,
 )
 
@@ -152,6 +152,7 @@ def _busy(interrupted: float) -> str:
     return f"{calls} by the system, which do not count"
 
 
+@styled
 def pareto_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write accuracy against latency and against compute as a PNG, the chosen detector marked.
 
@@ -170,18 +171,17 @@ def pareto_figure(content: Mapping[str, Any], path: str | Path) -> None:
         _candidates(axes, content, key)
         _front(axes, content, key)
         axes.axvline(limit, color="black", linestyle=":", linewidth=1)
-        clean(axes)
     left.set_xlabel("worst-case latency, onset to decision, ms")
     left.set_ylabel("balanced accuracy, %, a material left out")
     title = "front: shortest hop; chosen: longest that keeps the deadline (dotted)"
-    left.set_title(title, fontsize=10)
+    left.set_title(title)
     right.plot([], [], "s", color="white", mec="black", label="pooled over channels")
     for letter, what in _NAMED.values():
         right.plot([], [], marker=f"${letter}$", color="black", linestyle="", label=what)
     right.set_xscale("log")
     _plain_ticks(right)
     right.set_xlabel("compute, raw samples to decision, p99, us")
-    right.set_title("one bin, one thread; dotted: the limit", fontsize=10)
+    right.set_title("one bin, one thread; dotted: the limit")
     handles, _ = right.get_legend_handles_labels()
     legend_below(figure, handles, 3)
     save(figure, path)

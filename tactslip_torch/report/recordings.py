@@ -26,9 +26,7 @@ from tactslip_torch.report.style import (
     BLUE,
     GREY,
     INK,
-    TEXT,
     VERMILION,
-    clean,
     colours_of,
     lanes,
     legend_below,
@@ -36,6 +34,7 @@ from tactslip_torch.report.style import (
     new_figure,
     save,
     stack,
+    styled,
     table,
 )
 
@@ -193,6 +192,7 @@ def ranges_table(channels: Channels, ranges: Array, units: str) -> str:
     return table(rows)
 
 
+@styled
 def dataset_figure(
     trials: Sequence[Trial],
     example: DrawnRecording,
@@ -226,10 +226,9 @@ def dataset_figure(
         stack(bars, lane, (slip, quiet, whole - slip - quiet), colours)
         text = f"  {len(group)} recording{'s' * (len(group) != 1)}"
         bars.text(whole, lane, text, va="center", fontsize=7, color=GREY)
-    clean(bars, "x")
     lanes(bars, materials)
     bars.margins(x=0.12)
-    bars.set_xlabel("seconds of signal", fontsize=TEXT, color=GREY)
+    bars.set_xlabel("seconds of signal")
 
     chosen = sorted({round(place) for place in np.linspace(0, len(names) - 1, num_lanes)})
     view = (0.0, example.duration_s)
@@ -243,10 +242,10 @@ def dataset_figure(
     _draw_lanes(traces, times, values, labels, [INK] * len(chosen), scales, most=1.2)
     traces.set_ylim(-len(chosen) + 0.2, 0.8)
     _mark(traces, example, view)
-    traces.set_xlabel("time, s", fontsize=TEXT, color=GREY)
+    traces.set_xlabel("time, s")
     some = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} channels"
     what = f"{example.title}{some}; beside each name the span of all but 2 % of it"
-    traces.set_title(what, fontsize=TEXT, color=GREY)
+    traces.set_title(what)
     handles: list[Any] = [Patch(color=colour, label=label) for colour, label in colours.items()]
     handles += [Line2D([], [], label="onset", **_ONSET)] if example.onsets_s else []
     legend_below(figure, handles, 4)
@@ -254,6 +253,7 @@ def dataset_figure(
 
 
 # Signals -----------------------------------------------------------------------------------------
+@styled
 def signals_figure(
     rows: Sequence[DrawnRecording],
     channels: Channels,
@@ -286,18 +286,18 @@ def signals_figure(
             if in_lanes:
                 _draw_lanes(axes, times, values, names, own, [scale] * len(names))
                 apart = f"lanes {scale:.2g} {row.units} apart"
-                axes.set_title(apart, loc="right", fontsize=_NAMES, color=GREY)
+                axes.set_title(apart, loc="right", fontsize=_NAMES)
             for line, name, colour in zip(values, names, own, strict=True):
                 if not in_lanes:
                     axes.plot(times, line, color=colour, linewidth=0.7, label=name)
             _mark(axes, row, view)
         unit = "volts" if row.units == "V" else row.units
-        panels[0].set_ylabel(f"{row.title}\n{unit}", fontsize=TEXT, color=INK)
+        panels[0].set_ylabel(f"{row.title}\n{unit}", color=INK)
     for axes, (kind, _, in_lanes) in zip(grid[0], columns, strict=True):
         how = "offsets removed" if in_lanes else "as measured"
-        axes.set_title(f"{kind}, {how}", fontsize=TEXT, color=GREY, loc="left")
+        axes.set_title(f"{kind}, {how}")
     for axes in grid[-1]:
-        axes.set_xlabel("time, s", fontsize=TEXT, color=GREY)
+        axes.set_xlabel("time, s")
     legend_below(figure, _legend(rows, channels), 9)
     save(figure, path, dpi=120)
 
@@ -367,7 +367,6 @@ def _mark(axes: Axes, row: DrawnRecording, view: tuple[float, float]) -> None:
         if view[0] <= onset <= view[1]:
             axes.axvline(onset, **_ONSET)
     axes.set_xlim(*view)
-    clean(axes)
     axes.grid(visible=False)
     axes.tick_params(labelsize=_NAMES)
 

@@ -31,11 +31,8 @@ from tactslip_torch.report.style import (
     ORANGE,
     PALETTE,
     PURPLE,
-    SMALL,
-    TEXT,
     UPPER_LEFT_OUTSIDE,
     VERMILION,
-    clean,
     colours_of,
     grouped,
     kind_colours,
@@ -46,6 +43,7 @@ from tactslip_torch.report.style import (
     percent,
     save,
     stack,
+    styled,
     table,
     words,
 )
@@ -220,6 +218,7 @@ def solve_line(solve: Mapping[str, Any]) -> str:
     return f"{line}, unless what is left out is null" if solve.get("left_out") else line
 
 
+@styled
 def confusion_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write one confusion matrix per split: bins counted, and percent of each true class.
 
@@ -255,29 +254,29 @@ def _confusion_panel(
         value = percent(fractions[row, column] if counts[row].any() else None)
         axes.text(column, row - 0.06, f"{value} %", fontsize=13, **style)
         number = f"{grouped(int(counts[row, column]))} bins"
-        axes.text(column, row + 0.16, number, fontsize=9, **style)
+        axes.text(column, row + 0.16, number, **style)
     names = ["non-slip", "slip"]
-    axes.set_xticks([0, 1], names, fontsize=10)
-    axes.set_yticks([0, 1], names, fontsize=10, rotation=90, va="center")
-    axes.tick_params(length=0)
+    axes.set_xticks([0, 1], names)
+    axes.set_yticks([0, 1], names, rotation=90, va="center")
+    axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.axhline(0.5, color="white", linewidth=2)
     axes.axvline(0.5, color="white", linewidth=2)
-    axes.set_ylabel("truth", fontsize=10, color=GREY)
-    axes.set_title(name, fontsize=11, fontweight="bold", pad=21)
+    axes.set_ylabel("truth")
+    axes.set_title(name, fontweight="bold", pad=21)
 
     def accuracies(of: Mapping[str, Any]) -> str:
         both = percent(of["accuracy"]), percent(of["balanced_accuracy"])
         return "accuracy {} %, balanced {} %".format(*both)
 
-    axes.text(0.5, -0.545, accuracies(scores), ha="center", fontsize=9)  # below the title
+    axes.text(0.5, -0.545, accuracies(scores), ha="center")  # below the title
     lines = ["prediction", "", ""]
     if paper and paper.non_slip_recall is not None:
         recalls = (percent(recall, 1) for recall in (paper.non_slip_recall, paper.slip_recall))
         lines[1:] = "paper: non-slip {} %, slip {} %".format(*recalls), accuracies(vars(paper))
     elif paper:
         lines[1] = f"paper: accuracy {percent(paper.accuracy)} %"
-    axes.set_xlabel("\n".join(lines), fontsize=9, color=GREY)
+    axes.set_xlabel("\n".join(lines))
 
 
 # Selected features -------------------------------------------------------------------------------
@@ -326,6 +325,7 @@ _COMPONENTS = ("raw", "A1", "A2", "A3", "A4", "D1", "D2", "D3", "D4")
 _DOMAIN_WORDS = {"time": "time domain", "freq": "frequency domain"}
 
 
+@styled
 def selected_features_figure(
     selected: Sequence[Mapping[str, str]], path: str | Path, *, simulated: bool
 ) -> None:
@@ -374,10 +374,10 @@ def selected_features_figure(
     names = _counts(descriptor, what, zip(kinds, places, strict=True), ranks, colours)
     if is_papers:
         said = f"paper: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
-        component.set_xlabel(said, fontsize=9, color=GREY)
+        component.set_xlabel(said)
         lanes(descriptor, [f"{words(name)}  [{ranks[name]}]" for name in names])
         unit = "features; the paper never selects [-]"
-        descriptor.set_xlabel(unit, fontsize=9, color=GREY)
+        descriptor.set_xlabel(unit)
     save(figure, path, dpi=180)
 
 
@@ -407,14 +407,13 @@ def _counts(
             axes.barh(lanes_at, widths, height, left=lefts, hatch=hatch, **style)
             ends |= {name: ends[name] + by_name[name] for name in has}
         for lane, end in enumerate(ends.values() if shown else ()):
-            axes.text(end, lane + at, f" {end}", va="center", fontsize=9, color=GREY)
-    clean(axes, "x")
+            axes.text(end, lane + at, f" {end}", va="center", color=GREY)
     lanes(axes, list(map(words, names)))
-    axes.set_title(title, loc="left", fontsize=11)
+    axes.set_title(title)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
     axes.margins(x=0.1)
     place_of: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
-    axes.legend(frameon=False, fontsize=9, ncols=4, borderaxespad=0.3, handlelength=1.4, **place_of)
+    axes.legend(ncols=4, borderaxespad=0.3, handlelength=1.4, **place_of)
     return names
 
 
@@ -457,6 +456,7 @@ def validation_table(metrics: _Metrics) -> str:
     return marked(metrics["simulated"], *lines)
 
 
+@styled
 def validation_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the balanced accuracy on left-out groups over C, one line for each structure.
 
@@ -490,8 +490,7 @@ def validation_figure(metrics: _Metrics, path: str | Path) -> None:
     axes.set_xscale("log")
     axes.set_xlabel("C")
     axes.set_ylabel("balanced accuracy on the group left out, %")
-    axes.legend(frameon=False, fontsize=SMALL, handlelength=3.5, **UPPER_LEFT_OUTSIDE)
-    clean(axes)
+    axes.legend(handlelength=3.5, **UPPER_LEFT_OUTSIDE)
     save(figure, path)
 
 
@@ -561,6 +560,7 @@ def tuning_tables(metrics: _Metrics) -> list[str]:
     return texts
 
 
+@styled
 def tuning_figure(tuning: Mapping[str, Any], path: str | Path, *, simulated: bool) -> None:
     """Write the descents of every held-out group, the one on all, and the learned scales.
 
@@ -585,9 +585,8 @@ def tuning_figure(tuning: Mapping[str, Any], path: str | Path, *, simulated: boo
     axes.set_ylim(bottom=0)
     axes.set_xlabel("steps")
     axes.set_ylabel("held-out log loss, nats")
-    axes.set_title("groups held out; dots: steps chosen by the other groups", fontsize=10)
-    axes.legend(frameon=False, fontsize=SMALL, **UPPER_LEFT_OUTSIDE)
-    clean(axes)
+    axes.set_title("groups held out; dots: steps chosen by the other groups")
+    axes.legend(**UPPER_LEFT_OUTSIDE)
     if scales:
         _draw_scales(panels[1], scales)
     save(figure, path)
@@ -607,8 +606,7 @@ def _draw_scales(axes: Axes, scales: Mapping[str, float]) -> None:
     axes.set_ylim(0, 1.5 * ordered[0][1])
     axes.set_xlabel("features, by scale")
     axes.set_ylabel("scale in the kernel")
-    axes.set_title("learned scales: soft selection", fontsize=10)
-    clean(axes, "y")
+    axes.set_title("learned scales: soft selection")
 
 
 # Confounders: scenes that have motion without slip, or slip without motion ------------------------
@@ -676,6 +674,7 @@ def confound_table(metrics: _Metrics) -> str:
     return marked(metrics["simulated"], table(rows, num_left=4))
 
 
+@styled
 def confound_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write false slips and slips found of each detector on each kind of scene, as a PNG.
 
@@ -697,7 +696,6 @@ def confound_figure(metrics: _Metrics, path: str | Path) -> None:
     dot: dict[str, Any] = {"marker": "o", "ls": "", "ms": 7.5, "mew": 1.8}
     for role, pair in zip(roles, panels, strict=True):
         for axes, key in zip(pair, ("non_slip_recall", "slip_recall"), strict=True):
-            clean(axes)
             for lane, scene in enumerate(scenes):
                 own = [
                     row
@@ -716,18 +714,18 @@ def confound_figure(metrics: _Metrics, path: str | Path) -> None:
                     axes.plot(value, at, color=colour, mfc=fill, clip_on=False, zorder=2, **dot)
                 if not own:
                     text = "nothing but slip" if axes is pair[0] else "no slip in this scene"
-                    style: dict[str, Any] = {"fontsize": 8.5, "color": GREY, "ha": "center"}
+                    style: dict[str, Any] = {"color": GREY, "ha": "center"}
                     axes.text(
                         0.5, lane, text, va="center", transform=axes.get_yaxis_transform(), **style
                     )
             lanes(axes, ["paper's protocol" if name == "paper" else words(name) for name in scenes])
         named = {"test": "test cycles of seen materials", "unseen": "unseen materials"}
-        pair[0].set_title(named.get(role, role), loc="left", fontsize=10.5)
+        pair[0].set_title(named.get(role, role))
     left, right = panels[-1]
     left.set_xlim(left=0)
     right.set_xlim(right=100)
-    left.set_xlabel("false slips, % of non-slip bins: fewer is better", fontsize=TEXT)
-    right.set_xlabel("slips found, % of slip bins: more is better", fontsize=TEXT)
+    left.set_xlabel("false slips, % of non-slip bins: fewer is better")
+    right.set_xlabel("slips found, % of slip bins: more is better")
     handles = [Line2D([], [], color=colours[name], label=name, **dot) for name in colours]
     if any(row["is_trained"] is False for row in rows):
         labels = {GREY: "trained on other cycles of that scene", "white": "scene not trained on"}
@@ -768,6 +766,7 @@ def reliability_table(metrics: _Metrics) -> str:
     return marked(metrics["simulated"], table(rows, num_left=2, merged=1))
 
 
+@styled
 def reliability_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the reliability curve of each role with its counts, and the error of each material.
 
@@ -792,17 +791,14 @@ def reliability_figure(metrics: _Metrics, path: str | Path) -> None:
         curves.plot(scores["probabilities"], scores["slip_shares"], "o-", label=label, **style)
         at = np.array(scores["probabilities"]) + aside
         counts.bar(at, scores["counts"], width=0.01, color=colours[role])
-    clean(curves)
-    clean(counts, "y")
-    clean(errors, "x")
     curves.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), ylabel="fraction of bins that slip")
     curves.tick_params(labelbottom=False)
-    curves.legend(frameon=False, fontsize=9, loc="upper left")
+    curves.legend(loc="upper left")
     counts.set(xlabel="stated probability of slip, mean of a cell", ylabel="bins")
     for lane, (role, material, scores) in enumerate(rows):
         value = 100 * scores["ece"]
         errors.barh(lane, value, color=colours[role], alpha=0.45 if material else 1.0)
-        errors.text(value, lane, f" {value:.2f}", va="center", fontsize=8, color=GREY)
+        errors.text(value, lane, f" {value:.2f}", va="center", color=GREY)
     lanes(errors, [material or f"{role}, all" for role, material, _ in rows])
     errors.margins(x=0.15)
     errors.set_xlim(left=0)
@@ -845,6 +841,7 @@ def answers_table(metrics: _Metrics) -> str:
     return marked(metrics["simulated"], table(rows), note)
 
 
+@styled
 def answers_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the coverage of every recording, and what became of the bins of each role, as a PNG.
 
@@ -873,9 +870,8 @@ def answers_figure(metrics: _Metrics, path: str | Path) -> None:
     asked: dict[str, Any] = {"color": INK, "ls": "--", "lw": 1}
     for coverage in {scores["coverage"] for scores in answers.values()}:
         left.axvline(100 * coverage, **asked)
-    clean(left, "x")
-    clean(right, "x")
     lanes(left, [f"{role}, {CLASSES[truth].replace('_', '-')}" for role, truth in rows])
+    right.grid(visible=False, axis="y")
     left.set_xlabel("covered of a recording's bins, %; bar: mean over recordings")
     right.set_xlabel("of the bins of a class, %")
     right.set_xlim(0, 100)
@@ -969,6 +965,7 @@ def _drawn_events(metrics: _Metrics) -> dict[str, dict[str, Mapping[str, Any]]]:
     return {role: by_rule for role, by_rule in drawn.items() if by_rule}
 
 
+@styled
 def events_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write slips found by time since the onset, and what became of all, as a PNG.
 
@@ -994,8 +991,6 @@ def events_figure(metrics: _Metrics, path: str | Path) -> None:
     panels = figure.subplots(len(events), 2, sharex="col", squeeze=False, gridspec_kw=ratios)
     earliest, latest = 0.0, _REFLEX_MS[1]
     for (role, by_rule), (left, right) in zip(events.items(), panels, strict=True):
-        clean(left)
-        clean(right, "x")
         left.axvspan(*_REFLEX_MS, color="#F0E6C8", zorder=0, lw=0)
         lanes(right, list(by_rule), least=2)
         for lane, (rule, numbers) in enumerate(by_rule.items()):
@@ -1010,12 +1005,12 @@ def events_figure(metrics: _Metrics, path: str | Path) -> None:
             _draw_outcomes(right, lane, numbers)
             right.get_yticklabels()[lane].set_color(styles[rule]["color"])
         left.set_ylim(0, 102)
-        left.set_ylabel("slips found, %", fontsize=TEXT)
-        left.set_title(role, loc="left", fontsize=11, fontweight="bold")
+        left.set_ylabel("slips found, %")
+        left.set_title(role, fontweight="bold")
         right.set_xlim(0, 100)
     left.set_xlim(earliest, 1.5 * latest)
-    left.set_xlabel("time since the exact onset, ms (look-ahead within)", fontsize=TEXT)
-    right.set_xlabel("of all slips, %", fontsize=TEXT)
+    left.set_xlabel("time since the exact onset, ms (look-ahead within)")
+    right.set_xlabel("of all slips, %")
     handles: list[Any] = [Line2D([], [], lw=2, label=rule, **styles[rule]) for rule in rules]
     handles.append(Line2D([], [], color=GREY, marker="o", ls="", label="median"))
     handles.append(Patch(color="#F0E6C8", label="grip reflex of people, 60 to 90 ms"))
@@ -1028,7 +1023,7 @@ def _draw_outcomes(axes: Axes, lane: int, numbers: Mapping[str, Any]) -> None:
     """Found, early and missed of a rule in one bar, the false alarms behind it."""
     widths = [100 * (numbers[name] or {"value": 0.0})["value"] for name in _OUTCOMES]
     stack(axes, lane, widths, _OUTCOMES.values())
-    style: dict[str, Any] = {"va": "center", "fontsize": 9}
+    style: dict[str, Any] = {"va": "center"}
     for width, end in zip(widths, np.cumsum(widths), strict=True):
         if width >= 7:
             axes.text(end - width / 2, lane, f"{width:.1f}", color="white", ha="center", **style)
@@ -1164,6 +1159,7 @@ def scenes_table(metrics: _Metrics) -> str:
     return marked(metrics["simulated"], table(scene_rows(metrics), num_left=2))
 
 
+@styled
 def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the false-alarm rates that were reached, and those of every scene, as a PNG.
 
@@ -1189,10 +1185,10 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
             for by_role in scenes.values()
         ]
         _draw_rates(right, of_scenes, aside, colour)
-    left.set_title(f"Without slip: {' and '.join(hours)}", fontsize=10, loc="left")
+    left.set_title(f"Without slip: {' and '.join(hours)}")
     left.axvline(target, color=INK, linewidth=1, linestyle="--", zorder=1)
     what = f"Confounding scenes, by {words(alarm['rule'])} (bars: their budgets)"
-    right.set_title(what, fontsize=10, loc="left")
+    right.set_title(what)
     limits = {row["scene"]: row["limit"] for row in alarm["budget"] if not row["is_share"]}
     for lane, scene in enumerate(scenes):
         if scene in limits:
@@ -1201,9 +1197,8 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
         lanes(axes, list(map(words, names)))
         axes.set_xscale("log")
         axes.set_xlim(left=0.8 * _LEAST_RATE)
-        axes.set_xlabel("false alarms an hour, with interval (none: at the left edge)", fontsize=9)
-        clean(axes, "x")
-    left.legend(frameon=False, fontsize=9, loc="best")
+        axes.set_xlabel("false alarms an hour, with interval (none: at the left edge)")
+    left.legend(loc="best")
     save(figure, path)
 
 

@@ -1,7 +1,8 @@
 """Shared form of every report: words and numbers in tables, and colours, axes and files of figures.
 
 Colours are those of Okabe and Ito (2008), which colour-blind readers tell apart. Figures are drawn
-on matplotlib's ``Figure`` objects, so that no window opens and no global state changes.
+on matplotlib's ``Figure`` objects, so that no window opens; its settings are those of ``styled``
+while one is drawn, and as they were after it.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -27,7 +29,6 @@ INK, GREY, LIGHT = "#222222", "#666666", "#DDDDDD"
 ALARM = "#C6361B"
 _KIND_COLOURS = {"SG": ORANGE, "PVDF": BLUE}
 
-SMALL, TEXT, TITLE = 8, 9.5, 12  # font sizes in points
 UPPER_LEFT_OUTSIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 
 
@@ -116,11 +117,38 @@ def grouped(count: float) -> str:
 
 
 # Figures -----------------------------------------------------------------------------------------
+styled = rc_context(
+    {
+        "font.size": 9,
+        "figure.titlesize": 12,
+        "axes.titlesize": 10.5,
+        "axes.titlelocation": "left",
+        "axes.labelsize": 9,
+        "axes.labelcolor": GREY,
+        "axes.grid": True,
+        "axes.axisbelow": True,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "grid.color": LIGHT,
+        "grid.linewidth": 0.7,
+        "xtick.major.size": 0,
+        "xtick.minor.size": 0,
+        "xtick.labelcolor": INK,
+        "ytick.major.size": 0,
+        "ytick.minor.size": 0,
+        "ytick.labelcolor": INK,
+        "legend.frameon": False,
+        "legend.fontsize": 8.5,
+    }
+)
+"""Decorates what draws a figure: a light grid behind the data, no ticks, no box, small letters."""
+
+
 def new_figure(width: float, height: float, title: str = "", *, simulated: bool = False) -> Figure:
     """An empty figure of some inches, its parts laid out by matplotlib, that says SIMULATED."""
     figure = Figure(figsize=(width, height), layout="constrained")
     if title:
-        figure.suptitle(f"{title} (SIMULATED data)" if simulated else title, fontsize=TITLE)
+        figure.suptitle(f"{title} (SIMULATED data)" if simulated else title)
     return figure
 
 
@@ -130,18 +158,11 @@ def save(figure: Figure, path: str | Path, dpi: int = 160) -> None:
         figure.savefig(temporary, format="png", dpi=dpi, facecolor="white")
 
 
-def clean(axes: Axes, grid: Literal["x", "y", "both"] = "both") -> None:
-    """A light grid behind the data, no ticks, no box."""
-    axes.grid(axis=grid, color=LIGHT, linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.tick_params(length=0, labelsize=SMALL + 0.5, labelcolor=INK)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
 def lanes(axes: Axes, names: Sequence[str], *, least: int = 1) -> None:
     """Give the y axis a lane for each name, the first on top; space for ``least`` lanes."""
-    axes.set_yticks(range(len(names)), names, fontsize=TEXT)
+    axes.set_yticks(range(len(names)), names)
     axes.set_ylim(max(least, len(names)) - 0.4, -0.6)
+    axes.grid(visible=False, axis="y")
 
 
 def stack(axes: Axes, lane: float, widths: Sequence[float], colours: Iterable[str]) -> None:
@@ -154,8 +175,8 @@ def stack(axes: Axes, lane: float, widths: Sequence[float], colours: Iterable[st
 
 def legend_below(figure: Figure, handles: Sequence[Any], ncols: int) -> None:
     """One legend for all panels, below them."""
-    style: dict[str, Any] = {"loc": "outside lower center", "fontsize": SMALL + 0.5}
-    figure.legend(handles=handles, ncols=ncols, frameon=False, **style)
+    place: Any = "outside lower center"  # which matplotlib's types lack
+    figure.legend(handles=handles, ncols=ncols, loc=place)
 
 
 def colours_of(names: Iterable[str]) -> dict[str, str]:
