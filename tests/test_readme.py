@@ -1,4 +1,4 @@
-"""What README.md and the pages show is there and runs."""
+"""What README.md, the pages and the notebooks show is there and runs."""
 
 import ast
 import os
@@ -66,6 +66,15 @@ def test_every_command_and_program_runs_in_an_empty_folder(name, tmp_path):
         assert done.returncode == 0, f"{part}\n{done.stdout}\n{done.stderr}"
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("path", sorted(ROOT.glob("examples/*.ipynb")), ids=lambda path: path.stem)
+def test_a_notebook_runs(path, tmp_path):
+    nbclient, nbformat = map(pytest.importorskip, ("nbclient", "nbformat"))  # of the extra docs
+    folder = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(nbformat.read(path, 4), timeout=600, resources=folder).execute()
+
+
 def anchors(text):
     """Anchors of headings, as the site makes them."""
     text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
@@ -126,7 +135,8 @@ def strings(path):
 
 def test_words_are_plain():
     texts = {name: text for name, text in PAGES.items() if name != "CHANGELOG.md"}
-    texts |= {str(path): path.read_text(encoding="utf-8") for path in ROOT.glob("conf/**/*.yaml")}
+    for pattern in ("conf/**/*.yaml", "examples/*.ipynb"):
+        texts |= {str(path): path.read_text(encoding="utf-8") for path in ROOT.glob(pattern)}
     texts |= {str(path): strings(path) for path in ROOT.glob("tactslip_torch/**/*.py")}
     found = {name: hits for name, text in texts.items() if (hits := BANNED.findall(text))}
     assert found == {}

@@ -331,7 +331,7 @@ class FeaturePool(nn.Module):
             bins: filtered.
             given: dtype of the samples that they were filtered from, by default theirs.
             raw_magnitude: of these samples (``ChannelFilter.raw_magnitude``), by which a span is
-                judged (``LEAST_SPAN``); without, by the magnitude of the filtered bin.
+                decided (``LEAST_SPAN``); without, by the magnitude of the filtered bin.
 
         Shape:
             - bins: ``[*, C, n]``; raw_magnitude: ``[*, C]``
