@@ -17,17 +17,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
-
-try:
-    import fcntl
-except ImportError:  # Windows: temporary files of killed processes stay
-    fcntl = None  # type: ignore[assignment]
 
 __version__ = "0.1.0"
 PACKAGE = Path(__file__).resolve().parent
@@ -205,7 +201,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary name beside ``path`` to write to; renamed to ``path`` when all went well.
 
     A failure leaves what was at ``path`` before, and no temporary file. What a killed process left
-    is removed: those that live hold a lock on theirs.
+    is removed, where Linux tells that it is no more.
 
     Raises:
         OSError: that names the folder, if its disk is full.
@@ -218,13 +214,13 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    for left in path.parent.glob(f".{glob.escape(path.stem)}.????????.tmp{path.suffix}"):
-        if (lock := _locked(left)) is not None:
-            left.unlink(missing_ok=True)
-            os.close(lock)
-    unique = secrets.token_hex(4)  # process ids repeat on other hosts and in containers
+    if here := _machine():
+        for left in path.parent.glob(f".{glob.escape(path.stem)}.{here}-*.tmp{path.suffix}"):
+            _, pid, started, _ = left.name.removeprefix(f".{path.stem}.").split("-")
+            if _started(pid) != started:
+                left.unlink(missing_ok=True)
+    unique = "-".join([here, str(os.getpid()), _started("self"), secrets.token_hex(4)])
     temporary = path.with_name(f".{path.stem}.{unique}.tmp{path.suffix}")
-    lock = _locked(temporary)
     try:
         yield temporary
         temporary.replace(path)
@@ -237,27 +233,27 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise OSError(errno.ENOSPC, said) from error
     finally:
         temporary.unlink(missing_ok=True)
-        if lock is not None:
-            os.close(lock)
 
 
 _BLOCK = 2**16
 
 
-def _locked(path: Path) -> int | None:
-    """A file, made if it is not there, that no other process can lock as long as this one lives."""
-    if fcntl is None:
-        return None
+@lru_cache(maxsize=1)
+def _machine() -> str:
+    """Where process numbers mean the same: this boot, in this container; empty if not known."""
     try:
-        descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
+        boot = Path("/proc/sys/kernel/random/boot_id").read_bytes()
+        return hashlib.sha256(boot + os.readlink("/proc/self/ns/pid").encode()).hexdigest()[:8]
     except OSError:
-        return None
+        return ""
+
+
+def _started(pid: str) -> str:
+    """When a process began, in ticks since the boot; empty if there is none."""
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return Path("/proc", pid, "stat").read_text().rpartition(")")[2].split()[19]
     except OSError:
-        os.close(descriptor)
-        return None
-    return descriptor
+        return ""
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:

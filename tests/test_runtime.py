@@ -6,6 +6,7 @@ import pickle
 import random
 import time
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -317,14 +318,20 @@ def test_what_is_no_file_is_refused_without_a_wait(tmp_path):
         load_table(__file__, FORM, 10)
 
 
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux")
 def test_what_a_killed_process_left_is_removed_and_what_is_being_written_is_not(tmp_path):
     path = tmp_path / "a.txt"
-    (tmp_path / ".a.0123abcd.tmp.txt").write_text("half")
+    if (child := os.fork()) == 0:
+        with whole_file(path) as left:
+            left.write_text("half")
+            os._exit(0)
+    os.waitpid(child, 0)
+    (left,) = tmp_path.iterdir()
     with whole_file(path) as first:
         first.write_text("first")
         with whole_file(path) as second:
-            assert sorted(tmp_path.iterdir()) == sorted([first, second])
             second.write_text("second")
+            assert sorted(tmp_path.iterdir()) == sorted([first, second])
     assert path.read_text() == "first"
     assert names_in(tmp_path) == ["a.txt"]
 
