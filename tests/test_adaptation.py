@@ -254,16 +254,3 @@ def test_small_steps_together_keep_the_margin(old, before):
 def test_what_cannot_be_added_is_refused(old, before, bins, weight, message):
     with pytest.raises(ValueError, match=message):
         add(old, before, bins, weight, margin=0.1)
-
-
-def test_statistics_come_back_from_their_file_and_damage_is_noticed(old, new, tmp_path):
-    there = replace(old.reweighed(dict.fromkeys(new, 2.0), new), labels={"layout": "whole_slide"})
-    there.save(tmp_path / "statistics.pt")
-    back = Statistics.load(tmp_path / "statistics.pt")
-    assert (back.machine, back.labels) == (there.machine, there.labels)
-    assert torch.equal(solve(back).scores, solve(there).scores)
-    content = bytearray((tmp_path / "statistics.pt").read_bytes())
-    content[len(content) // 2] ^= 1
-    (tmp_path / "statistics.pt").write_bytes(content)
-    with pytest.raises(ValueError, match="damaged"):
-        Statistics.load(tmp_path / "statistics.pt")

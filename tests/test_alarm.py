@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
-from scipy.stats import beta, chi2
 from small_detector import small_detector
 from small_set import RATE_HZ, SMALL_HAND
 from test_commands import composed
@@ -18,7 +17,7 @@ from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.calibration import Isotonic, Platt
+from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
@@ -353,41 +352,12 @@ def test_slips_are_found_in_time_and_all_is_told_in_plain_json(calibrated, tmp_p
     assert (tmp_path / "alarm.png").stat().st_size > 10_000
 
 
-def test_rows_of_budgets_are_alarms_beside_hours_or_knocks_with_intervals(calibrated):
-    _, found = calibrated
-    for row in found["budget"]:
-        role, alarms = row["role"], row["alarms"]
-        if row["is_share"]:
-            numbers, amount = found["scenes"]["taps"][role], 2 * {"test": 9, "unseen": 6}[role]
-        else:
-            numbers = found["events"][f"{role} stream"]
-            numbers = {name: own["per_scene"]["held"] for name, own in numbers.items()}
-            amount = 3 / 3600 * {"test": 4, "unseen": 6}[role]
-        assert row["amount"] == pytest.approx(amount)
-        assert alarms == numbers[row["method"]]["num_false_alarms"]
-        if row["is_share"]:
-            low = beta.ppf(0.025, alarms, amount - alarms + 1) if alarms else 0.0
-            high = beta.ppf(0.975, alarms + 1, amount - alarms) if alarms < amount else 1.0
-        else:
-            low = chi2.ppf(0.025, 2 * alarms) / 2 / amount if alarms else 0.0
-            high = chi2.ppf(0.975, 2 * alarms + 2) / 2 / amount
-        if not row["is_share"] or alarms <= amount:
-            assert (row["low"], row["high"]) == pytest.approx((low, high))
-    kinds = {(row["role"], row["scene"], row["method"]) for row in found["budget"]}
-    assert len(kinds) == len(found["budget"]) == 2 * 2 * 4
-
-
 def test_the_papers_rule_is_left_out_where_its_hop_cannot_be():
     detector, timing = loudness_detector(), Timing(RATE_HZ, 40, 100, 25)
     made, onset = stage(hop_ms=20.0), onset_of()
     calibrate = made.roles(detector)["calibrate"]
     own = score_streams(made.streams, calibrate, {OURS: detector}, {OURS: 40}, onset, 0)
     assert set(made.methods(own, {OURS: timing}, onset)) == {JOINT, "cusum"}
-
-
-def test_evidence_left_open_is_hop_by_bin():
-    assert stage(rule={"name": "cusum", "evidence": None}).made_rule(100).evidence == 0.5
-    assert stage().made_rule(100).evidence == 0.4
 
 
 # -------------------------------------------------------------------------- streams and decisions
@@ -444,17 +414,6 @@ def test_the_rule_of_the_file_keeps_the_rate_not_one_like_it():
     allowed = 3  # 300 s at 100 an hour: 8.33, 3 show 7.75 and 4 show 9.15
     assert settings.metadata["calibrated"]["rate"]["alarms"] == alarms(settings) <= allowed
     assert alarms(replace(settings, threshold=0.8 * settings.threshold)) > allowed
-
-
-@pytest.mark.parametrize("rule", [KOfN(2, 3), Cusum(1.0, 0.2, 1.5)], ids=lambda rule: rule.name)
-def test_where_every_knock_reaches_the_most_there_is_bins_raise_nothing(rule):
-    flat = Isotonic((-1.0, 0.4), (-3.0, 2.0))  # every knock is beyond its last knot
-    made = stage(budget={"held": 400.0}, rearm_s=0.05, refractory_s=0.0)
-    streams = [knocked(number) for number in range(5)]
-    settings = made.calibrated(rule, flat, streams, TIMING)
-    assert settings.metadata["calibrated"]["rate"]["alarms"] == 0
-    for _, decided in decide(streams, settings, TIMING):
-        assert float(decided.statistic.max()) < settings.threshold
 
 
 def joint_streams(num=24):
@@ -523,32 +482,6 @@ def test_a_threshold_that_is_never_reached_is_refused():
     assert settings_of(rule, threshold=7.5).threshold == 7.5
     with pytest.raises(ValueError, match=r"threshold 7\.6 lies above 7\.5, .* lower it"):
         settings_of(rule, threshold=7.6)
-
-
-@pytest.mark.parametrize("rule", [KOfN(2, 3), Cusum(0.2, 0.5, 4.0)], ids=lambda rule: rule.name)
-def test_streams_are_decided_together_as_each_alone(rule):
-    rng = np.random.default_rng(0)
-    streams = [stream_of(rng.standard_normal(n), number=i) for i, n in enumerate((30, 41, 30, 1))]
-    found = {s.recording: made for s, made in decide(streams, settings_of(rule), TIMING)}
-    assert len(found) == len(streams)
-    for stream in streams:
-        alone = Decider(settings_of(rule), RATE_HZ, 100, 25).decide(stream.score, stream.is_valid)
-        for ours, theirs in zip(found[stream.recording], alone, strict=True):
-            torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-6)
-
-
-def test_a_longer_hop_leaves_decisions_out():
-    score, coarse = np.random.default_rng(1).standard_normal(23), TIMING._replace(hop_samples=100)
-    ((_, made),) = decide([stream_of(score)], settings_of(hop=100), TIMING)
-    ((_, thinned),) = decide([stream_of(score[::5])], settings_of(hop=100), coarse)
-    assert torch.equal(made.statistic, thinned.statistic)
-    assert made.available_s[1] - made.available_s[0] == pytest.approx(0.05)
-
-
-def test_a_score_that_tells_nothing_is_neutral():
-    usable = [True, False, True, True]
-    ((_, made),) = decide([stream_of([3, 3, 3, -3], is_usable=usable)], settings_of(), TIMING)
-    assert (made.llr != 0).tolist() == usable
 
 
 def test_bins_over_the_edge_of_a_slide_have_no_label():

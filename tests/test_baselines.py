@@ -84,18 +84,6 @@ def test_simple_statistics_are_those_of_the_bin(wavelet, num, rng):
         assert (error <= 1e-6 * np.abs(expected) + 1e-12 * largest).all()
 
 
-# -------------------------------------------------------------------------------- what is learned
-def test_each_learns_what_is_separable(fitted):
-    pool, baselines = fitted
-    bins, is_slip = bins_of(300, seed=9)
-    features = pool(bins).float()
-    found = baselines(features, features[:, :40].double())
-    assert list(found) == NAMES == list(baselines.metadata())
-    for name, says_slip in found.items():
-        assert says_slip.dtype == torch.bool
-        assert (says_slip == is_slip).double().mean() > 0.95, name
-
-
 def test_the_pooled_number_is_the_best_of_all_means_and_deviations(fitted):
     pool, baselines = fitted
     number = baselines.pooled

@@ -1,6 +1,5 @@
 """From decisions on labelled bins to events: alarms by hand, stretches, splits by bin."""
 
-import math
 from collections import deque
 from types import SimpleNamespace
 
@@ -155,26 +154,6 @@ def test_stretches_of_slip_and_of_none_are_watched_in_the_order_of_time():
         assert len(events.false_alarms_s) == 2
         # 0.5 to 7 s are unbroken, before the onset 1.01 s; the last 0.2 s of it are early
         assert events.quiet_s == pytest.approx(6.5 + 1.01 - LATENCY.look_ahead_s - 0.2)
-
-
-def test_where_no_decision_speaks_for_slip_there_is_no_first():
-    batch = batch_of(onsets=(2.0,), ends=(4.0,))
-    late = says(batch, right=False, wrong=[(0, 4)])
-    (onset,) = events_of(batch, late)["first_transition"].onsets
-    assert onset.delay_s == pytest.approx(0.2525)
-    assert onset.bin_fill_s == pytest.approx(0.24)
-    spoke_before = says(batch, wrong=[(0, -5)])  # what is said before the onset is not of it
-    (onset,) = events_of(batch, spoke_before)["first_transition"].onsets
-    assert (onset.bin_fill_s, onset.decision_s) == pytest.approx((0.04, 0.0))
-    let_go = says(batch_of((2.0,), (4.0,)), wrong=[(0, -1)])  # its bin ends 10 ms before the onset
-    batch = batch_of((2.0,), (4.0,), released_s=((1.98, 2.1),))
-    (onset,) = events_of(batch, let_go)["first_transition"].onsets
-    found = (onset.outcome, onset.delay_s, onset.delay_first_s, onset.slid_mm)
-    assert found == ("found", *map(pytest.approx, (0.0025, 0.0225, 0.05)))
-    assert (onset.bin_fill_s, onset.decision_s) == pytest.approx((-0.01, 0.0))
-    (onset,) = events_of(batch, says(batch, right=False))["first_transition"].onsets
-    assert onset.outcome == "missed"
-    assert math.isnan(onset.delay_s)
 
 
 # ---------------------------------------------------------------------------------- whole roles

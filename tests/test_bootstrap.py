@@ -82,16 +82,6 @@ def test_what_never_happened_may_still_happen_and_nothing_is_none():
     assert many.rate([1] * 30, [0] * 30) is Bootstrap(0).share([], []) is None
 
 
-def test_one_recording_alone_has_no_interval_of_what_is_no_count():
-    values, recording = torch.tensor([1.0, 2.0]).double(), torch.tensor([3, 3])
-    five = Bootstrap(5)
-    numbers = [five.quantile(values, recording, 0.5), five.mean(values, recording)]
-    numbers += [five.deviation(values, recording), five.ratio([0, 4.0, 0, 0, 0], [0, 2, 0, 0, 0])]
-    for number in numbers:
-        assert number["low"] is number["high"] is None
-    assert five.share([1, 0, 0, 0, 0], [2, 0, 0, 0, 0])["low"] > 0
-
-
 @pytest.mark.parametrize("wrong", [{"level": 0.0}, {"level": 1.0}, {"num": 0}])
 def test_draws_that_are_none_are_refused(wrong):
     with pytest.raises(ValueError, match="level between 0 and 1 and at least one draw"):

@@ -8,10 +8,9 @@ from test_commands import composed
 
 from tactslip_torch.commands import calibrate_simulator as command
 from tactslip_torch.commands.calibrate_simulator import best_point, calibrate, parameters_at, search
-from tactslip_torch.commands.train import train
 from tactslip_torch.report import published
-from tactslip_torch.simulation import Contact, Disturbances, paper_scenes, scene
-from tactslip_torch.simulation.scene import CALIBRATED_PATH, PRIORS, read_calibrated
+from tactslip_torch.simulation import paper_scenes, scene
+from tactslip_torch.simulation.scene import read_calibrated
 
 SMALL = (
     "data.cycles=1",
@@ -65,14 +64,6 @@ def test_the_search_is_cut_back_to_where_the_checks_hold(edge):
 # --- the line and the frozen values -------------------------------------------------------------
 
 
-def test_parameters_take_the_frozen_values():
-    values = json.loads(CALIBRATED_PATH.read_text())["values"]
-    assert set(values) == set(PRIORS)
-    assert list(Contact().presliding_mm) == values["presliding_mm"]
-    assert Contact().friction_noise_mv == values["friction_noise_mv"]
-    assert Disturbances().burst_rate_hz == values["burst_rate_hz"]
-
-
 @pytest.mark.parametrize("text", [None, "", "[]", '{"values": {"friction_noise_mv": []}}'])
 def test_a_damaged_file_of_frozen_values_is_one_line(tmp_path, text):
     path = tmp_path / "calibrated.json"
@@ -112,22 +103,6 @@ def test_the_command_leaves_all_it_tried(found):
     assert str(folder) not in (folder / "calibration.json").read_text()
     protocol = {name: content["protocol"][name] for name in ("step", "most_points", "check_cycles")}
     assert protocol == {"step": 1.5, "most_points": 2, "check_cycles": 1}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("limits", [(), ("recipe.feature_filter={kind:PVDF,domain:freq}",)])
-def test_accuracy_is_what_train_reports_for_the_same_parameters_and_seed(tmp_path, found, limits):
-    if limits:
-        point = command.evaluate_point(tiny(*limits), 0.0)
-        assert point["accuracy"] != found[0]["points"][0]["accuracy"]
-    else:
-        point = found[0]["points"][1]
-    values = {name: str(value).replace(" ", "") for name, value in point["parameters"].items()}
-    scene = [f"+scene.{name}={value}" for name, value in values.items()]
-    rest = ("data.materials=[M1,M5]", "recipe=paper", "seed=1000", "cache=off", "export=false")
-    config = composed(*SMALL, *scene, *limits, "+exp=random_bins", *rest)
-    assert train(config, tmp_path)["test/accuracy"] == point["accuracy"] < 1
-    assert point["accuracy_by_seed"] == [point["accuracy"]]
 
 
 @pytest.mark.slow

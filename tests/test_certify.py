@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 from small_detector import small_detector
 from test_commands import TinyRecordings, composed
 
-from tactslip_torch.analysis.raw_bins import bins_inside, draw_bins
+from tactslip_torch.analysis.raw_bins import draw_bins
 from tactslip_torch.commands.certify import certify, main
 from tactslip_torch.data.labels import LabelRule, label_bins
 from tactslip_torch.features.cache import cache_key
@@ -106,26 +106,6 @@ def test_drawn_bins_are_those_of_the_role_with_their_context(number, num_recordi
     assert {recording.material for recording in recordings} <= {"A", "B"}
     assert torch.equal(bins, drawn(number)[0])
     assert not torch.equal(bins, drawn(number, seed=4)[0])
-
-
-def test_as_many_of_each_class_are_drawn_if_asked():
-    _, _, fold = drawn(5)
-    detector = small_detector()
-    maker = FeatureMaker(source(), detector.pool, detector.channel_filter, LabelRule())
-    bins, is_slip, recordings = draw_bins(maker, fold, "train", 24, 0, 6, by_class=True)
-    assert len(bins) == len(is_slip) == 2 * int(is_slip.sum()) == 24
-    assert len(recordings) == 4
-    known = {}
-    for recording in recordings:
-        own, inside = bins_inside(maker, fold, recording, "train")
-        known |= dict(
-            zip(
-                keys_of(maker.raw_bins(recording, inside)),
-                own.is_slip[inside].tolist(),
-                strict=True,
-            )
-        )
-    assert [known[key] for key in keys_of(bins)] == is_slip.tolist()
 
 
 # The command -----------------------------------------------------------------------------------

@@ -90,14 +90,6 @@ def test_an_entry_point_stops_before_hydra_starts(monkeypatch, capsys, argument)
     assert err.count("\n") == 1
 
 
-def test_an_entry_point_composes_its_configuration(monkeypatch, tmp_path):
-    folder = tmp_path / "run"
-    monkeypatch.setattr(sys, "argv", ["train", "split=seen6", f"hydra.run.dir={folder}"])
-    given = []
-    entry_point("train", lambda config, folder: given.append((config.split._target_, folder)))()
-    assert given == [("tactslip_torch.data.splits.seen6", folder)]
-
-
 # One line --------------------------------------------------------------------------------------
 
 

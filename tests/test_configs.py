@@ -9,11 +9,9 @@ from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
 from tactslip_torch.commands.entry import conf_dir
-from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.splits import ROLES
 from tactslip_torch.simulation.source import SimulatedRecordings
 from tactslip_torch.training.experiment import feature_maker
-from tactslip_torch.training.recipe import Recipe
 
 RECORDED = {"biotacsp_dos"}
 """Experiments on real recordings, which are not here: a folder of their layout stands in."""
@@ -146,16 +144,6 @@ def test_every_option_composes(group, option):
         assert [str(r.scene) for r in source.ids] == [option, option]
     elif section and group != "features":  # plain values, for ``feature_maker``
         assert callable(get_object(section._target_))
-
-
-def test_recipe_and_rule_defaults_are_those_of_their_files():
-    """The file states what an experiment may change; the signature says the same."""
-    config = composed("recipe=paper")
-    pooling = tuple(config.features.pooling)  # of the file of features
-    assert instantiate(config.recipe, _convert_="all") == Recipe(pooling=pooling)
-    assert instantiate(config.labels) == LabelRule()
-    half = instantiate(composed("labels=half_second").labels)
-    assert half == LabelRule(layout="half_second")
 
 
 def test_evaluate_judges_on_the_same_defaults_as_train():

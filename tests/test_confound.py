@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pytest
 import torch
-from drawing import rows_of
 from hydra import compose, initialize_config_dir
 from small_set import RATE_HZ, SMALL_HAND, SmallTimeline
 
@@ -15,10 +14,9 @@ from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.report.metrics import bin_metrics, confusion_matrix, split_metrics
+from tactslip_torch.report.metrics import bin_metrics
 from tactslip_torch.report.results import (
     confound_table,
-    print_results,
 )
 
 pytestmark = pytest.mark.filterwarnings(
@@ -122,43 +120,6 @@ def made(seed=0, *, simulated=True, scenes=SCENES, roles=("train", "test", "unse
 
 
 # Table and figure --------------------------------------------------------------------------------
-
-
-def table_rows(metrics):
-    """The header and rows of the table."""
-    lines = confound_table(metrics).splitlines()
-    return rows_of("\n".join(lines[1:] if metrics["simulated"] else lines))
-
-
-def test_the_table_has_the_scores_of_the_bins_of_each_detector_and_scene(capsys):
-    metrics, bins = made()
-    header, *rows = table_rows(metrics)
-    assert header[:5] == ["evaluated on", "scene", "detector", "trained on it", "bins"]
-    assert [row[:3] for row in rows] == [
-        [role, scene, fold]
-        for role in ("test", "unseen")
-        for scene in ("paper", "carried", "tapped")  # the protocol, what was trained on, the rest
-        for fold in ("protocol", "with_scenes")
-    ]
-    trained = {("protocol", "paper"), ("with_scenes", "paper"), ("with_scenes", "carried")}
-    for role, scene, fold, is_trained, num_bins, *cells in rows:
-        labels, truth, says = bins[fold, role]
-        mine = torch.tensor([label == scene for label in labels])
-        expected = split_metrics(confusion_matrix(truth[mine], says[mine]))
-        assert int(num_bins) == int(mine.sum())
-        known = [expected[key] for key in KEYS]
-        assert cells == ["-" if value is None else f"{100 * value:.2f}" for value in known]
-        assert (cells[1] == "-") == (scene == "carried")  # no slip there
-        assert is_trained == ("yes" if (fold, scene) in trained else "no")
-    single = metrics["folds"]["protocol"]
-    saved = {"simulated": False, "splits": single["splits"], "detector": {}}
-    assert {row[3] for row in table_rows(saved)[1:]} == {"-"}  # another run trained it
-    print_results(metrics, [])  # folds on the same bins are printed apart, not summed
-    rows = rows_of(capsys.readouterr().out)
-    for fold in ("protocol", "with_scenes"):
-        accuracy = metrics["folds"][fold]["splits"]["unseen"]["accuracy"]
-        row = next(row for row in rows if row[0] == f"{fold}/unseen")
-        assert (row[1], row[-1]) == (f"{100 * accuracy:.2f}", "600")
 
 
 # The experiment, on small scenes -----------------------------------------------------------------

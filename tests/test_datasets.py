@@ -345,19 +345,6 @@ def test_files_of_several_rates_are_brought_to_one(tmp_path):
         assert torch.allclose(read.samples[:, middle], expected[middle].expand(3, -1), atol=5e-3)
 
 
-def test_several_rates_are_one_problem_however_many_files_have_them(tmp_path):
-    for place, rate in enumerate((200.0, 200.0, 200.0, 500.0, 500.0, 50.0)):
-        table(tmp_path / f"{place}.csv", samples(place), rate)
-    manifest(tmp_path, *(f"{place}.csv,wood,{place},,,slip" for place in range(6)))
-    source = FileRecordings(tmp_path, strict=False)
-    assert lines_of(source) == [
-        "manifest.csv:5: 3.csv: is of 500 Hz, manifest.csv:2 of 200 Hz (in all 2 of 500 Hz, 1 of "
-        "50 Hz); data.resample_hz=... brings all to one"
-    ]
-    assert [name.cycle for name in source.ids] == [0, 1, 2]
-    assert len(FileRecordings(tmp_path, resample_hz=100.0).ids) == 6
-
-
 def test_truth_follows_the_clock_of_the_file(tmp_path):
     """A logger that counts 199.5 Hz is taken as 200 Hz; its fifth second is not ours."""
     rates = (199.5, 199.6, 200.2)

@@ -358,16 +358,6 @@ def test_bad_input_is_one_line_and_exit_status_2(name, model, tmp_path, monkeypa
     assert not (tmp_path / "out" / "onsets.json").exists()
 
 
-def test_a_detector_without_a_threshold_says_how_to_get_one(tmp_path, monkeypatch, capsys):
-    small_detector(SEED).save(tmp_path / "bare.pt")
-    save(tmp_path / "a.npz", recording())
-    given = (f"model={tmp_path / 'bare.pt'}", f"input={tmp_path / 'a.npz'}")
-    status, out, lines = command(monkeypatch, capsys, tmp_path, *given)
-    assert (status, out) == (2, "")
-    (line,) = lines
-    assert "no alarm threshold; train with +exp=onset" in line
-
-
 # Files of others ---------------------------------------------------------------------------------
 
 
@@ -400,17 +390,6 @@ def test_a_gap_in_the_times_is_missing_samples_and_a_clock_a_little_off_is_none(
     assert gap[0]["invalid"] > even[0]["invalid"] == 0
     assert gap[2]
     assert off[2]
-
-
-def test_what_training_tared_is_tared(model, tmp_path):
-    content = recording()
-    level = torch.tensor([3.0, -2.0, 0.5, 1.0])[:, None]
-    save(tmp_path / "a.npz", content)
-    save(tmp_path / "b.npz", recording(samples=content.samples + level))
-    found = detected(model, tmp_path, tmp_path / "out", "figure=false", "tare_s=[0,0.5]")
-    first, second = found["recordings"]
-    assert first["alarms"]
-    assert [a["alarm_s"] for a in first["alarms"]] == [a["alarm_s"] for a in second["alarms"]]
 
 
 def test_a_detector_of_counts_takes_counts_and_what_says_no_units(model, tmp_path):

@@ -8,9 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.onset.events import (
-    PAPER_SCENE,
     EventRules,
     LatencyParts,
     Watched,
@@ -292,37 +290,6 @@ def test_delays_from_the_onset_and_the_first_release(
     parts = metrics["latency_ms"]
     whole = parts["look_ahead"] + parts["bin_fill"] + parts["decision"]
     assert parts["delay"] == pytest.approx(whole)
-
-
-def test_estimates_are_held_against_the_onsets_found(rng):
-    away = rng.normal(0.004, 0.02, 40)
-    many = [
-        watched((0.1, 1.1), onset_estimates_s=(0.05, 1 + error), recording=str(number))
-        for number, error in enumerate(away)
-    ]
-    error = event_metrics(many, RULES, LATENCY)["onset_error_ms"]
-    expected = {"median": np.median(away), "sd": away.std(), "mean_abs": np.abs(away).mean()}
-    for name, value in expected.items():
-        assert error[name]["value"] == pytest.approx(1000 * value, rel=1e-5), name
-        assert error[name]["low"] < error[name]["value"] < error[name]["high"], name
-
-
-def test_of_several_scenes_materials_and_speeds_are_of_the_papers():
-    many = [watched([1.1], recording="a"), watched([1.1, 9.0], recording="b")]
-    tapped = watched([2.0, 3.0, 9.5], (), scene="taps", material="M2", recording="c")
-    metrics = event_metrics([*many, tapped], RULES, LATENCY)
-    alone = event_metrics(many, RULES, LATENCY)
-    for group in (alone["per_material"]["M1"], alone["per_scene"]["paper"]):
-        assert "quantiles" not in group["delay_ms"]
-        assert group["false_alarms_per_hour"] == alone["false_alarms_per_hour"]
-    assert alone["per_speed"]["20"]["false_alarms_per_hour"] is None  # nobody slides there
-    assert alone["per_speed"]["20"]["num_found"] == 2
-    assert metrics["per_material"] == alone["per_material"]
-    assert metrics["per_speed"] == alone["per_speed"]
-    assert list(metrics["per_scene"]) == ["paper", "taps"]
-    assert metrics["per_scene"]["taps"]["num_false_alarms"] == 3
-    assert metrics["num_false_alarms"] == 4
-    assert RecordingId.scene == PAPER_SCENE
 
 
 def test_the_same_recording_of_two_detectors_is_drawn_as_one():

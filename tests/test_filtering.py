@@ -11,7 +11,6 @@ import torch
 from any_hands import own_kernels
 from scipy import signal
 
-from tactslip_torch.onset.streaming import SampleClock
 from tactslip_torch.signals.filtering import (
     ChannelFilter,
     _edges_of_kernel,
@@ -269,19 +268,3 @@ def test_what_is_no_kernel_is_refused_in_one_line(kernels, message):
     with pytest.raises(ValueError, match=message) as error:
         ChannelFilter([11, 1, 5, 11], kernels=kernels)
     assert "\n" not in str(error.value)
-
-
-def test_a_clock_is_exact_after_months():
-    """Whole numbers are counted; a float that adds half a millisecond at a time would be off."""
-    clock, month = SampleClock(2000.0), 30 * 24 * 3600 * 2000
-    none = np.zeros(0, np.int64), np.zeros(0)
-    for num in (1, month, 7):
-        clock.take(num, *none)
-    assert clock.end_s(np.array([month + 8]))[0] == (month + 8) / 2000
-    clock.take(3, np.array([0]), np.array([1.7e9]))
-    clock.take(month, *none)
-    assert clock.missing(np.array([1.7e9 + 1.5e-3 + month / 2000])).tolist() == [0]
-    assert clock.missing(np.array([1.7e9 + 2.5e-3 + month / 2000])).tolist() == [2]
-    with pytest.raises(ValueError, match=r"goes back: sample 0 .* 1 samples before its turn"):
-        clock.missing(np.array([1.7e9 + 1e-3 + month / 2000]))
-    assert clock.num_samples == 2 * month + 11

@@ -13,7 +13,7 @@ from test_commands import BAD_INPUT, TinyRecordings, composed
 
 from tactslip_torch import HandLayout, simulate
 from tactslip_torch.commands import generate as module
-from tactslip_torch.commands.entry import folder_problem, one_line
+from tactslip_torch.commands.entry import one_line
 from tactslip_torch.commands.generate import generate
 from tactslip_torch.data.formats import FORMATS
 from tactslip_torch.simulation.scene import Scene
@@ -97,20 +97,6 @@ def test_any_number_of_processes_writes_the_same_bytes(tmp_path):
     lines = [(tmp_path / str(n) / "manifest.csv").read_bytes() for n in (0, 2)]
     assert lines[0] == lines[1]
     assert found[0] == found[1]
-
-
-def test_sessions_and_kinds_of_scenes_have_files_and_rows_of_their_own(tmp_path, capsys):
-    short = "+data.scene.strokes=[{speed_mm_s: 60.0, distance_mm: 60.0, pause_s: 0.5}]"
-    extra = "+extra_scenes.quiet={strokes: [{speed_mm_s: 60.0, distance_mm: 60.0}]}"
-    run(tmp_path, "scene=paper", "materials=[M1]", "cycles=1", "sessions=2", short, extra)
-    found = contents(tmp_path)
-    names = [f"M1_{s}_00{n}.npz" for n in ("", "_session2") for s in ("paper", "quiet")]
-    assert [line["file"] for line in manifest(tmp_path)] == names
-    assert len(set(found.values())) == 4
-    assert [line["session"] for line in manifest(tmp_path)] == ["", "", "2", "2"]
-    rows = [line.split()[:3] for line in capsys.readouterr().out.splitlines()]
-    for row in (["paper", "2", "2"], ["quiet", "2", "2"], ["all", "4", "4"]):
-        assert row in rows
 
 
 # What is kept --------------------------------------------------------------------------------
@@ -214,18 +200,6 @@ def test_bad_input_is_one_line_and_touches_nothing(tmp_path, overrides, said):
     assert re.search(said, line), line
     assert "\n" not in line
     assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_that_cannot_be_made_is_said_in_one_line(tmp_path):
-    (tmp_path / "file").write_text("mine")
-    for place in (tmp_path / "file", tmp_path / "file" / "below" / "it"):
-        problem = folder_problem(["seed=1", f"hydra.run.dir={place}"])
-        assert problem.startswith(f"cannot write to hydra.run.dir={place}: ")
-        assert "\n" not in problem
-    assert folder_problem([f"hydra.run.dir='{tmp_path / 'a b'}'"]) is None
-    sweep = ["-m", f"hydra.sweep.dir={tmp_path / 'file'}", f"hydra.run.dir={tmp_path}"]
-    assert "hydra.sweep.dir" in folder_problem(sweep)
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]  # nothing is left behind
 
 
 # What is drawn -------------------------------------------------------------------------------

@@ -110,16 +110,6 @@ def test_a_threshold_is_that_of_the_onset_classifier(host, fast_model, recording
     assert_same(run_host(host, fast_model, recording, "--decisions", "--threshold", 1e9), expected)
 
 
-def test_an_onset_hop_that_is_none_is_refused(host, fast_model, tmp_path):
-    mine = copied(fast_model, tmp_path)
-    told = json.loads(sidecar_of(mine).read_text()) | {"onset_hop_samples": 0}
-    sidecar_of(mine).write_text(json.dumps(told))
-    ran = run_host(host, mine, _recording(tmp_path))
-    assert ran.status == 1
-    assert "onset_hop_samples 0" in ran.stderr
-    assert len(ran.stderr.splitlines()) == 1
-
-
 @pytest.mark.slow
 def test_a_graph_in_double_precision_is_fed_in_it(host, tmp_path, tmp_path_factory):
     precise = hosts.exported(tmp_path_factory, "float64") / "stream.onnx"
@@ -381,49 +371,6 @@ int main(int count, char **words) {
 
 
 # Node ------------------------------------------------------------------------------------------
-
-PROGRAM = """
-import { readFileSync } from "node:fs";
-import { SlipStream } from "./stream.mjs";
-
-const volts = new Float64Array(JSON.parse(readFileSync(0)));
-const stream = await SlipStream.open(process.argv[1]);
-const width = stream.facts.channels.length;
-const whole = await stream.push(volts);
-await stream.reset();
-const cuts = [0, 1, 1, 250, 3397].map((rows) => rows * width);
-const pieces = cuts.map((cut, i) => stream.push(volts.subarray(cut, cuts[i + 1])));
-const cut = (await Promise.all(pieces)).flat();
-const refused = [];
-for (const wrong of [volts.subarray(1), [0, 1]]) {
-  await stream.push(wrong).catch((error) => refused.push(error.message));
-}
-await stream.reset();
-const after = await stream.push(volts);
-console.log(JSON.stringify({ whole, cut, after, refused }));
-"""
-
-
-def test_a_program_may_cut_and_begin_again_as_it_likes(model):
-    installed(EXPORT / "node")
-    volts = slipping_stream().astype(float)  # more than the graph is given at a time
-    told = subprocess.run(
-        ["node", "--input-type=module", "-e", PROGRAM, model],
-        input=json.dumps(volts.ravel().tolist()),
-        cwd=EXPORT / "node",
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    said = json.loads(told.stdout)
-    expected = truth(slipping_stream())
-    for decisions in (said["whole"], said["cut"], said["after"]):
-        for name in ("time_s", "valid", "alarm", "on"):
-            assert [each[name] for each in decisions] == [row[name] for row in expected]
-    rows, kind = said["refused"]
-    assert "24 channels (SG1 to PVDF10)" in rows
-    assert "Float32Array" in kind
-
 
 # Python ----------------------------------------------------------------------------------------
 

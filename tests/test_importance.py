@@ -20,7 +20,6 @@ from tactslip_torch.analysis.importance import (
     Ranking,
     Refit,
     balanced_accuracy,
-    best_first,
     count_right,
     difference,
     first_order,
@@ -147,15 +146,6 @@ def test_a_result_is_that_of_machines_fitted_without_each_group():
         assert torch.equal(result.counts[role].right, count_right(is_right, bins).right)
 
 
-def test_of_machines_that_are_all_right_the_one_of_smallest_error_is_taken():
-    refit = refit_of({0: 9.0})
-    each = {penalty: refit.held_out([0], [penalty]) for penalty in PENALTIES}
-    assert {result.accuracies[HELD_OUT] for result in each.values()} == {1.0}
-    best = min(each, key=lambda penalty: each[penalty].error)
-    assert best != PENALTIES[0]  # which the first of equal ones would be
-    assert refit([0]).penalty == best
-
-
 def test_bins_of_other_roles_choose_nothing():
     refit = refit_of({0: 0.8})
     spoilt = refit_of({0: 0.8})
@@ -186,21 +176,6 @@ def test_a_ranking_takes_the_largest_scores_of_the_channels_it_may():
     refit.train.features[:, 4] = 3 * refit.train.features[:, 5]
     assert ranking_of(refit, 2)("abc") == [4, 5]
     assert ranking_of(refit, 2, most_correlation=0.99)("abc") == [4, 3]  # passes over a repetition
-
-
-def test_the_best_few_begin_with_what_tells_most_and_end_with_all():
-    refit = refit_of({2: 1.5, 4: 0.9})
-    ranking = ranking_of(refit)
-    steps = best_first(refit, ranking, UNITS, 9, "")
-    assert [name for name, _ in steps] == ["b", "c", "a"]
-    assert [result.num_features for _, result in steps] == [2, 4, 6]
-    alone = {name: refit(ranking(channels)).merit for name, channels in UNITS.items()}
-    assert steps[0][1].merit == max(alone.values())
-    assert steps[-1][1].counts["test"].right.equal(refit(ranking("abc")).counts["test"].right)
-    assert len(best_first(refit, ranking, UNITS, 2, "")) == 2
-    allowed = torch.tensor([False] * 2 + [True] * 4)
-    steps = best_first(refit, ranking_of(refit, 6, allowed), UNITS, 9, "")
-    assert sorted(name for name, _ in steps) == ["b", "c"]  # no feature, no part
 
 
 # Gradients ---------------------------------------------------------------------------------------

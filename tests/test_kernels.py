@@ -46,16 +46,6 @@ def test_a_kernel_equals_the_oracle(kernel, rng):
     np.testing.assert_allclose(actual, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("kernel", KERNELS, ids=str)
-def test_manners(kernel, rng, device):
-    a = torch.from_numpy(rng.standard_normal((6, 7, 4))).to(device)
-    b = torch.from_numpy(rng.standard_normal((9, 4))).to(device)
-    oracles.assert_manners(lambda a: kernel(a, b.to(a)), a, num_axes=2)
-    batched = kernel(a, torch.stack([b + i for i in range(6)]))
-    for i in range(6):
-        torch.testing.assert_close(batched[i], kernel(a[i], b + i), rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_no_distance_is_negative(dtype, rng):
     """Squares and products of far bins cancel to less than nothing; the kernel is at most 1."""

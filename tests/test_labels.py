@@ -182,15 +182,6 @@ def test_windows_have_the_label_of_most_samples_or_of_the_last(assign, layout, h
         assert bool(((position >= 0) == bins.is_slip[own]).all())
 
 
-def test_a_window_that_is_half_slip_is_not_slip_by_majority_and_is_by_its_last_sample():
-    stretches = {"non_slip_s": ((0.0, 1.025),), "slip_s": ((1.025, 2.0),)}
-    for assign, at_edge in (("whole", []), ("majority", [False]), ("last", [True])):
-        bins = lay(LabelRule(assign=assign), (), (), 2.0, **stretches)
-        assert bins.is_slip[bins.starts == 2000].tolist() == at_edge
-    short = lay(LabelRule(assign="last"), (), (), 0.02, non_slip_s=((0.0, 0.02),))
-    assert len(short.starts) == 0  # shorter than a bin
-
-
 def test_bins_that_need_missing_samples_are_left_out():
     bins = lay(None, (), (), 3.0, non_slip_s=((0.0, 3.0),))
     gap = (1.0, 1.0 + 1 / RATE)

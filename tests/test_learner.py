@@ -7,7 +7,6 @@ import pytest
 import torch
 from small_set import RATE_HZ, SmallSet, small_maker, small_recipe
 
-from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import random_bins, seen6, unseen4
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.onset.events import LatencyParts
@@ -150,30 +149,6 @@ def test_metrics_count_every_bin_once_in_its_role(plain):
         assert [sum(rights[:20]), sum(rights[20:])] == [quiet_right, slip_right]
 
 
-def test_bins_of_no_stroke_have_no_position_but_a_scene():
-    class Handled(SmallSet):
-        """The second cycle of each material is another scene, with a stretch without slip."""
-
-        def __init__(self):
-            super().__init__()
-            kinds = ("paper", "tapped")
-            self.ids = tuple(
-                RecordingId(r.material, r.cycle, kinds[r.cycle == 1]) for r in self.ids
-            )
-
-        def timeline(self, recording):
-            stretch = ((0.0, 0.05),) if recording.scene == "tapped" else ()
-            return replace(super().timeline(recording), non_slip_s=stretch)
-
-    source = Handled()
-    scores = learn(source, unseen_c(source)).metrics["splits"]["unseen"]
-    counted = {scene: of["num_bins"] for scene, of in scores["per_scene"].items()}
-    assert counted == {"paper": 4 * 37, "tapped": 38}
-    for groups in ("per_speed", "per_position"):  # of the paper's scene alone
-        assert sum(of["num_bins"] for of in scores[groups].values()) == 4 * 37, groups
-    assert "0" not in scores["per_speed"]
-
-
 def test_events_are_of_the_detectors_own_decisions_and_the_exact_onset():
     class Apart(SmallSet):
         """A person marked the onset 20 ms late."""
@@ -198,14 +173,6 @@ def test_events_are_of_the_detectors_own_decisions_and_the_exact_onset():
         assert {part.bins.times.onsets_s for part in parts} == {(1.1,)}
         for found in learner.events[role]["first_transition"]:  # from 1.12 - 0.01 - 1 on
             assert found.quiet_s == pytest.approx(0.9 - 0.11 - latency.look_ahead_s)
-
-
-def test_the_solve_is_reported_with_its_condition(plain):
-    solve = plain.detector.info["solve"]
-    assert solve == plain.metadata["solve"]
-    assert solve["method"] == "cholesky"
-    assert 1 < solve["condition"] <= solve["condition_bound"]
-    assert solve["rank"] == solve["size"] <= plain.metadata["num_bins"]
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ from matplotlib.colors import to_hex
 
 from tactslip_torch.report.onset import (
     ALARM,
-    COLUMNS,
     REST,
     SLIP,
     DecisionCounts,
@@ -19,10 +18,7 @@ from tactslip_torch.report.onset import (
     Traces,
     alarm_outcome,
     onset_figure,
-    onset_rows,
-    onsets_summary,
     onsets_table,
-    onsets_title,
     view_of,
 )
 
@@ -273,14 +269,6 @@ def test_every_alarm_has_its_outcome():
     ]
 
 
-def test_rows_are_alarms_and_missed_onsets_in_order_of_time():
-    rows = onset_rows(content(entry(), entry("b.npy", truth=False)))
-    told = ["false", "found", "repeated", "early", "missed", "late"]
-    assert [row["outcome"] for row in rows] == [*told, *[None] * 5]
-    assert all(tuple(row) == COLUMNS for row in rows)
-    assert (rows[4]["true_onset_s"], rows[4]["alarm_s"]) == (5.0, None)
-
-
 def test_the_table_says_what_is_simulated_what_is_wrong_and_what_it_leaves_out():
     lines = onsets_table(content(entry())).splitlines()
     assert lines[0].startswith("SIMULATED")
@@ -292,28 +280,3 @@ def test_the_table_says_what_is_simulated_what_is_wrong_and_what_it_leaves_out()
     assert many[-1] == "and 80 more, see onsets.csv"
     assert "SIMULATED" not in many[0]
     assert onsets_table(content(simulated=False)) == "no alarm, and no slip missed"
-
-
-def test_summary_and_title_say_how_well_and_of_what():
-    said = onsets_summary(content(entry()), 0.5)
-    assert "5 alarms in 6.0 s of 1 recordings; took 0.5 s, 12 times real time" in said
-    assert "0.5 % of the decisions are not valid" in said
-    events = dict.fromkeys(("num_found", "num_early", "num_missed", "num_false_alarms"), 1)
-    events |= {"num_onsets": 3, "quiet_hours": 0.05, "delay_ms": {"median": {"value": 50.0}}}
-    events |= {"slid_mm": {"median": {"value": 1.52}}}
-    whole = entry(decisions={"number": 600, "invalid": 0})
-    said = onsets_summary(content(whole, events=events), 0.5)
-    assert "not valid" not in said
-    assert (
-        "of 3 slips 1 found, median delay 50.0 ms (1.5 mm slid), 1 early, 1 missed; "
-        "1 false alarms in 3.00" in said
-    )
-    none = {"delay_ms": None, "slid_mm": None}
-    late = onsets_summary(content(whole, events=events | none), 0.5)
-    assert "delay" not in late
-    assert onsets_title(entry(), of_simulated=True) == (
-        "SIMULATED recording a.npz, material M1, 5 alarms, 1 of 3 slips found, 1 false, "
-        "detector trained on simulated data"
-    )
-    real = entry("b.npy", truth=False, simulated=None, material=None)
-    assert onsets_title(real, of_simulated=False) == "Recording b.npy, 5 alarms"

@@ -361,30 +361,6 @@ def test_what_is_close_to_the_limits_is_timed(rng):
     assert len(set(compute)) == 10
 
 
-# Detectors of candidates -------------------------------------------------------------------------
-@pytest.mark.parametrize("degree", [1, 2])
-def test_a_machine_of_all_bins_is_that_of_all_bins_but_a_large_quadratic_one(searched, degree):
-    made, candidates = searched
-    chosen = only(candidates, "all", "all", "t", degree, 6)
-    detector = made.make(chosen, from_all=True)
-    assert detector.info["fitted_to"] == "all training bins"
-    maker = made.makers["centred"]
-    batches = [maker(recording, made.fold) for recording in made.fold.having("train")]
-    features = torch.cat([batch.features[:, list(chosen.selected)].double() for batch in batches])
-    z, is_slip = detector.scaler(features), torch.cat([batch.is_slip for batch in batches])
-    weights = (len(z) / (2 * torch.bincount(is_slip.long()).double()))[is_slip.long()]
-    kernel = Polynomial(degree, FREE_CONSTANT if degree == 1 else 0.5)
-    head = fit_machine(TrainingBins(z, is_slip, weights), chosen.penalty, kernel, route="dual")
-    torch.testing.assert_close(detector.head(z), head(z), rtol=1e-6, atol=1e-6)
-    made.most_summed = 3
-    try:
-        fitted_to = made.make(chosen, from_all=True).info["fitted_to"]
-    finally:
-        made.most_summed = 120
-    sampled = "40 training bins of each material and class"
-    assert fitted_to == (sampled if degree == 2 else "all training bins")
-
-
 # The command -------------------------------------------------------------------------------------
 TINY = (
     "data._target_=test_commands.TinyRecordings",

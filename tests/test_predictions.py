@@ -59,18 +59,6 @@ def unused_channel(detector):
 # NaN and Inf -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_healthy_bins_are_scored_as_ever(dtype, detector):
-    samples = noise(9).to(dtype)
-    found = detector.predict_raw(samples, nonfinite="raise")
-    assert found.score.dtype == dtype
-    assert torch.equal(found.score, detector.score_raw(samples))
-    assert found.is_valid.tolist() == [True] * 9
-    assert not found.is_missing.any()
-    bins = detector.channel_filter.valid(samples)
-    assert torch.equal(detector.predict(bins).score, detector(bins))
-
-
 @pytest.mark.parametrize("bad", BAD)
 def test_a_missing_channel_gets_its_imputation_values(bad, detector):
     """The score is that of features computed by hand, with the channel's own replaced."""

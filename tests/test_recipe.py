@@ -93,19 +93,6 @@ def test_ranking_is_by_the_t_statistic_and_the_scaler_has_the_range_of_all_bins(
     torch.testing.assert_close(found.first(2)(features), scaled[:, :2])
 
 
-def test_tails_are_compressed_and_clipped_on_request(rng):
-    parts = make_parts(rng)
-    parts[0][1][0, :5] = 1e6  # an outlier in one bin
-    found = selected(Recipe(num_features=3, compress=True, tail=0.05), parts)
-    features, scaler = together(parts)[0], found.scaler
-    chosen = features[:, list(found.selected)]
-    bent = chosen.sign() * (chosen.abs() / scaler.knee).log1p() * scaler.knee
-    share = (bent > scaler.maximum).double().mean(0)
-    assert ((share > 0.02) & (share <= 0.05)).all()
-    assert found(features).abs().amax() == 1
-    assert (scaler.maximum < 10).all()
-
-
 @pytest.mark.parametrize("balance", ["undersample", "weights"])
 def test_a_sample_stands_for_all_bins_with_both_classes_of_one_weight(balance, rng):
     recipe, parts = Recipe(sample_bins=7, balance=balance), make_parts(rng, share=0.8)
@@ -116,15 +103,6 @@ def test_a_sample_stands_for_all_bins_with_both_classes_of_one_weight(balance, r
     wanted = num_rest if balance == "undersample" else 120
     assert totals == pytest.approx([wanted, wanted], rel=1e-12)
     assert class_fractions(recipe, sample)[0] == 1.0  # non-slip is the smaller class
-
-
-def test_balanced_accuracy_by_hand():
-    truth = torch.tensor([False, False, True, True, True, True])
-    says = torch.tensor([False, True, True, True, True, False])
-    assert balanced_accuracy(says, truth) == pytest.approx((1 / 2 + 3 / 4) / 2)
-    weights = torch.tensor([3.0, 1.0, 1.0, 1.0, 1.0, 3.0], dtype=torch.float64)
-    assert balanced_accuracy(says, truth, weights) == pytest.approx((3 / 4 + 3 / 6) / 2)
-    assert balanced_accuracy(says[:2], truth[:2]) is None
 
 
 @pytest.mark.parametrize(
@@ -263,16 +241,6 @@ def test_neither_order_nor_sums_change_the_machine(bins, balance, rng):
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
     with pytest.raises(ValueError, match="already"):
         gathered.update(str(parts[0][0]), parts[0][1], parts[0][2])
-
-
-def test_undersampling_keeps_about_as_many_slips_as_non_slips(rng):
-    parts = make_parts(rng, cycles=8, share=0.8)
-    plan = planned(Recipe(**FEW), parts)
-    num_rest = int((~together(parts)[1]).sum())
-    kept = passed(plan, parts).stats.count.tolist()
-    assert kept[0] == num_rest
-    assert abs(kept[1] - num_rest) < 5 * num_rest**0.5
-    assert plan.num_bins == 2 * num_rest
 
 
 @pytest.mark.parametrize(

@@ -184,28 +184,6 @@ def test_published_numbers_agree_with_each_other():
         assert split.accuracy == pytest.approx(recalls @ [0.2466, 0.7534], abs=6e-4)
 
 
-def test_splits_stand_beside_baselines_and_the_papers_numbers():
-    metrics = metrics_of()
-    baseline = {"splits": {"unseen": metrics["splits"]["test"]}}
-    printed = splits_table(metrics | {"baselines": {"logistic_regression": baseline}})
-    assert printed.startswith("SIMULATED")
-    rows = rows_of(printed)
-
-    def cells(name):
-        keys = ("accuracy", "balanced_accuracy", "non_slip_recall", "slip_recall")
-        return [f"{100 * metrics['splits'][name][key]:.2f}" for key in keys]
-
-    at = [row[0] for row in rows].index("unseen")
-    assert rows[at] == ["unseen", *cells("unseen"), "500"]
-    assert rows[at + 1] == ["logistic regression, same features", *cells("test"), "-"]
-    assert rows[at + 2] == ["paper", "91.95", "86.05", "74.40", "97.70", "-"]
-    assert ["paper", "96.59", "-", "-", "-", "-"] in rows
-    alone = {"simulated": False, "splits": {"other": split_metrics([[0, 0], [1, 3]])}}
-    rows = rows_of(splits_table(alone))
-    assert rows[1] == ["other", "75.00", "-", "-", "75.00", "4"]
-    assert rows[2][0] == PAPER_LINE
-
-
 @pytest.mark.parametrize(
     ("scenes", "is_papers"), [(("paper",), True), (("taps",), False), (("paper", "taps"), False)]
 )

@@ -54,18 +54,6 @@ def test_bins_with_context_score_as_predict_raw_says(dtype, kind, align):
     assert not expected.is_valid.all()
 
 
-def test_chunks_and_layout_change_nothing():
-    detector, samples = small_detector(), signal(900)
-    samples[0, 400] = torch.inf
-    whole = score_stream(detector, samples, HOP)
-    before = samples.clone()
-    for chunk in (1, 7, 1024):
-        assert_scores(score_stream(detector, samples, HOP, chunk), whole)
-    assert_scores(score_stream(detector, samples.T.contiguous().T, HOP), whole)
-    assert torch.equal(samples, before)
-    assert not score_stream(detector, samples.requires_grad_(), HOP).score.requires_grad
-
-
 def test_a_nan_spoils_the_bins_that_its_frame_reaches():
     detector, samples = small_detector(), signal(600)
     samples[1, 300] = torch.nan

@@ -16,7 +16,6 @@ from scene_files import (
     scene_on,
 )
 
-from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.simulation import (
     SEEN_MATERIALS,
     UNSEEN_MATERIALS,
@@ -35,8 +34,7 @@ from tactslip_torch.simulation import (
     timeline,
 )
 from tactslip_torch.simulation._contact import draw_grasp
-from tactslip_torch.simulation._sensors import draw_front
-from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
+from tactslip_torch.simulation.extremes import extreme_bins
 from tactslip_torch.simulation.source import SimulatedRecordings
 
 SHORT = (Stroke(40.0, 20.0, 0.6), Stroke(60.0, 20.0, 0.4))
@@ -125,17 +123,6 @@ def test_truth_is_what_the_contact_does(name, material, model):
     assert_truth_is_the_contacts(short(name, material, model))
 
 
-def test_scenes_that_handle_the_hand_say_where_and_the_others_do_not():
-    truths = {name: timeline(scene_of(name, "M3")) for name in NAMES}
-    handled = {name for name, truth in truths.items() if truth.non_slip_s}
-    assert handled == {"arm_motion", "taps", "grips", "held", "knocked"}
-    for name in ("held", "knocked"):  # nothing slips in them, from end to end
-        truth = truths[name]
-        assert truth.onsets_s == truth.arm_s == truth.sliding_s == ()
-        assert truth.non_slip_s == ((0.0, truth.duration_s),)
-    assert truths["arm_motion"].onsets_s == truths["pulled"].arm_s == ()
-
-
 def test_a_recording_carries_truth_and_provenance_and_the_dtype_asked_for():
     scene = Scene("copper", seed=3, cycle=7, strokes=SHORT)
     truth, double = timeline(scene), simulate(scene, dtype=torch.float64)
@@ -187,19 +174,6 @@ def test_paper_scenes_are_the_protocol_and_take_flat_overrides():
 
 
 # --- sets ---------------------------------------------------------------------------------------
-
-
-def test_sessions_are_other_mountings_and_the_first_is_that_of_a_set_with_one():
-    kinds = {"cycles": 2, "materials": ["M1"], "extra_scenes": {"taps": {"cycles": 1}}}
-    one, three = SimulatedRecordings(**kinds), SimulatedRecordings(sessions=3, **kinds)
-    assert three.ids[: len(one.ids)] == one.ids
-    assert [three.key(r) for r in one.ids] == [one.key(r) for r in one.ids]
-    assert {r.session for r in three.ids} == {"", "2", "3"}
-    assert len(set(map(str, three.ids))) == 3 * len(one.ids)
-    ids = [RecordingId("M1", 0), *(RecordingId("M1", 0, kind, "2") for kind in ("paper", "taps"))]
-    first, *second = (draw_front(Scene.from_dict(three.key(one))).white_v for one in ids)
-    assert np.array_equal(*second)  # all kinds in one mounting
-    assert not np.isclose(first, second[0], rtol=1e-3).any()
 
 
 # --- what is refused ----------------------------------------------------------------------------
@@ -328,26 +302,3 @@ def test_what_cannot_be_is_refused_in_one_line(call, message):
 
 
 # --- generated extremes -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_extreme_bins_are_finite_of_their_dtype_and_the_seeds(dtype):
-    def made(kind, shape=(8, 3, 50)):
-        return extreme_bins(kind, shape, torch.Generator().manual_seed(5), dtype)
-
-    bins = {kind: made(kind) for kind in EXTREMES}
-    for kind, values in bins.items():
-        assert (values.shape, values.dtype) == ((8, 3, 50), dtype)
-        assert values.isfinite().all()
-        assert torch.equal(values, made(kind))
-    assert 0 < bins["denormal"].abs().median() < torch.finfo(dtype).tiny
-    assert bins["huge"].abs().max() > 1e30
-    assert ((bins["spike"] != 0).sum(-1) == 1).all()
-    assert ((bins["outlier"] == 5).sum(-1) == 1).all()
-    assert (bins["constant"].std(-1) < 1e-6).all()
-    assert len(bins["constant"].unique()) == 8 * 3
-    assert bins["rails"].unique().tolist() == [-5.0, 5.0]
-    assert bins["alternating"].sum(-1).abs().max() < 1e-5
-    if dtype == torch.float32:
-        assert (bins["huge"].square()).isinf().any()
-        assert (bins["offset 1e6, vibration 1e-6"] == 1e6).all()  # what float32 leaves of it

@@ -56,22 +56,6 @@ def test_arm_travels_its_distance_with_bounded_acceleration(speed, distance, acc
     np.testing.assert_allclose(stroke.travel_mm(stroke.time_of_travel_s(within)), within, rtol=1e-9)
 
 
-@pytest.mark.parametrize("material", SEEN_MATERIALS)
-def test_onset_comes_after_the_arm_and_by_the_presliding_travel(material):
-    for cycle in range(5):
-        scene = Scene(material, cycle=cycle)
-        truth, grasp, arm = timeline(scene), draw_grasp(scene), scene.arm
-        for stroke, onset_s, (start_s, end_s) in zip(
-            arm, truth.onsets_s, truth.sliding_s, strict=True
-        ):
-            assert stroke.start_s + 0.005 < onset_s == start_s < end_s < stroke.stop_s
-        fresh_mm = arm[0].travel_mm(np.array(truth.onsets_s[0]))
-        touching_mm = grasp.presliding_mm[grasp.touching]
-        assert touching_mm.min() * (1 - 1e-9) <= fresh_mm <= touching_mm.max() * (1 + 1e-9)
-        later_mm = arm[1].travel_mm(np.array(truth.onsets_s[1]))
-        assert later_mm < 0.65 * fresh_mm  # the pause left most of the shear
-
-
 def test_elements_let_go_one_after_the_other_each_after_its_own_travel():
     scene = Scene("M1", contact=Contact(presliding_mm=(0.1, 0.1)))  # at most 0.15 mm
     truth, grasp, arm = timeline(scene), draw_grasp(scene), scene.arm

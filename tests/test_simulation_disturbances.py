@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scene_files import (
     CALM,
-    CONTACTS,
     FINE,
     NAMES,
     RATE_HZ,
@@ -315,14 +314,6 @@ def test_a_grip_raises_the_sg_channels_stays_and_comes_back():
 
 
 # --- imperfections ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("model", ["kinematic", "one"])
-def test_no_imperfection_moves_the_truth(model):
-    strokes = (Stroke(40.0, 20.0, 0.6),)
-    hard = scene_of("hard", "M6", strokes=strokes, **CONTACTS[model])
-    assert all(value > 0 for value in vars(hard.imperfections).values())
-    assert timeline(hard) == timeline(replace(hard, imperfections=Imperfections()))
 
 
 def imperfect(material: str, **changes: float) -> np.ndarray:

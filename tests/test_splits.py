@@ -72,19 +72,6 @@ def test_unseen4_stratifies_by_material_and_gives_every_recording_one_role():
     assert not any(bool(mask.any()) for mask in masks.values())
 
 
-def test_the_draw_depends_on_the_seed_and_the_material_alone():
-    assert drawn(list(reversed(recordings())), seed=4).roles == drawn(seed=4).roles
-    assert drawn(seed=4).roles != drawn(seed=5).roles
-    for seen in (["M2"], ["M2", "M1"], ["M3", "M2"]):
-        assert of_role(drawn(seen=seen), "test", "M2") == of_role(drawn(), "test", "M2")
-    cycles = [sorted(r.cycle for r in of_role(drawn(), "test", m)) for m in SEEN]
-    assert cycles[0] != cycles[1] or cycles[1] != cycles[2]
-    # wear and session drift go with the cycle's number: the last six must not be the test
-    tests = [sorted(r.cycle for r in of_role(drawn(seed=s), "test", "M1")) for s in range(5)]
-    assert all(cycles not in (list(range(6)), list(range(22, 28))) for cycles in tests)
-    assert len({tuple(cycles) for cycles in tests}) == 5
-
-
 # Scenes --------------------------------------------------------------------------------------
 
 
@@ -165,29 +152,6 @@ def test_one_fold_for_every_material():
     mixed = recordings(["iron", "M2", "M1"])
     named = leave_one_material_out(mixed, materials=["iron", "M2", "M1"])
     assert leave_one_material_out(mixed, materials=None) == named
-
-
-def mounted(sessions=("", "2", "3"), materials=SEEN):
-    return recordings(materials, 10, sessions)
-
-
-def test_one_fold_for_every_session():
-    alone, *folds = leave_one_session_out(mounted(), seen=SEEN, first_alone=True)
-    assert folds == leave_one_session_out(mounted(), seen=SEEN)
-    assert [fold.name for fold in folds] == [f"without_session_{n}" for n in (1, 2, 3)]
-    for fold, left_out in zip(folds, ("", "2", "3"), strict=True):
-        assert of_role(fold, "unseen") == {r for r in mounted() if r.session == left_out}
-        assert {r.session for r in fold.having("train", "test")} == {"", "2", "3"} - {left_out}
-        assert len(fold.having("train")) == 2 * len(SEEN) * 8
-    assert alone.name == "session_1_alone"
-    assert {r.session for r in alone.having("train", "test")} == {""}
-    assert of_role(alone, "unseen") == {r for r in mounted() if r.session}
-    assert have_same_bins([alone, *folds])  # what is unseen in both is not summed
-    assert not have_same_bins(folds)
-    extra = [*mounted(("", "2")), *mounted(("2",), materials=["wood"])]
-    without_1, without_2 = leave_one_session_out(extra, seen=[*SEEN, "wood"])
-    assert {r.material for r in of_role(without_2, "unseen")} == set(SEEN)
-    assert {r.material for r in of_role(without_1, "train")} == {*SEEN, "wood"}
 
 
 # Folds together ------------------------------------------------------------------------------

@@ -101,20 +101,6 @@ def test_any_cut_gives_what_the_whole_recording_gives(
     assert_same(found, offline(detector, settings, samples))
 
 
-@pytest.mark.parametrize("kind", DETECTORS, ids="-".join)
-@pytest.mark.parametrize("hop", [20, 130])
-def test_a_decision_comes_with_the_last_sample_of_its_look_ahead(kind, hop):
-    detector = DETECTORS[kind]
-    stream = stream_of(detector, settings_of(hop=hop))
-    ahead = {"all": 25, "PVDF": 5}[kind[0]] if kind[1] == "centred" else 0
-    assert stream.look_ahead_s == ahead / RATE
-    for num, sample in enumerate(signal(500).T, 1):
-        found = stream.push(sample[None])
-        whole, rest = divmod(num - 100 - ahead, hop)
-        assert found.number.tolist() == ([whole] if whole >= 0 and rest == 0 else [])
-        assert found.available_s.tolist() == [num / RATE] * len(found.number)
-
-
 @pytest.mark.parametrize("start_s", [None, 7.0])
 def test_bins_shorter_than_a_frame_wait_for_the_first_frame(start_s):
     detector = copy.deepcopy(DETECTORS["all", "causal"])
@@ -204,7 +190,7 @@ def spoilt(kind, samples):
     return samples
 
 
-@pytest.mark.parametrize(("rule", "dtype"), zip(RULES, (torch.float32, torch.float64), strict=True))
+@pytest.mark.parametrize(("rule", "dtype"), [(RULES[0], torch.float32), (RULES[1], torch.float64)])
 @pytest.mark.parametrize(
     "kind",
     ["nan", "all nan", "now and then", "dead", "rail", "huge", "larger than float32", "denormal"],
@@ -257,16 +243,6 @@ def test_times_shift_what_comes_out_and_change_nothing_else(each, start_s):
     assert_same(found._replace(available_s=plain.available_s, onset_s=plain.onset_s), plain)
 
 
-@pytest.mark.parametrize("as_", [float, np.float64, torch.tensor, np.array])
-def test_a_time_may_come_in_any_form(as_):
-    stream = stream_of()
-    found = stream.push(
-        signal(200).T,
-        as_(2.0) if as_ is not torch.tensor else torch.tensor(2.0, dtype=torch.float64),
-    )
-    assert float(found.available_s[0]) == 2.0 + 125 / RATE
-
-
 @pytest.mark.parametrize("within", [False, True])
 def test_a_long_gap_ends_the_stream_and_begins_another(within, caplog):
     samples = signal(3000, 6)
@@ -299,14 +275,6 @@ def test_a_long_gap_ends_the_stream_and_begins_another(within, caplog):
         "the stream begins anew at 0.7005 s, behind a gap",
         "the stream begins anew at 3601.0505 s, behind a gap",
     ]
-
-
-def test_the_longest_gap_that_is_filled_can_be_set():
-    for max_gap_s, num_gaps in ((0.0, 1), (0.001, 0)):
-        stream = stream_of(max_gap_s=max_gap_s)
-        stream.push(signal(500).T, 0.0)
-        stream.push(signal(500).T, 502 / RATE)
-        assert stream.num_gaps == num_gaps
 
 
 @pytest.mark.parametrize(
