@@ -20,8 +20,8 @@ from torch import Tensor
 from benchmarks.harness import say, trained
 from benchmarks.selection import kept_selection
 from tactslip_torch import AlarmSettings, FeaturePool, HandLayout, SlipDetector
+from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.crossval import Materials
-from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split, seen6

@@ -36,7 +36,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from tactslip_torch import AlarmSettings, HandLayout, Scene, SlipDetector, StreamingDetector
-from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.onset.baselines import BaselineDetector
 from tactslip_torch.onset.decisions import Decider, Decisions, is_usable, score_stream

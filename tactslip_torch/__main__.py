@@ -30,19 +30,46 @@ def main() -> None:
     """
     given, *rest = sys.argv[1:] or ["--help"]
     if given in ("-h", "--help"):
-        print("usage: tactslip COMMAND [key=value ...]; tactslip COMMAND --help tells its keys\n")
+        print("usage: tactslip COMMAND [KEY=VALUE ...]\n")
         print("\n".join(f"  {name:22}{what}" for name, what in COMMANDS.items()))
+        print("\ntactslip COMMAND --help lists the keys of a command, with examples")
         return
     if given not in COMMANDS:
         near = get_close_matches(given, COMMANDS, 1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(COMMANDS)}"
-        print(f"error: no command {given!r}; {hint}", file=sys.stderr)
+        print(f"error: no command {given}; {hint}", file=sys.stderr)
         raise SystemExit(2)
-    sys.argv = [f"tactslip {given}", *rest]
-    # as __main__, so that Lightning finds what to start again in further processes
-    runpy.run_module(
-        f"tactslip_torch.commands.{given.replace('-', '_')}", run_name="__main__", alter_sys=True
-    )
+    run(given, rest)
+
+
+def run(command: str, arguments: list[str]) -> None:
+    """Carry out a command, or print its help, for which nothing heavy is imported.
+
+    Raises:
+        SystemExit: with another status than 0 if it failed.
+    """
+    from tactslip_torch.commands.configuration import conf_dir
+    from tactslip_torch.commands.stopping import stopping
+
+    name = {"data": "data_tool"}.get(command, command.replace("-", "_"))
+    is_ours = (conf_dir() / f"{name}.yaml").is_file()
+    with stopping():
+        if is_ours and {"-h", "--help"} & set(arguments):
+            from tactslip_torch.commands.configuration import Composed, help_text
+            from tactslip_torch.commands.mistakes import Mistake, checked
+
+            asked = [each for each in arguments if each not in ("-h", "--help")]
+            try:
+                _, composed = checked(command, name, asked)
+            except Mistake as mistake:
+                print(f"error: {mistake}", file=sys.stderr)
+                raise SystemExit(2) from None
+            print(help_text(command, COMMANDS[command], composed or Composed(name)))
+            return
+        sys.argv = [f"tactslip {command}", *arguments]
+        # as __main__, so that Lightning finds what to start again in further processes
+        module = f"tactslip_torch.commands.{command.replace('-', '_')}"
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 
 if __name__ == "__main__":

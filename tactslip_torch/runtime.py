@@ -5,14 +5,18 @@ from __future__ import annotations
 import errno
 import glob
 import hashlib
+import io
 import json
+import logging
 import math
 import multiprocessing
 import os
 import secrets
 import shutil
 import stat
+import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, wait
@@ -27,6 +31,8 @@ from tqdm.auto import tqdm
 
 __version__ = "0.1.0"
 PACKAGE = Path(__file__).resolve().parent
+
+log = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -362,6 +368,40 @@ def content_digest(*tensors: Tensor) -> str:
 
 
 LEAD = 31
+_EVERY_S = 10.0
+
+
+class Progress(tqdm):  # type: ignore[misc]
+    """A progress bar on a terminal or in a notebook; elsewhere a logged line every ten seconds.
+
+    What takes less than ten seconds leaves no line in a log.
+    """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        self._is_drawn = sys.stderr.isatty() or "ipykernel" in sys.modules
+        self._told = time.monotonic()
+        if not self._is_drawn:
+            options["file"] = io.StringIO()
+        super().__init__(*args, **options)
+
+    def display(self, *args: Any, **options: Any) -> Any:
+        """Draw the bar, or log it where the last line is ten seconds old."""
+        if self._is_drawn:
+            return super().display(*args, **options)
+        if time.monotonic() - self._told >= _EVERY_S:
+            self._told = time.monotonic()
+            told = self.format_dict
+            of = "" if told["total"] is None else f" of {told['total']}"
+            what = (self.desc or "").removesuffix(": ").strip()
+            left = (
+                ""
+                if not told["rate"] or told["total"] is None
+                else (f", {(told['total'] - told['n']) / told['rate']:.0f} s left")
+            )
+            log.info(
+                "%s: %s%s%s in %.0f s%s", what, told["n"], of, self.unit, told["elapsed"], left
+            )
+        return True
 
 
 def bar(
@@ -377,7 +417,7 @@ def bar(
         return items
     if total is None and isinstance(items, Sized):
         total = len(items)
-    shown: Iterable[Any] = tqdm(
+    shown: Iterable[Any] = Progress(
         items, desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", dynamic_ncols=True
     )
     return shown
@@ -394,7 +434,7 @@ class Ticker:
     """
 
     def __init__(self, what: str, unit: str, total: int, *, show: bool = True) -> None:
-        self._bar = tqdm(
+        self._bar = Progress(
             desc=f"{what:{LEAD}}",
             total=total,
             unit=f" {unit}",

@@ -2,8 +2,7 @@
 
 import sys
 
-from tactslip_torch.__main__ import main
+from tactslip_torch.__main__ import run
 
 if __name__ == "__main__":
-    sys.argv.insert(1, "train")
-    main()
+    run("train", sys.argv[1:])

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import yaml
 
-from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.simulation import Scene, paper_scenes, simulate, timeline
 from tactslip_torch.simulation._blocks import Grid
 from tactslip_torch.simulation._contact import ElementContact, draw_grasp, scene_contact

@@ -8,14 +8,10 @@ from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 from torch.utils.data import DataLoader
 
-from tactslip_torch.commands import entry
-from tactslip_torch.commands.entry import (
-    conf_dir,
-    entry_point,
-    errors_in_one_line,
-    one_line,
-    unknown_choice,
-)
+from tactslip_torch.commands import configuration
+from tactslip_torch.commands.configuration import conf_dir
+from tactslip_torch.commands.entry import entry_point, errors_in_one_line, one_line
+from tactslip_torch.commands.mistakes import unknown_choice
 
 # Where the configuration lives -----------------------------------------------------------------
 
@@ -23,7 +19,7 @@ from tactslip_torch.commands.entry import (
 def test_conf_inside_the_package_comes_first_and_none_is_an_error(monkeypatch, tmp_path, request):
     assert conf_dir() == request.config.rootpath / "conf"
     package = tmp_path / "site-packages" / "tactslip_torch"
-    monkeypatch.setattr(entry, "PACKAGE", package)
+    monkeypatch.setattr(configuration, "_PACKAGE", package)
     with pytest.raises(FileNotFoundError, match=r"no conf folder with train\.yaml.*reinstall"):
         conf_dir()
     for folder in (package.parent / "conf", package / "conf"):
@@ -39,8 +35,8 @@ def test_conf_inside_the_package_comes_first_and_none_is_an_error(monkeypatch, t
     ("arguments", "message"),
     [
         (["+exp=nope"], "unknown exp nope; known: biotacsp_dos, confound, deploy, hard, leav"),
-        (["seed=3", "split=seen7"], "unknown split seen7; known: confound, leave_one_material_out"),
-        (["labels=whole"], "unknown labels whole; known: half_second, whole_slide"),
+        (["seed=3", "split=seen7"], "unknown split seen7; known: seen6, unseen4, confound, "),
+        (["labels=whole"], "unknown labels whole; known: whole_slide, half_second"),
         (["data=real"], "unknown data real; known: authors_raw, biotacsp_dos, files"),
         (["-m", "split=seen6,seen7"], "unknown split seen7"),
         (["exp=unseen4"], "write +exp=unseen4"),

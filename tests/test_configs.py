@@ -8,7 +8,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
-from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.data.splits import ROLES
 from tactslip_torch.simulation.source import SimulatedRecordings
 from tactslip_torch.training.experiment import feature_maker

@@ -10,7 +10,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from small_set import RATE_HZ, SMALL_HAND, SmallTimeline
 
-from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import Recording, RecordingId

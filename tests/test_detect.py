@@ -13,8 +13,8 @@ from small_detector import HAND, small_detector
 
 from tactslip_torch import HandLayout, Recording
 from tactslip_torch.commands import detect as module
+from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.detect import detect, main
-from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.formats import FORMATS, Samples
 from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.calibration import Platt

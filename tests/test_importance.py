@@ -26,7 +26,7 @@ from tactslip_torch.analysis.importance import (
     score_gradients,
     without,
 )
-from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.importance import main, sensors
 from tactslip_torch.commands.train import train
 from tactslip_torch.features.bin_sample import BinSample

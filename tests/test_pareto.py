@@ -500,16 +500,6 @@ def test_none_that_meets_the_limits_is_said_plainly(monkeypatch, capsys, tmp_pat
     assert not list(tmp_path.glob("*.pt"))
 
 
-def test_ctrl_c_is_one_line_and_leaves_no_detector(monkeypatch, capsys, tmp_path):
-    def stopped(*args):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(command, "time_in_fresh_process", stopped)
-    status, line = fails(monkeypatch, capsys, tmp_path, *EASY, *FEW)
-    assert (status, line) == (130, "interrupted: no detector is written")
-    assert not list(tmp_path.glob("*.pt"))
-
-
 def test_what_is_missed_least_is_said():
     def row(worst_ms, compute_us, hop_ms):
         latency = Latency(worst_ms - 40 - hop_ms - compute_us / 1000, 40.0, hop_ms, compute_us)

@@ -19,7 +19,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from tactslip_torch.analysis.signal_checks import Signals, check_signals, filtered
-from tactslip_torch.commands.entry import conf_dir, entry_point, leave_results
+from tactslip_torch.commands.configuration import conf_dir
+from tactslip_torch.commands.entry import entry_point, leave_results
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.features.statistics import TrainingStatistics

@@ -266,7 +266,14 @@ def _origin(context: _DetectionContext) -> dict[str, Any]:
     return dict(plain(origin))
 
 
-main = entry_point("detect", detect)
+def _saved(config: DictConfig, folder: Path, again: str) -> str:
+    """What a stopped run leaves, and how to go on."""
+    path = folder / "onsets.json"
+    kept = f"{path} has the recordings that were done" if path.exists() else "none is done"
+    return f"{kept}; start again: {again}"
+
+
+main = entry_point("detect", detect, _saved)
 
 if __name__ == "__main__":
     main()

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
+import shlex
 import sys
-import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from itertools import pairwise
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -18,9 +18,17 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from tactslip_torch.runtime import PACKAGE, is_first_process, process_number, write_json
+from tactslip_torch.commands.configuration import conf_dir
+from tactslip_torch.commands.mistakes import Mistake, checked, folder_problem, with_lists
+from tactslip_torch.commands.stopping import Stopped, stopping
+from tactslip_torch.runtime import is_first_process, process_number, write_json
 
-CONF_HINT = "train.yaml"
+log = logging.getLogger(__name__)
+
+NOTHING_SAVED = "no result is written (features made so far stay in the cache); start it again"
+COMMAND_OF = {"data_tool": "data"}
+"""Commands whose file in ``conf`` has another name."""
+
 EXIT_BAD_INPUT = 2
 BAD_INPUT = (
     ValueError,
@@ -35,106 +43,60 @@ BAD_INPUT = (
 """What bad input raises, here or in the libraries that read it."""
 
 
-def conf_dir() -> Path:
-    """The ``conf`` folder: inside the package (wheel) or beside it (checkout, editable install).
-
-    Raises:
-        FileNotFoundError: if there is none.
-    """
-    for folder in (PACKAGE / "conf", PACKAGE.parent / "conf"):
-        if (folder / CONF_HINT).is_file():
-            return folder
-    raise FileNotFoundError(f"no conf folder with {CONF_HINT} in or beside {PACKAGE}; reinstall")
-
-
-def unknown_choice(arguments: Sequence[str]) -> str | None:
-    """One line about the first argument that names an option its config group does not have.
-
-    Example:
-        >>> unknown_choice(["+exp=unseen4", "seed=3"]) is None
-        True
-        >>> unknown_choice(["labels=quarter_second"])
-        'unknown labels quarter_second; known: half_second, whole_slide'
-    """
-    folders = [conf_dir(), *_further_folders(arguments)]
-    for argument in arguments:
-        key, found, value = argument.lstrip("+").partition("=")
-        groups = [folder / key for folder in folders]
-        if argument.startswith("-") or not found or not key or not groups[0].is_dir():
-            continue
-        known = sorted(path.stem for group in groups for path in group.glob("*.yaml"))
-        for name in value.split(","):
-            if name and name not in known:
-                return f"unknown {key} {name}; known: {', '.join(known)}"
-        if key == "exp" and not argument.startswith("+"):
-            return f"write +exp={value}: experiments are added to the configuration"
-    return None
-
-
-def _further_folders(arguments: Sequence[str]) -> list[Path]:
-    """Folders of configuration of the user's own, ``--config-dir``."""
-    given = [value for name, value in pairwise(arguments) if name in ("--config-dir", "-cd")]
-    given += [a.partition("=")[2] for a in arguments if a.startswith("--config-dir=")]
-    return [Path(value) for value in given]
-
-
-def folder_problem(arguments: Sequence[str], default: str = "outputs") -> str | None:
-    """One line about a results folder that cannot be made; Hydra alone would show a trace.
-
-    Args:
-        arguments: of the command line.
-        default: where results go if no argument says so; ``"."`` is not looked at.
-
-    Example:
-        >>> folder_problem(["hydra.run.dir=/dev/null/recordings"])
-        'cannot write to hydra.run.dir=/dev/null/recordings: Not a directory at /dev/null'
-    """
-    given = {key.lstrip("+"): value for key, _, value in (a.partition("=") for a in arguments)}
-    name = "hydra.sweep.dir" if {"-m", "--multirun"} & set(arguments) else "hydra.run.dir"
-    if (wanted := given.get(name, default)) == ".":
-        return None
-    folder = Path(wanted.strip("'\"")).absolute()
-    nearest = next(place for place in (folder, *folder.parents) if place.exists())
-    try:
-        with tempfile.TemporaryDirectory(dir=nearest):
-            return None
-    except OSError as error:
-        return f"cannot write to {name}={folder}: {error.strerror} at {nearest}"
-
-
 def entry_point(
-    name: str, run: Callable[[DictConfig, Path], Any], config_name: str | None = None
+    name: str,
+    run: Callable[[DictConfig, Path], Any],
+    saved: Callable[[DictConfig, Path, str], str] = lambda config, folder, again: NOTHING_SAVED,
 ) -> Callable[[], None]:
     """The command ``name`` as a function of the command line alone.
 
-    It refuses a choice or a folder that does not exist, composes the configuration, and calls
-    ``run`` with it and the folder for results. What bad input raises is printed in one line, and
-    the exit status is 2. Of the processes that torchrun starts, only the first gets a folder.
+    It refuses what is no configuration (``mistakes``) or no folder, composes the configuration,
+    and calls ``run`` with it and the folder for results. What bad input raises is printed in one
+    line, and the exit status is 2; where a signal stops it, what is saved and how to go on, and the
+    exit status is 130 (SIGINT) or 143 (SIGTERM). Of the processes that torchrun starts, only the
+    first gets a folder.
 
     Args:
-        name: of the module in ``commands``.
+        name: of the file in ``conf``, and of the module in ``commands``.
         run: does the work.
-        config_name: of the file in ``conf``, if that is another.
+        saved: what is there of a run that is stopped, and how to go on; given the configuration,
+            the folder and the command line.
     """
-    config_name = config_name or name
-
-    def composed(config: DictConfig) -> None:
-        with errors_in_one_line():
-            run(config, Path(HydraConfig.get().runtime.output_dir))
+    command = COMMAND_OF.get(name, name).replace("_", "-")
 
     def main() -> None:
-        arguments = sys.argv[1:]
-        own: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{config_name}.yaml"))
-        default = own["hydra"]["run"]["dir"].split("/")[0]
-        if problem := unknown_choice(arguments) or folder_problem(arguments, default):
-            fail(problem)
-        if "TORCHELASTIC_RUN_ID" in os.environ and not is_first_process():
-            sys.argv += ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
-        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(
-            composed
-        )()
+        with stopping(), errors_in_one_line():
+            arguments = sys.argv[1:]
+            known, composed = checked(command, name, arguments)
+            own: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{name}.yaml"))
+            default = own["hydra"]["run"]["dir"].split("/")[0]
+            if problem := folder_problem(arguments, default):
+                raise Mistake(problem)
 
-    composed.__module__ = f"{__package__}.{name}"  # Hydra names job and log file by it
+            def in_folder(config: DictConfig) -> None:
+                with _kept_in_log(), errors_in_one_line():
+                    if composed is not None:
+                        with_lists(config, composed)
+                    folder = Path(HydraConfig.get().runtime.output_dir)
+                    if (folder / "config.yaml").exists() and name != "generate":
+                        log.warning(
+                            "%s holds an earlier run; files of the same names are replaced", folder
+                        )
+                    try:
+                        run(config, folder)
+                    except Stopped as stop:
+                        again = shlex.join(["tactslip", command, *arguments])
+                        raise stop.saying(saved(config, folder, again)) from None
+
+            in_folder.__module__ = f"{__package__}.{name}"  # Hydra names job and log file by it
+            sys.argv[1:] = known
+            if "TORCHELASTIC_RUN_ID" in os.environ and not is_first_process():
+                nowhere = ["hydra.run.dir=.", "hydra.output_subdir=null"]
+                sys.argv[1:] = [*nowhere, "hydra/job_logging=stdout", *known]
+            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=name)(
+                in_folder
+            )()
+
     return main
 
 
@@ -149,6 +111,36 @@ def leave_results(
     write_json(folder / f"{name}.json", content)
     figure(content, folder / f"{name}.png")
     print("\n" + "\n\n".join([*texts, f"results in {folder}"]))
+
+
+@contextmanager
+def _kept_in_log() -> Iterator[None]:
+    """What is printed, but progress bars, stands in the log file of the run as well."""
+    handlers = HydraConfig.get().job_logging.get("handlers") or {}
+    if "file" not in handlers:
+        yield
+        return
+    with Path(handlers["file"]["filename"]).open("a", encoding="utf-8") as file:
+        out, err = _Copied(sys.stdout, file), _Copied(sys.stderr, file)
+        with redirect_stdout(out), redirect_stderr(err):
+            yield
+
+
+class _Copied:
+    """A stream whose whole lines are written to a file too."""
+
+    def __init__(self, stream: TextIO, file: TextIO) -> None:
+        self._stream, self._file, self._is_bar = stream, file, False
+
+    def write(self, text: str) -> int:
+        was_bar, self._is_bar = self._is_bar, "\r" in text
+        if not self._is_bar and not (was_bar and text == "\n"):
+            self._file.write(text)
+            self._file.flush()
+        return self._stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 @contextmanager

@@ -114,7 +114,13 @@ def _draw(
         signals_figure(rows, hand.to_rows(), files.folder / name, title=title, views=seen)
 
 
-main = entry_point("generate", generate)
+def _saved(config: DictConfig, folder: Path, again: str) -> str:
+    """What a stopped run leaves, and how to go on."""
+    place = "" if "hydra.run.dir=" in again else f" hydra.run.dir={folder}"
+    return f"the recordings in {folder} are whole; make the others: {again}{place}"
+
+
+main = entry_point("generate", generate, _saved)
 
 if __name__ == "__main__":
     main()

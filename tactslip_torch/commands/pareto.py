@@ -59,7 +59,6 @@ from tactslip_torch.training.experiment import (
 )
 
 _EXIT_NONE_MEETS = 1
-_EXIT_INTERRUPTED = 130
 _TIMES = ("p50_us", "p99_us", "p99_all_us", "interrupted")
 _VALIDATION = (
     "a material left out at a time, training recordings only; of pooled columns, compression, "
@@ -258,12 +257,8 @@ def _row(search: ParetoSearch, timed: Candidate, limits: Limits) -> dict[str, An
 
 
 def _pareto_or_exit(config: DictConfig, folder: Path) -> None:
-    """As a command: exit status 1 if no detector meets the limits, 130 if interrupted."""
-    try:
-        found = pareto(config, folder)
-    except KeyboardInterrupt:
-        print("interrupted: no detector is written", file=sys.stderr)
-        raise SystemExit(_EXIT_INTERRUPTED) from None
+    """As a command: exit status 1 if no detector meets the limits."""
+    found = pareto(config, folder)
     if found["chosen"] is None:
         print(none_meets(found), file=sys.stderr)
         raise SystemExit(_EXIT_NONE_MEETS)

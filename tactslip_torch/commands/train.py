@@ -263,6 +263,8 @@ def _run_fold(
     """
     trainer = make_trainer(config.trainer, folder, [_SaveAfterFirstPass(folder)])
     checkpoint = _checkpoint(config.ckpt_path, data.split)
+    if checkpoint is not None:
+        log.info("resumes %s: its first pass is not repeated", checkpoint)
     trainer.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     if learner.detector is None:
         raise ValueError(
@@ -403,7 +405,21 @@ def _checkpoint(given: str | None, fold: Split) -> Path | None:
     return path
 
 
-main = entry_point("train", train)
+def _saved(config: DictConfig, folder: Path, again: str) -> str:
+    """What a stopped run leaves, and how to go on."""
+    kept = sorted(folder.rglob("last.ckpt"))
+    if kept and not config.statistics and not config.tuning:
+        where = ", ".join(str(path) for path in kept)
+        return f"the first pass is saved in {where}; resume it: {again} ckpt_path={folder}"
+    made = (
+        "the features made so far are lost"
+        if config.cache in ("off", False)
+        else ("the features made so far are in the cache")
+    )
+    return f"no pass is finished, {made}; start again: {again}"
+
+
+main = entry_point("train", train, _saved)
 
 if __name__ == "__main__":
     main()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 import tempfile
 import warnings
 from collections import defaultdict
@@ -20,7 +19,6 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Checkpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
-from tqdm.auto import tqdm
 
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
@@ -36,7 +34,7 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.native import BackendName, backend_of
 from tactslip_torch.report.metrics import merged_answers, merged_metrics, summed_metrics
-from tactslip_torch.runtime import LEAD, __version__, whole_file
+from tactslip_torch.runtime import LEAD, Progress, __version__, whole_file
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.spectrum import SpectrumMethod
 from tactslip_torch.signals.wavelet import highest_level
@@ -208,12 +206,13 @@ class _RecordingProgressBar(TQDMProgressBar):
     """Lightning's bar, named after the pass that is running and counting recordings."""
 
     def __init__(self) -> None:
-        # a terminal is redrawn at every recording, a log file is not filled with bars
-        super().__init__(refresh_rate=1 if sys.stderr.isatty() else 50)
+        super().__init__(refresh_rate=1)
 
     def init_train_tqdm(self) -> Any:
         """The bar of both training passes, on standard error: standard output is for results."""
-        return tqdm(unit=" recording", dynamic_ncols=True, disable=self.is_disabled, smoothing=0)
+        return Progress(
+            unit=" recording", dynamic_ncols=True, disable=self.is_disabled, smoothing=0
+        )
 
     def init_test_tqdm(self) -> Any:
         """The bar of the test pass."""

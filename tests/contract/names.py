@@ -151,7 +151,6 @@ KEYS = {
     "workers": "num_workers",
 }
 """By the tests' word the key on the command line."""
-MISSPELT_KEY = "recipe.num_featurs"
 
 
 def settings(**given: object) -> list[str]:

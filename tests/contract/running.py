@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from .names import COMMANDS
+from .names import COMMANDS, PACKAGE
 
 ROOT = Path(__file__).parents[2]
 
@@ -93,8 +93,9 @@ def _serve() -> None:
 
     matplotlib.use("agg")
     torch.set_num_threads(1)
-    for arguments in COMMANDS.values():
-        importlib.import_module(arguments.removeprefix("-m ").split()[0])
+    importlib.import_module(PACKAGE).SlipDetector  # noqa: B018  # imports most of the package
+    for heavy in ("hydra", "lightning", "matplotlib.pyplot", "onnx", "onnxruntime", "scipy.signal"):
+        importlib.import_module(heavy)
     for line in sys.stdin:
         request = json.loads(line)
         pid = os.fork()

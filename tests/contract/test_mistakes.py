@@ -8,9 +8,7 @@ import pytest
 from .names import (
     ALARM_INFO,
     BAD_INPUT_STATUS,
-    COMMANDS,
     DETECTOR,
-    MISSPELT_KEY,
     TRACEBACK_VARIABLE,
     SlipDetector,
     settings,
@@ -153,17 +151,6 @@ def test_a_mistake_is_one_line_and_a_failing_exit(command, places, name, tmp_pat
     assert line.startswith("error: ")
     missing = [word for word in words.split() if word not in line]
     assert not missing, ran.err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("which", COMMANDS)
-def test_a_misspelt_key_is_refused_by_every_command(command, which, tmp_path):
-    """By Hydra's own message, in several lines, with the key in it."""
-    key = MISSPELT_KEY if which == "train" else "misspelt_key"
-    ran = command(tmp_path, which, f"{key}=1")
-    assert ran.status != 0
-    assert key.split(".")[-1] in ran.err
-    assert "Traceback" not in ran.err
 
 
 @pytest.mark.slow

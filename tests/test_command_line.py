@@ -1,0 +1,245 @@
+"""What a user types: help, and mistakes, each answered in one line.
+
+``python tests/test_command_line.py`` runs the mistakes and writes ``docs/troubleshooting.md``.
+"""
+
+import contextlib
+import importlib
+import io
+import os
+import shlex
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from tactslip_torch.__main__ import COMMANDS, main
+from tactslip_torch.commands.configuration import Composed, conf_dir, help_text
+from tactslip_torch.commands.mistakes import checked, with_lists
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "troubleshooting.md"
+MARKERS = "<!-- mistakes: written by tests/test_command_line.py -->", "<!-- end of mistakes -->"
+FILES = {name: "data_tool" if name == "data" else name.replace("-", "_") for name in COMMANDS}
+CONFIGURED = [name for name in COMMANDS if (conf_dir() / f"{FILES[name]}.yaml").is_file()]
+
+MISTAKES = {
+    # what is typed: words of the answer
+    "trian +exp=quick": "trian 'did you mean train?'",
+    "train sedd=1": "sedd 'did you mean seed?'",
+    "train +sedd=1": "sedd 'did you mean seed?'",
+    "train Seed=1": "Seed 'did you mean seed?'",
+    "train num_features=60": "num_features 'did you mean recipe.num_features?'",
+    "train recipe.num_featurs=60": "'did you mean recipe.num_features?'",
+    "train +recipe.num_featurs=60": "'did you mean recipe.num_features?'",
+    "train cycles=2": "'did you mean data.cycles?'",
+    "train learning_rate=0.1": "learning_rate 'tactslip train --help'",
+    "train +scene.frction_noise_mv=4": "'did you mean scene.friction_noise_mv?'",
+    "train +trainer.limit_train_batchs=2": "trainer.limit_train_batchs",
+    "train onset.budget.held=1": "onset=alarms",
+    "train data.root=recordings": "data=files",
+    "train seed 1": "'write seed=1'",
+    "train seed = 1": "'write seed=1'",
+    "train seed: 1": "'write seed=1'",
+    "train seed==1": "'write seed=1'",
+    "train --seed 1": "'write seed=1'",
+    "train --seed=1": "'write seed=1'",
+    "train +seed=1": "'write seed=1'",
+    "train ~sedd": "'did you mean seed?'",
+    "train quick": "+exp=quick",
+    "train exp=quick": "+exp=quick",
+    "train +exp quick": "+exp=quick",
+    "train +exp=quik": "'known: quick,'",
+    "train recipe=robst": "'known: robust,'",
+    "train split=unseen": "'known: unseen4,'",
+    "train data=webcam": "simulated",
+    "train data.materials=[M1, M6]": "\"'data.materials=[M1, M6]'\"",
+    "train data.materials=[M1,M6": "\"'data.materials=[M1,M6]'\"",
+    "train data.materials=M1,M6": "\"'data.materials=[M1,M6]'\" -m",
+    "train features.frames={SG: 51, PVDF: 11}": "\"'features.frames={SG: 51, PVDF: 11}'\"",
+    'train "name=\'my run"': "\"name='my run'\"",
+    "train 'features.frames={SG: 51, PVDF: 11}}'": "'} too many'",
+    "train 'seed=range(0,3)'": "-m",
+    "train seed=first": "seed first whole",
+    "train coverage=95": "coverage 0 1 95",
+    "train split.seen=M7": "M7 M1",
+    "train ckpt_path=nowhere": "nowhere",
+    "train hydra.run.dir=notes.txt/run": "hydra.run.dir notes.txt directory",
+    "train data=files": "data.root=",
+    "train data=files data.root=nowhere": "nowhere",
+    "train data=files data.root=recordings": "recordings manifest",
+    "evaluate": "model=",
+    "evaluate detector.pt": "'write model=detector.pt'",
+    "evaluate model=missing.pt": "missing.pt",
+    "evaluate model=notes.txt": "notes.txt",
+    "evaluate recipe=paper model=detector.pt": "'evaluate has no key recipe'",
+    "detect model=missing.pt input=recordings": "missing.pt",
+    "detect model=missing.pt imput=recordings": "'did you mean input?'",
+    "export model=missing.pt": "missing.pt",
+    "importance model=missing.pt": "missing.pt",
+    "data root=recordings": "action=",
+    "data action=chek root=recordings": "chek check",
+    "data action=check root=nowhere": "nowhere",
+    "generate materials=gold": "gold M1",
+    "generate format=docx": "docx npz",
+}
+
+
+def typed(line: str) -> list[str]:
+    """The words of a line, as a shell hands them on; brackets are no patterns here."""
+    return shlex.split(line)
+
+
+def answer(line: str) -> tuple[int, str]:
+    """Exit status, and what stands on standard error, of a line typed behind ``tactslip``."""
+    command, *rest = typed(line)
+    said, before = io.StringIO(), list(sys.argv)
+    sys.argv = ["tactslip", command, *rest]
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            if command in COMMANDS:
+                sys.argv = ["tactslip", *rest]
+                name = f"tactslip_torch.commands.{command.replace('-', '_')}"
+                importlib.import_module(name).main()
+            else:
+                main()
+    except SystemExit as end:
+        return int(end.code or 0), said.getvalue()
+    finally:
+        sys.argv = before
+    return 0, said.getvalue()
+
+
+@contextlib.contextmanager
+def in_a_folder():
+    """A working folder with what the mistakes are made on."""
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        (place / "recordings").mkdir()
+        (place / "recordings" / "cup1.csv").write_text("t,SG1\n0,1\n")
+        (place / "notes.txt").write_text("no detector")
+        os.chdir(place)
+        try:
+            yield place
+        finally:
+            os.chdir(before)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def working_folder():
+    with in_a_folder():
+        yield
+
+
+@pytest.mark.parametrize("line", MISTAKES)
+def test_a_mistake_is_answered_in_one_line(line):
+    status, said = answer(line)
+    assert (status, said.count("\n")) == (2, 1), said
+    assert said.startswith("error: ")
+    missing = [word for word in shlex.split(MISTAKES[line]) if word not in said]
+    assert not missing, said
+
+
+@pytest.mark.parametrize(
+    ("line", "key", "value"),
+    [
+        ("train split.seen=M1", "split.seen", ["M1"]),
+        ("train data=files data.root=x data.materials=cup", "data.materials", ["cup"]),
+        ("generate materials=M1", "materials", ["M1"]),
+        ("calibrate-simulator seeds=1001", "seeds", [1001]),
+        ("train recipe.use=pooled", "recipe.use", "pooled"),  # a text, or a list to choose from
+        ("train features.pooling=sorted", "features.pooling", "sorted"),
+        ("train recipe.num_features=60", "recipe.num_features", 60),
+    ],
+)
+def test_a_text_is_a_list_of_one_where_a_list_is_wanted(line, key, value):
+    command, *rest = typed(line)
+    _, composed = checked(command, FILES[command], rest)
+    with_lists(composed.config, composed)
+    found = composed.config
+    for part in key.split("."):
+        found = found[part]
+    assert found == value
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "train +scene.friction_noise_mv=4 +features.frames.film=11 +trainer.limit_train_batches=2",
+        "train extra_scenes=confound +extra_scenes.taps.machine_mv=3 extra_scenes.taps.cycles=1",
+        "train '+extra_scenes.mine={cycles: 3, taps_per_s: 1.0}'",
+        "train 'recipe.scene_weights={arm_motion: 1}' '~features.frames.PVDF'",
+        "train onset=alarms 'onset.budget={held: 2}' +onset.streams.extra_scenes.held.machine_mv=9",
+        "train data=files data.root=x 'data.streams={a: {kind: SG}}'",
+        "train -m +exp=quick,unseen4 'seed=range(0,3)' 'data.materials=[M1],[M2]'",
+        "data action=label_template root=a=b 'pattern={material}_{trial}'",
+        "crossval -m recipe@recipes.paper=robust,paper",
+    ],
+)
+def test_keys_that_something_takes_pass(line):
+    command, *rest = typed(line)
+    checked(command, FILES[command], rest)
+
+
+# Help --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", CONFIGURED)
+def test_every_key_and_group_is_described(command):
+    name = FILES[command]
+    composed = Composed(name)
+    assert composed.head
+    assert len(composed.examples) == 3
+    for example in composed.examples:
+        _, given, *rest = typed(example)
+        assert given == command
+        checked(command, name, rest)
+    assert [group.name for group in composed.groups if not group.description] == []
+    options = {g.name: g.options for g in composed.groups if g.name != "+exp"}
+    if command != "train":  # what is looked at there
+        options = {k: own for k, own in options.items() if k == "search"}
+    for n in range(max(map(len, options.values()), default=1)):
+        chosen = [f"{group}={own[n % len(own)]}" for group, own in options.items()]
+        keys = Composed(name, chosen).keys
+        assert [key.name for key in keys if not key.description] == [], chosen
+    text = help_text(command, COMMANDS[command], composed)
+    assert all(f"  {key.name}=" in text for key in composed.keys)
+
+
+@pytest.mark.parametrize("line", ["-m tactslip_torch train --help", "-m tactslip_torch.train -h"])
+def test_help_comes_without_torch(line):
+    code = (
+        "import runpy, sys; sys.argv = sys.argv[1:]; "
+        "runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True); "
+        "assert 'torch' not in sys.modules"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", code, *line.split()[1:]], capture_output=True, text=True, cwd=ROOT
+    )
+    assert (told.returncode, told.stderr) == (0, "")
+    assert "tactslip train +exp=quick" in told.stdout
+
+
+def test_the_page_has_every_mistake():
+    text = PAGE.read_text(encoding="utf-8")
+    assert [line for line in MISTAKES if f"`tactslip {line}`" not in text] == []
+
+
+def write_page() -> None:
+    """Run every mistake, and write the table between the markers of the page."""
+    rows = ["", "| typed | answer |", "|---|---|"]
+    with in_a_folder() as place:
+        for line in MISTAKES:
+            _, said = answer(line)
+            said = said.strip().replace(f"{place.resolve()}/", "").replace("|", "\\|")
+            rows.append(f"| `tactslip {line}` | `{said}` |")
+    text = PAGE.read_text(encoding="utf-8")
+    start, end = (text.index(marker) for marker in MARKERS)
+    PAGE.write_text(text[: start + len(MARKERS[0])] + "\n".join(rows) + "\n\n" + text[end:])
+
+
+if __name__ == "__main__":
+    write_page()
