@@ -249,7 +249,7 @@ def _machine() -> str:
     """Where process numbers mean the same: this boot, in this container; empty if not known."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_bytes()
-        return hashlib.sha256(boot + os.readlink("/proc/self/ns/pid").encode()).hexdigest()[:8]
+        return hashlib.sha256(boot + bytes(Path("/proc/self/ns/pid").readlink())).hexdigest()[:8]
     except OSError:
         return ""
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -123,7 +124,7 @@ def chosen_columns(
         time = _position(names, num_columns, how.time, "time")
     if how.channels is not None:
         return time, [_position(names, num_columns, one, "channels") for one in how.channels]
-    speed = speed_column(names, num_columns, how)
+    speed = None if how.speed is None else _position(names, num_columns, how.speed, "speed")
     beside = {time, speed, *others, *stamps, *(called if time is not None else ())}
     channels = [place for place in range(num_columns) if place not in beside]
     if not channels:
@@ -134,13 +135,36 @@ def chosen_columns(
     return time, channels
 
 
-def speed_column(names: Sequence[str] | None, num_columns: int, how: Reading) -> int | None:
-    """The place of the column of speed, if one is said.
+def opened_columns(
+    names: Sequence[str] | None,
+    num_columns: int,
+    how: Reading,
+    samples: Callable[[list[int]], Samples],
+    others: Iterable[int] = (),
+    units: Mapping[int, TimeUnit | None] = MappingProxyType({}),
+) -> Opened:
+    """A table as an open file: its channels, and the columns of times and of speed.
+
+    Args:
+        names: of all columns, if the file says.
+        num_columns: how many there are.
+        how: what a person says of the file.
+        samples: reads columns by their places.
+        others: columns that are no channels unless a person says so.
+        units: of columns that hold times by their type; ``None`` of one that has only empty cells.
 
     Raises:
-        Refused: if there is no such column.
+        Refused: as ``chosen_columns``.
     """
-    return None if how.speed is None else _position(names, num_columns, how.speed, "speed")
+    time, rows = chosen_columns(names, num_columns, how, others, tuple(units))
+    opened = Opened(samples(rows), names=None if names is None else tuple(names[r] for r in rows))
+    if how.speed is not None:
+        place = _position(names, num_columns, how.speed, "speed")
+        opened = opened._replace(speed=samples([place]))
+    if time is None:
+        return opened
+    unit = units.get(time, unit_of_time(names[time] if names else None, how))
+    return opened if unit is None else opened._replace(stamps=samples([time]), time_unit=unit)
 
 
 def _position(names: Sequence[str] | None, num_columns: int, wanted: str | int, what: str) -> int:
@@ -254,16 +278,12 @@ def _of_matrix(
     fitting = (labels for labels in matrix.labels if len(labels) == len(set(labels)) == count)
     labels = next(fitting, None)
     is_elsewhere = bool(times) and how.time != "auto"
-    time, rows = chosen_columns(labels, count, replace(how, time=None) if is_elsewhere else how)
-    used = None if rows == list(range(count)) else rows
-    names = None if labels is None else tuple(labels[row] for row in rows)
-    opened = Opened(Samples(path, matrix.values, axis, used), names=names)
-    if (speed := speed_column(labels, count, how)) is not None:
-        opened = opened._replace(speed=Samples(path, matrix.values, axis, [speed]))
-    if time is None:
-        return opened
-    unit = unit_of_time(labels[time] if labels else None, how)
-    return opened._replace(stamps=Samples(path, matrix.values, axis, [time]), time_unit=unit)
+    how = replace(how, time=None) if is_elsewhere else how
+
+    def samples(rows: list[int]) -> Samples:
+        return Samples(path, matrix.values, axis, None if rows == list(range(count)) else rows)
+
+    return opened_columns(labels, count, how, samples)
 
 
 def _time_axis(matrix: Array, lengths: set[int], how: Reading) -> int:

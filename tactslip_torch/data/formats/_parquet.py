@@ -13,12 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._choice import (
-    chosen_columns,
-    rate_in,
-    speed_column,
-    unit_of_time,
-)
+from tactslip_torch.data.formats._choice import opened_columns, rate_in
 from tactslip_torch.data.formats._reading import (
     MOST_CHANNELS,
     MOST_HEADER,
@@ -81,7 +76,7 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         raise Refused(f"has several columns of one name, or more than {MOST_CHANNELS}; rename them")
     check_plausible("its table", rows * len(names) * 8, path.stat().st_size, MOST_WHOLE)
     types = needs("pyarrow", "reading .parquet").types
-    stamps = [n for n, kind in enumerate(schema.types) if types.is_timestamp(kind)]
+    stamps = {n: kind.unit for n, kind in enumerate(schema.types) if types.is_timestamp(kind)}
     is_number = [types.is_floating(kind) or types.is_integer(kind) for kind in schema.types]
     refused = [n for n, good in enumerate(is_number) if not good and n not in stamps]
     own = header_in(metadata.get("header"))
@@ -91,26 +86,19 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         return opened_from(own, path, _columns(file, names[1:]))
     if len(refused) == len(names):
         raise Refused(f"holds no samples ({names[0]!r} holds {str(schema.types[0])[:40]!r})")
-    time, channels = chosen_columns(names, len(names), how, refused, stamps)
-    speed = speed_column(names, len(names), how)
-    for place in [*channels, *(place for place in (time, speed) if place is not None)]:
-        if place in refused:
-            raise Refused(f"holds {str(schema.types[place])[:40]!r} in column {names[place]!r}")
+
+    def samples(places: list[int]) -> Samples:
+        if wrong := [place for place in places if place in refused]:
+            kind = str(schema.types[wrong[0]])[:40]
+            raise Refused(f"holds {kind!r} in column {names[wrong[0]]!r}")
+        return Samples(path, _columns(file, [names[place] for place in places]))
+
     said: dict[str, float] = {}
     for name, text in metadata.items():
         with suppress(ValueError):
             said[name] = float(text)
-    opened = Opened(
-        Samples(path, _columns(file, [names[place] for place in channels])),
-        names=tuple(names[place] for place in channels),
-        sample_rate_hz=rate_in(said),
-    )
-    if speed is not None:
-        opened = opened._replace(speed=Samples(path, _columns(file, [names[speed]])))
-    if time is None:
-        return opened
-    unit = schema.types[time].unit if time in stamps else unit_of_time(names[time], how)
-    return opened._replace(stamps=Samples(path, _columns(file, [names[time]])), time_unit=unit)
+    opened = opened_columns(names, len(names), how, samples, refused, stamps)
+    return opened._replace(sample_rate_hz=rate_in(said))
 
 
 def _columns(file: Any, names: Sequence[str]) -> list[NDArray[Any]]:

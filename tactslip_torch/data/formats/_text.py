@@ -15,13 +15,14 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._choice import chosen_columns, speed_column, unit_of_time
+from tactslip_torch.data.formats._choice import opened_columns
 from tactslip_torch.data.formats._reading import (
     FORM,
     MOST_HEADER,
@@ -30,6 +31,7 @@ from tactslip_torch.data.formats._reading import (
     Refused,
     Samples,
     Spool,
+    TimeUnit,
     header_in,
     opened_from,
     shape_of,
@@ -120,14 +122,9 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         n for n, name in enumerate(names or ()) if name in ("", f"column {n}", f"Unnamed: {n}")
     ]
     counts = [n for n in numbers if is_count[n]]  # of the rows, which some libraries write first
-    time, columns = chosen_columns(names, layout.num_columns, how, counts)
-    chosen = tuple(names[column] for column in columns) if names is not None else None
-    opened = Opened(Samples(path, table, 0, columns), None, chosen)
-    if (speed := speed_column(names, layout.num_columns, how)) is not None:
-        opened = opened._replace(speed=Samples(path, table, 0, [speed]))
-    if time is not None and not (layout.is_time_empty and time == 0):
-        unit = unit_of_time(names[time] if names else None, how)
-        opened = opened._replace(stamps=Samples(path, table, 0, [time]), time_unit=unit)
+    columns = partial(Samples, path, table, 0)
+    empty: dict[int, TimeUnit | None] = {0: None} if layout.is_time_empty else {}
+    opened = opened_columns(names, layout.num_columns, how, columns, counts, empty)
     return opened._replace(sample_rate_hz=layout.sample_rate_hz)
 
 
