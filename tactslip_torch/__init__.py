@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tactslip_torch.model.moments import SufficientStats as SufficientStats
     from tactslip_torch.onset.decisions import AlarmSettings as AlarmSettings
     from tactslip_torch.onset.streaming import StreamingDetector as StreamingDetector
+    from tactslip_torch.pretrained import sample_recording as sample_recording
     from tactslip_torch.runtime import __version__ as __version__
     from tactslip_torch.simulation.scene import Scene as Scene
     from tactslip_torch.simulation.simulate import simulate as simulate
@@ -35,6 +36,7 @@ _MODULES = {
     "SufficientStats": "model.moments",
     "TactileFeatures": "estimators",
     "__version__": "runtime",
+    "sample_recording": "pretrained",
     "simulate": "simulation",
 }
 """Where each name is imported from when it is first asked for: ``--help`` needs no torch."""
@@ -53,6 +55,7 @@ __all__ = [
     "StreamingDetector",
     "SufficientStats",
     "TactileFeatures",
+    "sample_recording",
     "simulate",
 ]
 

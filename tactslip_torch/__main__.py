@@ -7,6 +7,7 @@ import sys
 from difflib import get_close_matches
 
 COMMANDS = {
+    "demo": "find the slip in a sample recording, draw it, export; nothing is needed",
     "train": "fit a detector, evaluate, save and export it",
     "evaluate": "evaluate a saved detector on recordings",
     "detect": "find slips in recordings",
@@ -19,6 +20,7 @@ COMMANDS = {
     "pareto": "the most accurate detector within a deadline",
     "certify": "what float32 does to a detector",
     "calibrate-simulator": "set the free parameters of the simulator",
+    "hosts": "copy a program that runs an exported detector: python, c, node or web",
 }
 
 

@@ -13,7 +13,10 @@ import yaml
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
-INGREDIENTS = ("hatch_build.py", "pyproject.toml", "README.md", "LICENSE", "conf", "tactslip_torch")
+INGREDIENTS = (
+    *("hatch_build.py", "pyproject.toml", "README.md", "LICENSE"),
+    *("conf", "export", "tactslip_torch"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +29,7 @@ def unpack(tmp_path_factory, variables):
     copy = tmp_path_factory.mktemp("copy")
     for name in INGREDIENTS:
         if (ROOT / name).is_dir():
-            ignore = shutil.ignore_patterns("__pycache__", "library.*")
+            ignore = shutil.ignore_patterns("__pycache__", "library.*", "node_modules")
             shutil.copytree(ROOT / name, copy / name, ignore=ignore)
         else:
             shutil.copy(ROOT / name, copy / name)
@@ -59,6 +62,7 @@ def test_the_wheel_holds_the_package_and_its_configuration(unpacked):
     held = {p.relative_to(package / "conf") for p in (package / "conf").rglob("*.yaml")}
     assert held == {p.relative_to(ROOT / "conf") for p in (ROOT / "conf").rglob("*.yaml")}
     code = {p.relative_to(package) for p in package.rglob("*.py")}
+    code = {path for path in code if path.parts[0] != "export"}
     ours = ROOT / "tactslip_torch"
     assert code == {p.relative_to(ours) for p in ours.rglob("*.py")}
 

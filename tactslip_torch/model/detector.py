@@ -42,7 +42,7 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName, Filters, Machine, Scores, backend_of
 from tactslip_torch.own_files import DETECTOR as FORMAT
 from tactslip_torch.own_files import FORGED, load_table, save_table
-from tactslip_torch.runtime import are_unchanged, stamps_of
+from tactslip_torch.runtime import PACKAGE, are_unchanged, stamps_of
 from tactslip_torch.signals.filtering import ChannelFilter
 
 MOST_BYTES = 2**30
@@ -122,11 +122,12 @@ class SlipDetector(nn.Module):
         pool, info, degree = self.pool, self.info, "kernel"
         if isinstance(self.head, QuadraticForm):
             degree = "linear" if self.head.is_linear else "quadratic"
-        simulated = info.get("simulated")
+        simulated, name = info.get("simulated"), info.get("name", "")
+        name = name and f"{name}: "
         origin = f", trained on {'simulated' if simulated else 'real'} recordings"
         said = "has an alarm" if "alarm" in info else "no alarm set"
         return (
-            f"SlipDetector({len(pool.hand)} channels, bins of {pool.bin_samples} samples at "
+            f"SlipDetector({name}{len(pool.hand)} channels, bins of {pool.bin_samples} samples at "
             f"{pool.sample_rate_hz:g} Hz, {len(self.selected_names)} columns, {degree} machine"
             f"{origin * (simulated is not None)}, {said}, {self.extractor.backend} backend)"
         )
@@ -492,6 +493,22 @@ class SlipDetector(nn.Module):
         except FORGED as error:
             reason = str(error).splitlines()[0]
             raise ValueError(f"{name} is damaged: {reason}") from error
+
+    @classmethod
+    def pretrained(cls, name: str = "paper24-sim", backend: BackendName = "auto") -> SlipDetector:
+        """A detector that comes with the package, its alarm set.
+
+        ``"paper24-sim"`` is of the paper's hand (``HandLayout.paper24``), trained on simulated
+        recordings of it alone: to try things, not for a hand. ``info`` tells what its test found.
+
+        Raises:
+            ValueError: if there is none of that name.
+        """
+        folder = PACKAGE / "pretrained"
+        known = sorted(path.stem for path in folder.glob("*.pt"))
+        if name not in known:
+            raise ValueError(f"no pretrained detector {name!r}; there is {', '.join(known)}")
+        return cls.load(folder / f"{name}.pt", backend)
 
     @classmethod
     def _from_table(

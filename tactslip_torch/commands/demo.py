@@ -1,0 +1,87 @@
+"""The detector that comes with the package, on its sample recording: ``tactslip demo``."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+
+import numpy as np
+import yaml
+from omegaconf import OmegaConf
+
+from tactslip_torch.commands.detect import detect
+from tactslip_torch.commands.entry import conf_dir, errors_in_one_line
+from tactslip_torch.commands.hosts import copy_host
+from tactslip_torch.deploy.export import export_detector
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.pretrained import NAME, RECORDING, sample_recording
+from tactslip_torch.runtime import whole_file
+
+
+def demo(folder: Path) -> None:
+    """Find the slip of the sample recording, draw it, export the detector, copy the page.
+
+    Args:
+        folder: for ``detector.pt``, ``recording.npz``, the results of ``detect``, both ONNX files
+            and the page.
+
+    Raises:
+        FileExistsError: if the folder is there and not empty.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise FileExistsError(f"{folder} is there and not empty; give another one, --out DIR")
+    detector, recording = SlipDetector.pretrained(NAME), sample_recording()
+    folder.mkdir(parents=True, exist_ok=True)
+    model, place = folder / "detector.pt", folder / "recording.npz"
+    detector.save(model)
+    shutil.copyfile(RECORDING, place)
+    plain = yaml.safe_load((conf_dir() / "detect.yaml").read_text(encoding="utf-8"))
+    for name in ("hydra", "defaults"):
+        del plain[name]
+    config = OmegaConf.create(plain | {"model": str(model), "input": str(place)})
+    (found,) = detect(config, folder)["recordings"]
+    export_detector(detector, folder, source=model)
+    with whole_file(folder / "recording.npy") as temporary:
+        np.save(temporary, recording.samples.T.contiguous().numpy())
+    page = copy_host("web", folder)
+    (onset_s,) = recording.onsets_s
+    alarms = [alarm for alarm in found["alarms"] if alarm["alarm_s"] >= onset_s]
+    if alarms:
+        alarm_s, at_s = alarms[0]["alarm_s"], alarms[0]["onset_s"]
+        print(
+            f"\nThe slip began at {onset_s:.3f} s. The detector raised its alarm at {alarm_s:.3f} s"
+            f", {1e3 * (alarm_s - onset_s):.0f} ms later, and puts the onset at {at_s:.3f} s."
+        )
+    else:
+        print(f"\nThe slip began at {onset_s:.3f} s. The detector raised no alarm.")
+    print(
+        f"Detector and recording are simulated.\n\n"
+        f"picture       {folder / 'recording_onsets.png'}\n"
+        f"ONNX files    {folder / 'model.onnx'}, {folder / 'stream.onnx'}\n"
+        f"page          needs Node 18 or later and, once, the internet:\n"
+        f"              cd {page} && npm ci && node serve.mjs --model ../stream.onnx "
+        f"--recording ../recording.npy --simulated\n"
+        f"              then open the address it prints"
+    )
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(
+        prog="tactslip demo",
+        description="Find the slip in the sample recording that comes with the package, draw it, "
+        "and write the detector as ONNX with a page for the browser. All of it is simulated.",
+        epilog="example: tactslip demo --out first",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("tactslip-demo"), metavar="DIR",
+        help="a new folder for what is written (default: %(default)s)",
+    )  # fmt: skip
+    given = parser.parse_args()
+    with errors_in_one_line():
+        demo(given.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Programs that run an exported detector without Python: ``tactslip hosts NAME FOLDER``."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+
+from tactslip_torch.commands.entry import errors_in_one_line
+from tactslip_torch.runtime import PACKAGE
+
+NEEDED = {"web": ("web", "node")}
+"""Hosts of several folders: the page shares the reader and the stream of ``node``."""
+_LEFT = shutil.ignore_patterns("node_modules", "__pycache__", "*.o")
+
+
+def hosts_dir() -> Path:
+    """The ``export`` folder: inside the package (wheel) or beside it (checkout).
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
+    for folder in (PACKAGE / "export", PACKAGE.parent / "export"):
+        if (folder / "README.md").is_file():
+            return folder
+    raise FileNotFoundError(f"no export folder in or beside {PACKAGE}; reinstall")
+
+
+def host_names() -> list[str]:
+    """The hosts there are."""
+    return sorted(path.name for path in hosts_dir().iterdir() if (path / "README.md").is_file())
+
+
+def copy_host(name: str, folder: Path) -> Path:
+    """Copy a host program, with what it shares with others, into a folder.
+
+    Returns:
+        Its own folder, ``folder / name``.
+
+    Raises:
+        ValueError: if there is no such host.
+        FileExistsError: if there is something in its place.
+    """
+    if name not in host_names():
+        raise ValueError(f"no host {name!r}; there are {', '.join(host_names())}")
+    parts = NEEDED.get(name, (name,))
+    for part in parts:
+        if (folder / part).exists():
+            raise FileExistsError(f"{folder / part} is there already; give another folder")
+    for part in parts:
+        shutil.copytree(hosts_dir() / part, folder / part, ignore=_LEFT)
+    return folder / name
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(
+        prog="tactslip hosts",
+        description="Copy a program that runs an exported detector (model.onnx, stream.onnx).",
+        epilog="example: tactslip hosts c slip-in-c",
+    )
+    parser.add_argument("name", help=f"one of {', '.join(host_names())}")
+    parser.add_argument("folder", type=Path, help="where its folder is put")
+    given = parser.parse_args()
+    with errors_in_one_line():
+        copied = copy_host(given.name, given.folder)
+        print(f"{copied}\nhow to build and run it: {copied / 'README.md'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""What comes with the package: a detector, a recording, the demo, the hosts."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from tactslip_torch import SlipDetector, StreamingDetector, sample_recording, simulate
+from tactslip_torch.commands import demo, hosts
+from tactslip_torch.pretrained.make import SCENE
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(monkeypatch: pytest.MonkeyPatch, command: object, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["tactslip", *arguments])
+    command.main()  # type: ignore[attr-defined]
+
+
+def test_the_recording_is_what_its_script_makes_and_the_detector_finds_its_slip() -> None:
+    recording, made = sample_recording(), simulate(SCENE)
+    torch.testing.assert_close(recording.samples, made.samples)
+    assert recording.onsets_s == made.onsets_s
+    detector = SlipDetector.pretrained("paper24-sim")
+    assert "paper24-sim: 24 channels" in repr(detector)
+    assert "simulated" in repr(detector)
+    assert recording.material not in detector.info["train_materials"]
+    stream = StreamingDetector(detector)
+    (alarm,) = (*stream.push(recording.samples.T).alarms, *stream.flush().alarms)
+    assert 0 < alarm.alarm_s - recording.onsets_s[0] < 0.2
+    with pytest.raises(ValueError, match="no pretrained detector 'hand'; there is paper24-sim"):
+        SlipDetector.pretrained("hand")
+
+
+@pytest.mark.onnx
+def test_the_demo_says_when_the_slip_began_and_leaves_all_it_names(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "demo"
+    run(monkeypatch, demo, "--out", str(out))
+    printed = capsys.readouterr().out
+    (found,) = json.loads((out / "onsets.json").read_text())["recordings"]
+    (onset_s,) = sample_recording().onsets_s
+    assert f"The slip began at {onset_s:.3f} s" in printed
+    assert f"alarm at {found['alarms'][0]['alarm_s']:.3f} s" in printed
+    assert "simulated" in printed
+    files = (
+        "recording_onsets.png model.onnx stream.onnx.json recording.npy web/page.mjs node/npy.mjs"
+    )
+    assert all((out / name).is_file() for name in files.split())
+    with pytest.raises(SystemExit) as refused:
+        run(monkeypatch, demo, "--out", str(out))
+    assert refused.value.code == 2
+    assert "is there and not empty; give another one, --out DIR" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["c", "node", "python", "web"])
+def test_hosts_are_copied_whole(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    run(monkeypatch, hosts, name, str(tmp_path))
+    assert str(tmp_path / name / "README.md") in capsys.readouterr().out
+    for path in (ROOT / "export" / name).glob("*.*"):
+        if path.is_file():
+            assert (tmp_path / name / path.name).read_bytes() == path.read_bytes()
+    for wrong, words in ((name, "is there already"), ("rust", "no host 'rust'; there are c, node")):
+        with pytest.raises(SystemExit) as refused:
+            run(monkeypatch, hosts, wrong, str(tmp_path))
+        assert refused.value.code == 2
+        assert words in capsys.readouterr().err
