@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import yaml
 from omegaconf import OmegaConf
 
 from tactslip_torch.commands.detect import detect
@@ -36,7 +36,7 @@ def demo(folder: Path) -> None:
     model, place = folder / "detector.pt", folder / "recording.npz"
     detector.save(model)
     shutil.copyfile(RECORDING, place)
-    plain = yaml.safe_load((conf_dir() / "detect.yaml").read_text(encoding="utf-8"))
+    plain: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "detect.yaml"))
     for name in ("hydra", "defaults"):
         del plain[name]
     config = OmegaConf.create(plain | {"model": str(model), "input": str(place)})
