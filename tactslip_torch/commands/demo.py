@@ -7,17 +7,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from omegaconf import OmegaConf
-
-from tactslip_torch.commands.detect import detect
-from tactslip_torch.commands.entry import conf_dir, errors_in_one_line
-from tactslip_torch.commands.hosts import copy_host
-from tactslip_torch.deploy.export import export_detector
-from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.pretrained import NAME, RECORDING, sample_recording
-from tactslip_torch.runtime import whole_file
-
 
 def demo(folder: Path) -> None:
     """Find the slip of the sample recording, draw it, export the detector, copy the page.
@@ -31,6 +20,17 @@ def demo(folder: Path) -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} is there and not empty; give another one, --out DIR")
+    import numpy as np  # here and below what --help has no need of
+    from omegaconf import OmegaConf
+
+    from tactslip_torch.commands.configuration import conf_dir
+    from tactslip_torch.commands.detect import detect
+    from tactslip_torch.commands.hosts import copy_host
+    from tactslip_torch.deploy.export import export_detector
+    from tactslip_torch.model.detector import SlipDetector
+    from tactslip_torch.pretrained import NAME, RECORDING, sample_recording
+    from tactslip_torch.runtime import whole_file
+
     detector, recording = SlipDetector.pretrained(NAME), sample_recording()
     folder.mkdir(parents=True, exist_ok=True)
     model, place = folder / "detector.pt", folder / "recording.npz"
@@ -79,6 +79,8 @@ def main() -> None:
         help="a new folder for what is written (default: %(default)s)",
     )  # fmt: skip
     given = parser.parse_args()
+    from tactslip_torch.commands.entry import errors_in_one_line
+
     with errors_in_one_line():
         demo(given.out)
 

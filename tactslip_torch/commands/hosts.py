@@ -6,8 +6,7 @@ import argparse
 import shutil
 from pathlib import Path
 
-from tactslip_torch.commands.entry import errors_in_one_line
-from tactslip_torch.runtime import PACKAGE
+_PACKAGE = Path(__file__).resolve().parents[1]  # runtime, which knows it too, imports torch
 
 NEEDED = {"web": ("web", "node")}
 """Hosts of several folders: the page shares the reader and the stream of ``node``."""
@@ -20,10 +19,10 @@ def hosts_dir() -> Path:
     Raises:
         FileNotFoundError: if there is none.
     """
-    for folder in (PACKAGE / "export", PACKAGE.parent / "export"):
+    for folder in (_PACKAGE / "export", _PACKAGE.parent / "export"):
         if (folder / "README.md").is_file():
             return folder
-    raise FileNotFoundError(f"no export folder in or beside {PACKAGE}; reinstall")
+    raise FileNotFoundError(f"no export folder in or beside {_PACKAGE}; reinstall")
 
 
 def host_names() -> list[str]:
@@ -62,6 +61,8 @@ def main() -> None:
     parser.add_argument("name", help=f"one of {', '.join(host_names())}")
     parser.add_argument("folder", type=Path, help="where its folder is put")
     given = parser.parse_args()
+    from tactslip_torch.commands.entry import errors_in_one_line  # of no need for --help
+
     with errors_in_one_line():
         copied = copy_host(given.name, given.folder)
         print(f"{copied}\nhow to build and run it: {copied / 'README.md'}")
