@@ -265,11 +265,11 @@ class Refit:
         return scaled.masked_fill(torch.tensor(single), 0.0)
 
 
-def units_of(hand: HandLayout) -> dict[str, dict[str, frozenset[str]]]:
+def _units_of(hand: HandLayout) -> dict[str, dict[str, frozenset[str]]]:
     """What is taken or left out together: the channels of a hand one by one, by finger, by kind.
 
     Example:
-        >>> units = units_of(HandLayout.paper24())
+        >>> units = _units_of(HandLayout.paper24())
         >>> sorted(units["finger"]["thumb"]), len(units["kind"]["SG"])
         (['PVDF10', 'PVDF9', 'SG13', 'SG14'], 14)
     """
@@ -479,7 +479,7 @@ def measure(
 
     rows: list[dict[str, Any]] = []
     best: dict[str, list[dict[str, Any]]] = {}
-    for unit, members in units_of(hand).items():
+    for unit, members in _units_of(hand).items():
         for name, channels in bar(list(members.items()), f"without each {unit}"):
             choices = [
                 without(selected, channels, ranking.channels),

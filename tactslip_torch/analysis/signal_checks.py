@@ -111,13 +111,13 @@ def rms(samples: Array) -> Array:
 # --- statistics: recordings of one material -> number -------------------------------------------
 
 
-def sg_offset_spread(seen: Sequence[Signals]) -> float:
+def _sg_offset_spread(seen: Sequence[Signals]) -> float:
     """Spread of the SGs' levels before the first onset, over how much one SG varies there."""
     rests = [s.rest(s.sg) for s in seen]
     return float(np.median([np.std(rest.mean(-1)) / np.median(rms(rest)) for rest in rests]))
 
 
-def sg_rise_v(seen: Sequence[Signals]) -> float:
+def _sg_rise_v(seen: Sequence[Signals]) -> float:
     """How much the SGs' mean level rises from before the first onset to its slide."""
     return float(
         np.mean([(s.slide(s.sg, 0).mean(-1) - s.rest(s.sg).mean(-1)).mean() for s in seen])
@@ -130,7 +130,7 @@ def sg_variation(seen: Sequence[Signals]) -> float:
     return float(np.median(np.concatenate(ratio)))
 
 
-def pvdf_onset_burst(seen: Sequence[Signals]) -> float:
+def _pvdf_onset_burst(seen: Sequence[Signals]) -> float:
     """PVDF vibration in the 60 ms around an onset over that later in the slide."""
     ratio = [
         rms(s.part(s.pvdf, onset_s - 0.02, onset_s + 0.04)) / rms(s.slide(s.pvdf, stroke))
@@ -152,7 +152,7 @@ def pvdf_speed_growth(seen: Sequence[Signals]) -> float:
     return float(min(np.median(level[1] / level[0]), np.median(level[2] / level[1])))
 
 
-def num_barely_responding(seen: Sequence[Signals]) -> float:
+def _num_barely_responding(seen: Sequence[Signals]) -> float:
     """PVDF channels a recording in which the onset is hardly visible."""
     ratio = [
         rms(s.part(s.pvdf, s.onsets_s[1] - 0.05, s.onsets_s[1] + 0.1)) / rms(s.rest(s.pvdf, 1))
@@ -161,7 +161,7 @@ def num_barely_responding(seen: Sequence[Signals]) -> float:
     return float(np.mean([np.sum(r < 4.0) for r in ratio]))
 
 
-def d1_fraction(seen: Sequence[Signals]) -> float:
+def _d1_fraction(seen: Sequence[Signals]) -> float:
     """Power of the branch D1 over the vibration's, while sliding."""
     shares = []
     for s in seen:
@@ -219,20 +219,20 @@ class SignalCheck:
 
 
 SIGNAL_CHECKS = (
-    SignalCheck("sg_offset", "SGs stand at offsets before onset", sg_offset_spread, ALL, 30.0),
-    SignalCheck("sg_rise", "SG levels rise with sliding", sg_rise_v, ALL, 0.02, 1.0),
+    SignalCheck("sg_offset", "SGs stand at offsets before onset", _sg_offset_spread, ALL, 30.0),
+    SignalCheck("sg_rise", "SG levels rise with sliding", _sg_rise_v, ALL, 0.02, 1.0),
     SignalCheck("sg_variation", "SGs vary more in sliding than at rest", sg_variation, ALL, 1.3),
     SignalCheck(
         "pvdf_abrupt",
         "PVDF is abrupt at onset, then quiet for M2 to M5",
-        pvdf_onset_burst,
+        _pvdf_onset_burst,
         QUIET,
         2.5,
     ),
     SignalCheck(
         "pvdf_abrupt_contrast",
         "M2 to M5 fall off behind the onset, M1 and M6 do not",
-        pvdf_onset_burst,
+        _pvdf_onset_burst,
         QUIET,
         1.5,
         over=SUSTAINED,
@@ -255,13 +255,13 @@ SIGNAL_CHECKS = (
     SignalCheck(
         "barely",
         "a few channels barely respond",
-        num_barely_responding,
+        _num_barely_responding,
         QUIET,
         0.3,
         4.0,
         pooled=True,
     ),
-    SignalCheck("d1", "D1 is nearly empty behind the filter", d1_fraction, ALL, 0.0, 0.02),
+    SignalCheck("d1", "D1 is nearly empty behind the filter", _d1_fraction, ALL, 0.0, 0.02),
 )
 """All of REFERENCE.md section 6, row *signals*, and PHYSICS.md's floor of slide over rest."""
 

@@ -240,7 +240,7 @@ def view_of(given: Any, duration_s: float) -> tuple[float, float]:
 
 # Tables and files --------------------------------------------------------------------------------
 def alarm_outcome(alarm_s: float, truth: Mapping[str, Any]) -> dict[str, Any]:
-    """What an alarm was: its ``outcome`` as in ``onset_rows``, of which onset, and how late.
+    """What an alarm was: its ``outcome`` as in ``_onset_rows``, of which onset, and how late.
 
     Args:
         alarm_s: when it was raised.
@@ -261,7 +261,7 @@ def alarm_outcome(alarm_s: float, truth: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def onset_rows(content: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _onset_rows(content: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Every alarm, and every onset that was missed, in order of time; each with all ``COLUMNS``.
 
     ``outcome`` is that of the alarm: it ``found`` a slip, came ``early``, ``repeated`` the alarm of
@@ -305,12 +305,12 @@ def onsets_title(entry: Mapping[str, Any], *, of_simulated: bool) -> str:
 
 
 def onsets_table(content: Mapping[str, Any]) -> str:
-    """The first rows of ``onset_rows`` as text; the first line says whether any is simulated.
+    """The first rows of ``_onset_rows`` as text; the first line says whether any is simulated.
 
     Args:
         content: of ``onsets.json``.
     """
-    rows = onset_rows(content)
+    rows = _onset_rows(content)
     shown = []
     for row in rows[:_MOST_ROWS]:
         cells: dict[str, object] = {"file": row["file"], "alarm s": _seconds(row["alarm_s"])}
@@ -376,7 +376,7 @@ def write_onsets(content: Mapping[str, Any], folder: Path) -> None:
     """
     write_json(folder / "onsets.json", content)
     with csv_writer(folder / "onsets.csv", COLUMNS) as write:
-        write(row.values() for row in onset_rows(content))
+        write(row.values() for row in _onset_rows(content))
 
 
 # Figure ------------------------------------------------------------------------------------------

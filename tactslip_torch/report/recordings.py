@@ -273,7 +273,7 @@ def signals_figure(
     """
     views = [(0.0, row.duration_s) for row in rows] if views is None else views
     columns = _columns(channels)
-    colours = channel_colours(channels)
+    colours = _channel_colours(channels)
     height = max(1.9, *(_LANE * len(places) for _, places, _ in columns))
     figure = new_figure(13.0, height * len(rows) + 1.3, title)
     widths = {"width_ratios": [1.0 if in_lanes else 0.75 for _, _, in_lanes in columns]}
@@ -316,7 +316,7 @@ def _columns(channels: Channels) -> list[tuple[str, list[int], bool]]:
     ]
 
 
-def channel_colours(channels: Channels) -> list[tuple[float, float, float]]:
+def _channel_colours(channels: Channels) -> list[tuple[float, float, float]]:
     """A colour per channel: the hue is its finger's, paler towards the palm."""
     hues = colours_of(channel["finger"] for channel in channels)
     colours = []

@@ -89,7 +89,7 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
         selected_features_figure(selected, path, simulated=simulated)
     alarm = metrics.get("alarm") or {}
     for is_there, draw, name in (
-        (_detectors(metrics), confound_figure, "confound"),
+        (_detectors(metrics), _confound_figure, "confound"),
         (_drawn_events(metrics), events_figure, "events"),
         (metrics.get("answers"), answers_figure, "answers"),
         (alarm, alarm_figure, "alarm"),
@@ -106,7 +106,7 @@ def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> N
     for key, tables in (
         ("events", (events_table,)),
         ("answers", (answers_table,)),
-        ("alarm", (alarm_table, scenes_table, reliability_table)),
+        ("alarm", (alarm_table, _scenes_table, reliability_table)),
     ):
         texts += [one(metrics) for one in tables if metrics.get(key)]
     if _detectors(metrics):
@@ -675,7 +675,7 @@ def confound_table(metrics: _Metrics) -> str:
 
 
 @styled
-def confound_figure(metrics: _Metrics, path: str | Path) -> None:
+def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write false slips and slips found of each detector on each kind of scene, as a PNG.
 
     In the paper's protocol the hand slides whenever the arm moves, so a detector of motors scores
@@ -1154,7 +1154,7 @@ def scene_rows(metrics: _Metrics) -> list[_Row]:
     return rows
 
 
-def scenes_table(metrics: _Metrics) -> str:
+def _scenes_table(metrics: _Metrics) -> str:
     """``scene_rows`` for the terminal."""
     return marked(metrics["simulated"], table(scene_rows(metrics), num_left=2))
 

@@ -275,7 +275,7 @@ def _with_next_starts(strokes: Sequence[ArmStroke]) -> Iterator[tuple[ArmStroke,
     yield from zip(strokes, [*(s.start_s for s in strokes[1:]), math.inf], strict=False)
 
 
-class KinematicContact:
+class _KinematicContact:
     """Contact by closed forms.
 
     Args:
@@ -374,7 +374,7 @@ class StrokeTrace:
     end_s: Array
 
 
-class BristleContact:
+class _BristleContact:
     """Contact read from integrated skin and bristles.
 
     Args:
@@ -394,7 +394,7 @@ class BristleContact:
         self, scene: Scene, grasp: Grasp, traces: tuple[StrokeTrace, ...] | None = None
     ) -> None:
         self._scene, self._grasp = scene, grasp
-        self._traces = scene_traces(scene) if traces is None else traces
+        self._traces = _scene_traces(scene) if traces is None else traces
         rest = quasi_static_slips(grasp, scene.slides)
         start_s, end_s = np.full_like(rest.start_s, np.nan), np.full_like(rest.end_s, np.nan)
         load = grasp.load_n[grasp.touching]
@@ -410,7 +410,7 @@ class BristleContact:
         self.slips = replace(rest, start_s=start_s, end_s=end_s)
 
     def element(self, element: int, grid: Grid, motion: Motion) -> ElementContact:
-        """A touching element's contact: see ``KinematicContact.element``."""
+        """A touching element's contact: see ``_KinematicContact.element``."""
         grasp, history = self._grasp, motion.grid
         lane = int(np.searchsorted(grasp.touching, element))
         normal_n = grasp.normal_n(element, motion.position_mm, history.time_s)
@@ -431,7 +431,7 @@ class BristleContact:
         return ElementContact(normal_n, friction_n, slide, release_v)
 
 
-Contacts = KinematicContact | BristleContact
+Contacts = _KinematicContact | _BristleContact
 """Either model of a recording's contact."""
 
 
@@ -440,8 +440,8 @@ def scene_contact(
 ) -> Contacts:
     """The contact of a scene by its fidelity; ``traces`` where they are integrated already."""
     if scene.fidelity == "kinematic":
-        return KinematicContact(scene, grasp)
-    return BristleContact(scene, grasp, traces)
+        return _KinematicContact(scene, grasp)
+    return _BristleContact(scene, grasp, traces)
 
 
 def _blend(
@@ -569,7 +569,7 @@ def _steps_per_sample(scene: Scene) -> int:
 
 
 @lru_cache(maxsize=_RECORDINGS_KEPT)
-def scene_traces(scene: Scene) -> tuple[StrokeTrace, ...]:
+def _scene_traces(scene: Scene) -> tuple[StrokeTrace, ...]:
     """The traces of a scene; of the last few they are kept, as a timeline and samples need them."""
     return traces_of([scene])[0]
 

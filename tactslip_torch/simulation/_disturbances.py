@@ -104,7 +104,7 @@ def common_volts(scene: Scene, grid: Grid, channels: list[int]) -> Array:
             add(mode_v, wave, rows)
     if of.machine_mv > 0:
         machine = lognormal(generator(*scene.session_key("machine couplings")), 0.4, num)
-        add(1e-3 * of.machine_mv * machine, machine_wave(scene, grid))
+        add(1e-3 * of.machine_mv * machine, _machine_wave(scene, grid))
     for coupling_v, time_s, omega, decay in _draw_knocks(scene):
         rows, wave = grid.ringing(time_s, 12.0 / decay, omega, decay)
         add(coupling_v, wave, rows)
@@ -220,7 +220,7 @@ def rotation_hz(scene: Scene) -> float:
     return float(log_uniform(rng, scene.disturbances.machine_hz))
 
 
-def machine_wave(scene: Scene, grid: Grid) -> Array:
+def _machine_wave(scene: Scene, grid: Grid) -> Array:
     """The machine's vibration, of unit rms at full speed and zero where it stands, ``[K, B]``.
 
     In a run the rotation's phase is the integral of a speed that rises and falls linearly, and
@@ -295,7 +295,7 @@ The skin of all elements and 0.2 kg resonate near 40 Hz.
 
 
 @dataclass(frozen=True, eq=False)
-class Event:
+class _Event:
     """A tap or a change of grip.
 
     Args:
@@ -324,7 +324,7 @@ def _draw_events(
     rate_hz: float,
     sizes: tuple[float, float],
     lengths_s: tuple[float, float],
-) -> list[Event]:
+) -> list[_Event]:
     """Events at random times where nothing slides, in order of time."""
     if rate_hz == 0:
         return []
@@ -345,7 +345,7 @@ def _draw_events(
         place_s = rng.random() * reached[-1]
         gap = min(int(np.searchsorted(reached, place_s, side="right")), len(reached) - 1)
         start_s = float(latest[gap] - (reached[gap] - place_s))
-        events.append(Event(start_s, float(start_s + length_s), size * factor))
+        events.append(_Event(start_s, float(start_s + length_s), size * factor))
     return sorted(events, key=lambda event: event.start_s)
 
 

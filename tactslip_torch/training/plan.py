@@ -4,7 +4,7 @@
 of the second in any order and solves; ``Abstaining`` sets the thresholds for abstaining. Features,
 K, degree, c and C are chosen by groups of recordings that are left out.
 
-**Held** (``choose_held``): features are ranked and scaled once; a held-out score is that of the
+**Held** (``_choose_held``): features are ranked and scaled once; a held-out score is that of the
 machine refitted without the bin's group, in closed form (``HeldOut``). Ranking and scaling have
 seen the group, so these scores choose, and are not what may be reported.
 
@@ -88,7 +88,7 @@ MOST_KEPT_BINS = 8192
 # Held validation --------------------------------------------------------------------------
 
 
-def choose_held(
+def _choose_held(
     recipe: Recipe,
     selection: FeatureSelection,
     sample: SampledBins,
@@ -814,7 +814,7 @@ def plan_detector(
             if isinstance(statistics, SampledBins):
                 raise ValueError("recipe.validation=held needs statistics of all training bins")
             selection = select_features(recipe, statistics, allowed)
-        rows, size, kernel, penalty = choose_held(
+        rows, size, kernel, penalty = _choose_held(
             recipe, selection, sample, is_settled=is_settled, show=show
         )
         selection = selection.first(size)

@@ -450,7 +450,7 @@ def check_classes(is_slip: Tensor) -> None:
         raise ValueError("baselines need training bins of both classes; got only one")
 
 
-def class_counts(sample: SampledBins) -> list[int]:
+def _class_counts(sample: SampledBins) -> list[int]:
     """How many training bins of non-slip and of slip a sample was drawn from.
 
     Raises:
@@ -467,13 +467,13 @@ def class_counts(sample: SampledBins) -> list[int]:
 
 def number_of_bins(recipe: Recipe, sample: SampledBins) -> int:
     """How many training bins there are, classes balanced."""
-    counts, fractions = class_counts(sample), class_fractions(recipe, sample)
+    counts, fractions = _class_counts(sample), class_fractions(recipe, sample)
     return round(counts[0] * fractions[0] + counts[1] * fractions[1])
 
 
 def class_fractions(recipe: Recipe, sample: SampledBins) -> tuple[float, float]:
     """The part of non-slip and of slip bins that is trained on."""
-    counts = class_counts(sample)
+    counts = _class_counts(sample)
     if recipe.balance != "undersample":
         return 1.0, 1.0
     return min(counts) / counts[0], min(counts) / counts[1]
@@ -495,7 +495,7 @@ def sample_weight(recipe: Recipe, sample: SampledBins) -> Tensor:
             [by_scene[_scene(name)] for name in sample.group_names]
         )
         return sample.sample_weight * of_stratum[sample.group, is_slip]
-    of_class = sample.sample_weight.new_tensor(_balance(recipe, class_counts(sample)))
+    of_class = sample.sample_weight.new_tensor(_balance(recipe, _class_counts(sample)))
     return sample.sample_weight * of_class[is_slip]
 
 
@@ -520,7 +520,7 @@ def scene_weights(recipe: Recipe, sample: SampledBins) -> dict[str, tuple[float,
         wanted = recipe.scene_weights.get(scene, 0.0) * protocol / totals[row]
         weights[row] = torch.where((wanted > 0) & wanted.isfinite(), wanted, 1.0)
     counts = (totals * weights).sum(0)
-    class_counts(sample)  # refuses one that is absent
+    _class_counts(sample)  # refuses one that is absent
     weights *= weights.new_tensor(_balance(recipe, counts.tolist()))
     return {scene: (own[0], own[1]) for scene, own in zip(scenes, weights.tolist(), strict=True)}
 

@@ -205,7 +205,7 @@ def _held_numbers(row: dict[str, float]) -> dict[str, float]:
 # The bins ----------------------------------------------------------------------------------------
 
 
-class TuningBins(NamedTuple):
+class _TuningBins(NamedTuple):
     """Bins of several groups.
 
     Attributes:
@@ -223,14 +223,14 @@ class TuningBins(NamedTuple):
     weights: Tensor
     group: Tensor
 
-    def where(self, rows: Tensor) -> TuningBins:
+    def where(self, rows: Tensor) -> _TuningBins:
         """Some of them, by a mask ``[N]``."""
-        return TuningBins(*(x[rows] for x in self))
+        return _TuningBins(*(x[rows] for x in self))
 
 
 def tuning_bins(
     sample: SampledBins, selected: Sequence[int], weights: Tensor, most: int
-) -> TuningBins:
+) -> _TuningBins:
     """At most so many sampled bins of every group and class: those of smallest key.
 
     Args:
@@ -253,7 +253,7 @@ def tuning_bins(
         own = is_slip == kind
         own_weights[own] *= weights[sample.is_slip == kind].sum() / own_weights[own].sum()
     features = sample.features[rows][:, list(selected)].double()
-    return TuningBins(features, is_slip, own_weights, sample.group[rows])
+    return _TuningBins(features, is_slip, own_weights, sample.group[rows])
 
 
 # The loss, and the grid that tuning starts from --------------------------------------------------
@@ -331,7 +331,7 @@ class GridPoint(NamedTuple):
     balanced_accuracy: float
 
 
-def grid_points(scaler: FeatureScaler, bins: TuningBins, recipe: Recipe) -> list[GridPoint]:
+def grid_points(scaler: FeatureScaler, bins: _TuningBins, recipe: Recipe) -> list[GridPoint]:
     """Every choice of C and c of a recipe.
 
     Raises:
@@ -438,8 +438,8 @@ class _Descent:
     """
 
     settings: LearnedSettings
-    bins: TuningBins
-    held: TuningBins | None = None
+    bins: _TuningBins
+    held: _TuningBins | None = None
     history: list[dict[str, float]] = field(default_factory=list)
 
     def loss(self) -> Tensor:

@@ -281,7 +281,7 @@ class Samples:
         return values if self._rows is None else values[self._rows]
 
 
-class RowSamples(Samples):
+class _RowSamples(Samples):
     """Samples of which each row of a table holds several of every channel.
 
     Args:
@@ -343,7 +343,7 @@ def unfolded(opened: Opened, how: Reading) -> Opened:
             "reading.row_order=channel (a_0, a_1, b_0, b_1) or time (a_0, b_0, a_1, b_1)"
         )
     order = found or "channel"
-    return opened._replace(samples=RowSamples(opened.samples, k, order), names=named.get(order))
+    return opened._replace(samples=_RowSamples(opened.samples, k, order), names=named.get(order))
 
 
 def _along(column: Any, part: slice) -> NDArray[Any]:
