@@ -81,8 +81,6 @@ QUICK_STREAMS = (
     "onset.learn_cycles=2",
     "onset.check_hours=0.002",
     "onset.check_slip_free_hours=0.002",
-    "onset.classifier.comb_periods=[1]",
-    "onset.classifier.penalties=[1.0]",
     "onset.budget.held=3000",
     "onset.hours.held=0.002",
     "onset.budget.taps_share=0.9",
@@ -114,7 +112,12 @@ class Sizes:
     """
 
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
-    overrides: tuple[str, ...] = ("baselines=false", "export=false")
+    overrides: tuple[str, ...] = (
+        "baselines=false",
+        "export=false",
+        "onset.check_slip_free_hours=4",
+        "onset.check_hours=0.4",
+    )
     pulses_v: tuple[float, ...] = PULSES_V
     knocks_mv: tuple[float, ...] = KNOCKS_MV
     cycles: int = 4

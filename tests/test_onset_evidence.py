@@ -103,8 +103,9 @@ def oracle(evidence, x, masked=()):
         heard = [i for i, c in enumerate(slow) if c not in masked]
         step, way = np.array(step)[:, heard], np.array(way)[:, heard]
         if len(slow):
-            row += [step.mean(-1), step.max(-1)] if len(slow) > 1 else [step.mean(-1)]
-            row.append(way.mean(-1))
+            for each in (step, way):
+                row.append(each.mean(-1))
+                row += [each.max(-1), each.min(-1)] if len(slow) > 1 else []
         rows.append(np.concatenate(row))
     return np.array(rows), first
 
@@ -157,7 +158,7 @@ def test_scale_moves_sizes_of_steps_alone():
     larger = replace(evidence, **{name: tuple(3 * k for k in own) for name, own in KNEES.items()})
     before, after = columns_of(evidence, x)[0], columns_of(larger, 3 * x)[0]
     torch.testing.assert_close(after[:, :num], before[:, :num], rtol=0, atol=1e-10)
-    sizes, ways = slice(num, num + 12), slice(num + 12, None)
+    sizes, ways = slice(num, num + 18), slice(num + 18, None)
     moved = before[:, sizes] + np.log(3.0)
     torch.testing.assert_close(after[:, sizes], moved, rtol=0, atol=1e-10)
     torch.testing.assert_close(after[:, ways], before[:, ways], rtol=0, atol=1e-10)
@@ -297,7 +298,7 @@ def test_bad_settings_are_refused_in_one_line(changes, match):
 
 def test_a_classifier_of_another_hand_or_version_is_refused():
     settings = AlarmSettings(50, Platt(1.0, 0.0), KOfN(1, 1), 1.0, None, onset=CLASSIFIER)
-    with pytest.raises(ValueError, match="expected 12 columns of evidence, got 54"):
+    with pytest.raises(ValueError, match="expected 12 columns of evidence, got 72"):
         AlarmSettings.from_dict(settings.to_dict(), hand_of("F"), RATE)
     plain = settings.to_dict()
     del plain["onset"]["mains_hz"]

@@ -5,8 +5,8 @@ from taps, motors and mains by how they spread over channels and by what was the
 
 - *fast channels*: power of four band filters over 10, 25 and 50 ms, as a log ratio to the channel's
   own floor, the mean of the log power over the last second;
-- *slow channels*: steps between means of neighbouring stretches of 10 to 200 ms, and their sign: a
-  grip presses, a slip relieves;
+- *slow channels*: steps between means of neighbouring stretches of 10 to 100 ms, their size and,
+  with their sign, how far they stand out of silence: a grip presses, a slip relieves;
 - each as mean, largest and smallest over the channels of its kind.
 
 Three filters are differences of neighbouring means (Haar wavelets); the fourth first takes away the
@@ -142,7 +142,7 @@ class OnsetEvidence:
         num_rows = len(WINDOWS_S) * len(self.fast_knee)
         num = num_rows * (3 if len(self.hand.fast) > 1 else 1)
         num_slow = len(self.hand.slow)
-        return num + len(STEPS_S) * (min(num_slow, 2) + min(num_slow, 1))
+        return num + 2 * len(STEPS_S) * (3 if num_slow > 1 else num_slow)
 
     @cached_property
     def _filters(self) -> Array:
@@ -173,9 +173,14 @@ class OnsetEvidence:
         return matrix.reshape(len(matrix), -1)
 
     @cached_property
+    def step_spans(self) -> list[list[int]]:
+        """``STEPS_S`` in blocks."""
+        return [[self.blocks_in(seconds) for seconds in step] for step in STEPS_S]
+
+    @cached_property
     def step_matrix(self) -> Tensor:
         """Means of the last blocks to steps: ``[b, D]``."""
-        spans = [[self.blocks_in(seconds) for seconds in step] for step in STEPS_S]
+        spans = self.step_spans
         matrix = np.zeros((max(back + length for _, length, back in spans), len(spans)))
         for row, (latest, length, back) in zip(matrix.T, spans, strict=True):
             row[len(row) - latest :] += 1 / latest
@@ -246,9 +251,10 @@ class OnsetEvidence:
         num, windows = power.shape[-1] - self.memory + 1, self.windows
         level = torch.stack([_moving_mean(power, n)[..., -num:] for n in windows], -1)
         floor = _moving_mean(log_power[..., : -windows[-1]], self.memory - windows[-1])
-        stretch = len(self.step_matrix)
-        latest = mean[:, mean.shape[-1] - num + 1 - stretch :].unfold(-1, stretch, 1)
-        steps = (latest - latest[..., :1]) @ self.step_matrix  # [S, k, D]
+        means = {n: _moving_mean(mean, n) for span in self.step_spans for n in span[:2]}
+        steps = torch.stack(  # [S, k, D]
+            [means[n][:, -num:] - means[m][:, -num - k : -k] for n, m, k in self.step_spans], -1
+        )
         heard = torch.ones(len(self.hand), dtype=torch.bool) if masked is None else ~masked
         return self.pooled(
             level.permute(2, 3, 1, 0),
@@ -290,9 +296,9 @@ class OnsetEvidence:
             told = size.sum(1).isfinite() & slow
             rows = told.unsqueeze(1)
             num = rows.type_as(size).sum(-1).clamp(min=1.0)
-            columns += _over_channels(size, rows, num)[: 2 if num_slow > 1 else 1]
             way = steps.sign() * (size - knee.log())
-            columns += _over_channels(way, rows, num)[:1]
+            for each in (size, way):
+                columns += _over_channels(each, rows, num)[: 3 if num_slow > 1 else 1]
         return torch.cat(columns, -1), in_use.any(-1)
 
     def to_dict(self) -> dict[str, Any]:
@@ -510,10 +516,10 @@ class _HopScore:
                 size = way = np.zeros((1, size.shape[1]))
             elif num < len(told):
                 size, way = size[told], way[told]
-            columns.append(size.sum(0) / len(size))
-            if len(told) > 1:
-                columns.append(size.max(0))
-            columns.append(way.sum(0) / len(way))
+            for each in (size, way):
+                columns.append(each.sum(0) / len(each))
+                if len(told) > 1:
+                    columns += [each.max(0), each.min(0)]
         z = np.concatenate(columns) * self._slope + self._offset
         z = np.minimum(np.maximum(z, -1.0), 1.0)
         pull = self._linear if self._quadratic is None else self._quadratic @ z + self._linear

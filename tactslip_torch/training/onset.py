@@ -2,21 +2,19 @@
 
 Negatives are what robots hear: holding, handling (taps, grips, the carrying arm), machines, mains,
 the moment before an onset, and steady sliding, which is the business of the classifier of bins.
-Each of these, of each scene, weighs alike, and so do onsets of each scene. The loudest hops of each
-kind of negative are a kind of their own: a knock while a grip is changed is rare, and like a slip.
+Each of these, of each scene, weighs alike, and so do onsets of each scene. The hops of each kind
+that are most like a slip are a kind of their own: a knock while a grip is changed is rare, and what
+sets the threshold. A first machine, fitted on some recordings, tells which they are.
 
-What cannot be known beforehand is chosen by leaving out each material: the penalty and the length
-of the comb that suppresses mains. The measure is how many onset hops score above all but
-``_FALSE_SHARE`` of the hops of every kind of negative.
+The penalty, the comb and the columns were chosen by leaving out each seen material: slips of it
+that are found at thresholds set on the others.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,30 +22,25 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
-from tactslip_torch.model.fit import TrainingBins
+from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
-from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.events import first_releases
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.runtime import in_processes
 
-log = logging.getLogger(__name__)
-
 ONSET_S = (0.002, 0.030)
 """Behind an onset, in which hops are positive."""
 _KNOWN_S = 0.1  # behind an onset, from which on sliding is known; and behind a slide, until rest
 _BEFORE_S = 0.3  # before a slip, a kind of negatives of its own
-_MOST_HOPS = 250  # of a recording and kind
-_MOST_LOUD = 300  # likewise
-_FALSE_SHARE = 1e-3
+_MOST_HOPS, _MOST_LIKE = 20, 60  # of a recording and kind: at even distances; most like a slip
+_FIRST_HOPS, _FIRST_RECORDINGS = 100, 60  # of the first machine
 _KERNEL = Polynomial(2)
 _FAST_KNEE, _SLOW_KNEE = 0.1, 1.0  # of what is usual in training
 _LEAST_KNEE = 1e-30
 _KNEE_RECORDINGS = 12
 _TAIL = 0.001  # of hops whose columns are clipped at either end
 _ONSET = "onset"
-_FOLDS = 5  # of cycles, where there is one material
 Array = NDArray[np.float64]
 
 
@@ -57,14 +50,14 @@ class OnsetTraining:
 
     Args:
         hop_ms: between its decisions, at most 5.
-        penalties: the paper's ``C``, to choose from.
-        comb_periods: of the mains, to choose from.
+        penalty: the paper's ``C``, of hops whose weights sum to 1.
+        comb_periods: of the mains, over which the comb takes the mean.
         mains_hz: nominal.
     """
 
     hop_ms: float = 5.0
-    penalties: Sequence[float] = (1.0, 10.0, 100.0)
-    comb_periods: Sequence[int] = (1, 4)
+    penalty: float = 2e4
+    comb_periods: int = 1
     mains_hz: float = 50.0
 
     def __call__(
@@ -72,16 +65,16 @@ class OnsetTraining:
         source: RecordingSource,
         recordings: Sequence[RecordingId],
         num_workers: int | None = None,
-    ) -> tuple[OnsetClassifier, dict[str, Any]]:
+    ) -> tuple[OnsetClassifier, dict[str, int]]:
         """Fit on some recordings; the threshold is left at infinity.
 
         Args:
             source: of the recordings.
-            recordings: of several materials, or of one in several cycles.
+            recordings: with slips among them.
             num_workers: processes.
 
         Returns:
-            The classifier, and JSON-able what was chosen from what.
+            The classifier, and how many hops of each kind it was fitted on.
 
         Raises:
             ValueError: if there is no recording, or no slip begins in them.
@@ -90,105 +83,82 @@ class OnsetTraining:
             raise ValueError(
                 "no recording is left to learn onsets from; give onset.streams more cycles"
             )
-        hop_samples = round(self.hop_ms * 1e-3 * source.sample_rate_hz)
-        evidences = [
-            OnsetEvidence(
-                source.hand,
-                source.sample_rate_hz,
-                hop_samples,
-                mains_hz=self.mains_hz,
-                comb_periods=periods,
-            )
-            for periods in self.comb_periods
-        ]
-        some = recordings[:: -(-len(recordings) // _KNEE_RECORDINGS)]
-        usual = partial(_knees, source, evidences)
-        knees = list(in_processes(usual, some, "onsets, scales", "recording", num_workers))
-        for place, evidence in enumerate(evidences):
-            fast, slow = (
-                tuple(np.maximum(np.median(np.stack(of), 0), _LEAST_KNEE).tolist())
-                for of in zip(*(k[place] for k in knees), strict=True)
-            )
-            evidences[place] = replace(evidence, fast_knee=fast, slow_knee=slow)
-        read = partial(_hops, source, evidences)
-        made = list(in_processes(read, recordings, "onsets, evidence", "recording", num_workers))
-        kinds = [kind for _, own in made for kind in own]
-        is_onset = np.array([kind.startswith(_ONSET) for kind in kinds], bool)
-        if not is_onset.any():
-            raise ValueError("no slip begins in the recordings that onsets are learned from")
-        names = [r.material for r in recordings]
-        if len(set(names)) == 1:
-            names = [str(r.cycle % _FOLDS) for r in recordings]
-        place_of = {name: number for number, name in enumerate(dict.fromkeys(names))}
-        groups = torch.tensor(
-            [place_of[name] for name, (_, own) in zip(names, made, strict=True) for _ in own]
+        evidence = OnsetEvidence(
+            source.hand,
+            source.sample_rate_hz,
+            round(self.hop_ms * 1e-3 * source.sample_rate_hz),
+            mains_hz=self.mains_hz,
+            comb_periods=self.comb_periods,
         )
-        weights = _weights(kinds, is_onset)
-        tried, best = [], None
-        for place, evidence in enumerate(evidences):
-            columns = torch.from_numpy(np.concatenate([own[place] for own, _ in made]))
+        usual, some = partial(_knees, source, evidence), _some(recordings, _KNEE_RECORDINGS)
+        knees = in_processes(usual, some, "onsets, scales", "recording", num_workers)
+        fast, slow = (
+            tuple(np.maximum(np.median(np.stack(of), 0), _LEAST_KNEE).tolist())
+            for of in zip(*knees, strict=True)
+        )
+        evidence, first = replace(evidence, fast_knee=fast, slow_knee=slow), None
+        for own in (_some(recordings, _FIRST_RECORDINGS), recordings):
+            read = partial(_hops, source, evidence, first)
+            made = list(in_processes(read, own, "onsets, evidence", "recording", num_workers))
+            columns = torch.from_numpy(np.concatenate([found for found, _ in made]))
+            kinds = [kind for _, of_recording in made for kind in of_recording]
+            is_onset = np.array([kind.startswith(_ONSET) for kind in kinds], bool)
+            if not is_onset.any():
+                raise ValueError("no slip begins in the recordings that onsets are learned from")
             scaler = FeatureScaler.fit(columns, tail=_TAIL)
+            weights = _weights(kinds, is_onset)
             bins = TrainingBins(scaler(columns), torch.from_numpy(is_onset), weights)
-            held_out = HeldOut(bins, groups, _KERNEL)
-            for penalty in self.penalties:
-                try:
-                    fit = held_out.at(penalty)
-                except ValueError as error:  # too close to singular to be told
-                    log.warning("onset.classifier.penalties: %s", error)
-                    continue
-                found = _found_share(fit.scores, kinds)
-                periods = evidence.comb_periods
-                tried.append({"comb_periods": periods, "penalty": penalty, "found": found})
-                if best is None or found > best[0]:
-                    assert isinstance(fit.head, QuadraticForm)
-                    best = found, OnsetClassifier(evidence, scaler, fit.head, float("inf"))
-        if best is None:
-            raise ValueError("no penalty of onset.classifier.penalties can be told; lower them")
-        counts = {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)}
-        return best[1], {"tried": tried, "hops": counts}
+            head = fit_machine(bins, self.penalty / len(kinds), _KERNEL)
+            assert isinstance(head, QuadraticForm)
+            first = OnsetClassifier(evidence, scaler, head, float("inf"))
+        assert first is not None
+        return first, {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)}
+
+
+def _some(recordings: Sequence[RecordingId], number: int) -> Sequence[RecordingId]:
+    """At even distances, at most so many."""
+    return recordings[:: -(-len(recordings) // number)]
 
 
 def _knees(
-    source: RecordingSource, evidences: Sequence[OnsetEvidence], recording: RecordingId
-) -> list[tuple[Array, Array]]:
-    """By evidence, a tenth of the usual root power of each filter, and the usual step."""
-    samples, found = source.load(recording).samples, []
-    for evidence in evidences:
-        blocks = evidence.blocks_of_recording(samples)
+    source: RecordingSource, evidence: OnsetEvidence, recording: RecordingId
+) -> tuple[Array, Array]:
+    """A tenth of the usual root power of each filter, and the usual step."""
+    blocks = evidence.blocks_of_recording(source.load(recording).samples)
+    fast = blocks.power.sqrt().transpose(0, 1).flatten(1).nanmedian(-1).values
+    steps = torch.zeros(1, 1, len(evidence.slow_knee))
+    if source.hand.slow:
         steps = blocks.mean.unfold(-1, len(evidence.step_matrix), 1) @ evidence.step_matrix
-        fast = blocks.power.sqrt().transpose(0, 1).flatten(1).nanmedian(-1).values
-        if not source.hand.slow:
-            steps = torch.zeros(1, 1, steps.shape[-1])
-        slow = steps.abs().flatten(0, 1).nanmedian(0).values
-        found.append((_FAST_KNEE * fast.numpy(), _SLOW_KNEE * slow.numpy()))
-    return found
+    slow = steps.abs().flatten(0, 1).nanmedian(0).values
+    return _FAST_KNEE * fast.numpy(), _SLOW_KNEE * slow.numpy()
 
 
 def _hops(
-    source: RecordingSource, evidences: Sequence[OnsetEvidence], recording: RecordingId
-) -> tuple[list[Array], list[str]]:
-    """The hops of a recording that are learned from: evidence ``[N, K]`` each, and their kinds."""
+    source: RecordingSource,
+    evidence: OnsetEvidence,
+    first: OnsetClassifier | None,
+    recording: RecordingId,
+) -> tuple[Array, list[str]]:
+    """The hops of a recording that are learned from: evidence ``[N, K]``, and their kinds."""
     samples = source.load(recording).samples
-    made = [evidence.columns(evidence.blocks_of_recording(samples)) for evidence in evidences]
-    num = min(len(columns) for columns, _ in made)  # a longer comb begins later
-    usable = torch.stack([is_usable[-num:] for _, is_usable in made]).all(0).numpy()
-    evidence = evidences[0]
+    columns, is_usable = evidence.columns(evidence.blocks_of_recording(samples))
     last = samples.shape[-1] // evidence.hop_samples
-    time_s = np.arange(last - num + 1, last + 1) * evidence.hop_samples / evidence.sample_rate_hz
-    loudness = made[0][0][-num:, : len(evidence.fast_knee)].amax(1).numpy()
+    number = np.arange(last - len(columns) + 1, last + 1)
+    time_s = number * evidence.hop_samples / evidence.sample_rate_hz
     places, kinds = list[NDArray[np.int64]](), list[str]()
+    score = None if first is None else first.head(first.scaler(columns)).numpy()
+    num_even = _FIRST_HOPS if first is None else _MOST_HOPS
     for kind, is_kind in kinds_of(source.timeline(recording), time_s, recording.scene).items():
-        place = np.flatnonzero(is_kind & usable)
-        if not kind.startswith(_ONSET):
-            loudest = place[np.argsort(-loudness[place], kind="stable")[:_MOST_LOUD]]
-            places.append(loudest)
-            kinds += [f"loud {kind}"] * len(loudest)
-        if len(place) > _MOST_HOPS:
-            place = place[np.linspace(0, len(place) - 1, _MOST_HOPS).astype(int)]
+        place = np.flatnonzero(is_kind & is_usable.numpy())
+        if score is not None and not kind.startswith(_ONSET):
+            most = place[np.argsort(-score[place], kind="stable")[:_MOST_LIKE]]
+            places.append(most)
+            kinds += [f"like {kind}"] * len(most)
+        if len(place) > num_even:
+            place = place[np.linspace(0, len(place) - 1, num_even).astype(int)]
         places.append(place)
         kinds += [kind] * len(place)
-    chosen = np.concatenate(places)
-    return [columns[-num:].numpy()[chosen] for columns, _ in made], kinds
+    return columns.numpy()[np.concatenate(places)], kinds
 
 
 def kinds_of(
@@ -239,15 +209,3 @@ def _weights(kinds: Sequence[str], is_onset: NDArray[np.bool_]) -> Tensor:
     for mask in (is_onset, ~is_onset):
         each[mask] /= each[mask].sum()
     return torch.from_numpy(each * len(each) / 2)
-
-
-def _found_share(scores: Tensor, kinds: Sequence[str]) -> float:
-    """Of onset hops, kinds alike, those above all but ``_FALSE_SHARE`` of every negative kind."""
-    of_kind: dict[str, list[float]] = {}
-    for kind, score in zip(kinds, scores.tolist(), strict=True):
-        of_kind.setdefault(kind, []).append(score)
-    onsets = {kind: np.array(own) for kind, own in of_kind.items() if kind.startswith(_ONSET)}
-    threshold = max(
-        np.quantile(own, 1 - _FALSE_SHARE) for kind, own in of_kind.items() if kind not in onsets
-    )
-    return float(np.mean([(own >= threshold).mean() for own in onsets.values()]))
