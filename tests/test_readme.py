@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from hydra._internal.utils import get_args_parser
 from test_detector import random_detector
+from test_newcomer import code_lines
 
 import tactslip_torch
 from tactslip_torch import AlarmSettings
@@ -120,6 +121,14 @@ def test_every_dependency_and_its_licence_is_named():
     assert [name for name in names if not re.search(rf"\b{name}\b", licences)] == []
     bounded = [one for one in needed if "<" in one]
     assert [one for one in bounded if not one.startswith("torch>")] == []
+
+
+def test_lines_of_code_are_counted():
+    rows = re.findall(r"\| (\d+) \| \[(\w+\.py)\]", PAGES["docs/quickstart.md"])
+    assert [(code_lines(ROOT / "examples" / name), name) for _, name in rows] == [
+        (int(lines), name) for lines, name in rows
+    ]
+    assert len(rows) == 3
 
 
 def test_readme_is_short():
