@@ -5,6 +5,7 @@ import torch
 
 from tactslip_torch.analysis.certificate import certify
 from tactslip_torch.deploy.check import simulated_stream
+from tactslip_torch.features.groups import JUMPING
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Platt
@@ -39,12 +40,15 @@ def small_detector(
     arithmetic: str = "double",
     gain: float = 1.0,
     backend: BackendName = "auto",
+    jumps: bool = False,
 ) -> SlipDetector:
+    """Of random features; with ``jumps`` also of those that the least rounding moves far."""
     rng = np.random.default_rng(seed)
     pool = FeaturePool(HAND, arithmetic=arithmetic)  # type: ignore[arg-type]
     channel_filter = ChannelFilter([51, 51, 11, 11])
-    of_gauges = rng.choice(26, 4, replace=False)
-    of_films = 26 + rng.choice(len(pool.names) - 26, NUM_FEATURES - 4, replace=False)
+    steady = [i for i, n in enumerate(pool.names) if jumps or n.descriptor not in JUMPING]
+    of_gauges = rng.choice([i for i in steady if i < 26], 4, replace=False)
+    of_films = rng.choice([i for i in steady if i >= 26], NUM_FEATURES - 4, replace=False)
     selected = [int(i) for i in (*of_gauges, *of_films)]
     features = pool(channel_filter.valid(raw_bins(64, seed=99)))[:, selected]
     scaler = FeatureScaler.fit(features)
@@ -102,5 +106,5 @@ def lying_detector(threshold):
 
 
 def certified(detector, num_bins=48, held_out=None, **options):
-    options = {"simulated": True, "extremes": 6} | options
+    options = {"simulated": True, "extremes": 6, "boundary": 20} | options
     return certify(detector, raw_bins(num_bins), held_out, **options)

@@ -7,20 +7,26 @@ import math
 import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
 from small_detector import HAND, NUM_FEATURES, certified, lying_detector, raw_bins, small_detector
+from test_commands import composed, run_train
 
 from tactslip_torch.analysis.certificate import (
     FACTOR,
     INSIDE_SHARE,
     LARGEST_RATIO,
+    MOST_MARGIN_SD,
     WORST_SD,
     certify,
     compare,
     pipelines,
 )
+from tactslip_torch.analysis.raw_bins import draw_bins
+from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.rounding import rounding_bound
 from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
+from tactslip_torch.training.datamodule import FeatureMaker
 
 # Comparison ------------------------------------------------------------------------------------
 
@@ -167,7 +173,7 @@ def named(certificate, name):
 def test_a_sound_detector_holds():
     found = certified(small_detector(), held_out={"test": raw_bins(40, seed=7)})
     assert found.holds
-    assert [row["holds"] for row in found.content["conditions"]] == [True] * 9
+    assert [row["holds"] for row in found.content["conditions"]] == [True] * 11
     json.dumps(found.content, allow_nan=False)
 
 
@@ -209,16 +215,52 @@ def test_a_margin_that_swallows_the_scores_does_not_hold():
 
 
 def test_errors_beyond_the_limit_do_not_hold():
-    """In float32 throughout, a vibration on an offset loses its digits."""
-    bins = raw_bins(48, offset=1e4)
+    """Volts of float32 lose the digits of a vibration on an offset, whatever they are made of."""
     fine, coarse = (
-        certify(small_detector(arithmetic=a), bins.float(), simulated=True, extremes=2)
-        for a in ("double", "native")
+        certify(small_detector(), raw_bins(48, offset=offset).float(), simulated=True, extremes=2)
+        for offset in (1e3, 1e4)
     )
     name = "calibration: worst error, sd"
-    assert named(fine, name)["found"] <= WORST_SD
-    assert named(coarse, name)["found"] > WORST_SD
+    assert 1e-5 < named(fine, name)["found"] <= WORST_SD < named(coarse, name)["found"]
     assert (fine.holds, coarse.holds) == (True, False)
+
+
+@pytest.mark.parametrize("jumps", [False, True])
+def test_a_margin_holds_where_float32_turns(jumps):
+    found = certified(small_detector(2, jumps=jumps), 96, boundary=400).content
+    margin, edge = found["margin"], found["boundary"]
+    assert edge["valid_in_range"] > 300
+    assert edge["flips"] > 100
+    assert edge["outside_margin"] == 0
+    assert (margin["sd"] <= MOST_MARGIN_SD) == (not jumps)
+    assert bool(margin["jumping_columns"]) == jumps
+    worst = edge["worst_margins"] * margin["score"]
+    assert (worst > margin["score"] - margin["jump"]) == jumps  # so jumps have to be counted
+    if jumps:
+        row = next(row for row in found["conditions"] if row["name"] == "margin, sd")
+        assert row["holds"] is False
+        assert "train without mode, cv and entropy" in row["wanted"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", ["general", "paper", "robust"])
+def test_a_trained_detector_does_not_turn_outside_its_margin(recipe, tmp_path):
+    """1,000 bisected bins of each; only the default is steady enough for a small margin."""
+    run_train(
+        tmp_path, "+exp=quick", f"recipe={recipe}", "num_workers=0", "export=false",
+        "baselines=false",
+    )  # fmt: skip
+    config = composed("+exp=quick")
+    source = instantiate(config.data, _convert_="all")
+    detector = SlipDetector.load(tmp_path / "detector.pt")
+    rule = instantiate(config.labels)
+    maker = FeatureMaker(source, detector.pool, detector.channel_filter, rule)
+    (fold,) = instantiate(config.split, _convert_="all")(source.ids)
+    bins, *_ = draw_bins(maker, fold, "train", 400, 0)
+    found = certify(detector, bins, simulated=True, extremes=2).content
+    assert found["boundary"]["valid_in_range"] > 800
+    assert found["boundary"]["outside_margin"] == 0
+    assert (found["margin"]["sd"] < MOST_MARGIN_SD) == found["holds"] == (recipe == "general")
 
 
 def test_a_kernel_sum_has_no_bound_and_says_so():

@@ -1,9 +1,11 @@
 """What float32 does to a detector, measured against float64, with a margin for its decisions.
 
 The float32 pipeline is ``copy.deepcopy(detector).float()``, the float64 one the detector as
-fitted; both score the same bins. Calibration bins and a rigorous bound of the head set the margin.
-Held-out bins only check it, and generated extremes show what becomes of broken sensors. What lies
-outside the inputs that the calibration bins cover was never tried.
+fitted; both score the same bins, with digits that float32 does not hold. The margin is made of
+errors on calibration bins, a rigorous bound of the head, and what features can jump by whose value
+rounding decides (``JUMPING``). Held-out bins only check it, as do bins between those of either
+decision, at the edge where float32 turns; generated extremes show what becomes of broken sensors.
+What lies outside the inputs that the calibration bins cover was never tried.
 """
 
 from __future__ import annotations
@@ -17,8 +19,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.groups import JUMPING
 from tactslip_torch.features.pool import VALIDITY
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.rounding import error_facts, gradient_facts, head_facts, score_sd
 from tactslip_torch.runtime import bar
 from tactslip_torch.signals.binning import refuse_nonfinite
@@ -70,10 +74,19 @@ def _ranges(covers: Tensor, detector: SlipDetector) -> dict[str, Any]:
 
 
 FACTOR = 4
+MOST_MARGIN_SD = 1e-2  # in standard deviations of the score
+REMEDY = (
+    "features that jump decide: train without mode, cv and entropy, as recipe=general does "
+    "(recipe.descriptors)"
+)
 WORST_SD = 1e-3  # largest score error allowed on recordings, in standard deviations of the score
 INSIDE_SHARE = 0.01  # fewer of the held-out bins may lie inside the margin
 LARGEST_RATIO = 1e4  # a bound further above the worst error seen says too little
-_RULE = f"{FACTOR} x the worst error on calibration bins, plus the bound of the head if it has one"
+_RULE = (
+    f"{FACTOR} x the worst error on calibration bins, plus the bound of the head if it has one, "
+    f"plus what its columns of {', '.join(JUMPING)} can jump by"
+)
+_HALVINGS = 60  # of a line between two bins, in volts of float64
 _CHUNK_BINS, _GRADIENT_BINS = 16, 128
 
 
@@ -207,6 +220,7 @@ def certify(
     *,
     simulated: bool,
     extremes: int = 100,
+    boundary: int = 1000,
     seed: int = 0,
 ) -> Certificate:
     """Measure what float32 does to a detector, and within which margin its decisions stand.
@@ -217,7 +231,8 @@ def certify(
         held_out: others by name; they check the certificate and set nothing.
         simulated: whether the bins come from a simulation.
         extremes: generated bins of each kind of ``EXTREMES``.
-        seed: of the extremes and of the search for the worst error of the head.
+        boundary: bins at which float32 is about to turn, made of calibration bins in pairs.
+        seed: of digits, extremes, pairs, and of the search for the worst error of the head.
 
     Shape:
         - calibration, held_out: ``[N, C, n + 2 * context]``, volts, finite
@@ -230,10 +245,11 @@ def certify(
     if taken := sorted({"calibration", *EXTREMES} & {*(held_out or {})}):
         raise ValueError(f"a held-out set may not be named {taken[0]!r}, a name of our own; rename")
     double, single = pipelines(detector)
+    generator = torch.Generator().manual_seed(seed)
+    given = {name: _with_digits(bins, generator) for name, bins in given.items()}
     sets = {name: compare(double, single, bins, name) for name, bins in given.items()}
     base = sets["calibration"]
     sd = score_sd(base.exact)
-    generator = torch.Generator().manual_seed(seed)
     size = (extremes, *calibration.shape[1:])
     kinds = {
         kind: compare(double, single, extreme_bins(kind, size, generator, torch.float32), kind)
@@ -241,8 +257,11 @@ def certify(
     }
     head = head_facts(detector.head, base.scaled, seed)
     worst = float(base.error.max())
-    margin = (head["bound"] or 0.0) + FACTOR * worst
+    jump, jumping = _jumps(double, base)
+    margin = (head["bound"] or 0.0) + FACTOR * worst + jump
     known = _least_by_kind(base.covers, detector)
+    edge = _at_boundary(single, given["calibration"], base, boundary, generator)
+    turning = None if edge is None else compare(double, single, edge, "boundary")
     thinned = calibration[:: -(-len(calibration) // _GRADIENT_BINS)].double()
     content: dict[str, Any] = {
         "simulated": simulated,
@@ -255,7 +274,10 @@ def certify(
             "sd": margin / sd,
             "rule": _RULE,
             "worst_calibration_error": worst,
+            "jump": jump,
+            "jumping_columns": jumping,
         },
+        "boundary": turning and _boundary_facts(turning, detector, margin, known),
         "head": head,
         "sets": {name: _set_facts(c, detector, margin, sd, known) for name, c in sets.items()},
         "extremes": {k: _set_facts(c, detector, margin, sd, known) for k, c in kinds.items()},
@@ -273,19 +295,116 @@ def certify(
     return Certificate(content, sets | kinds)
 
 
+def _with_digits(samples: Tensor, generator: torch.Generator) -> Tensor:
+    """Samples in float64, with digits that float32 does not hold if they had none.
+
+    Samples of a converter, and of any float32 file, are exact in float32, so its error would be 0.
+    Up to half the least step between two samples of a channel is added, but at least a rounding.
+    """
+    samples = samples.double()
+    if not samples.numel() or not torch.equal(samples, samples.float().double()):
+        return samples
+    steps = samples.movedim(-2, 0).flatten(1).sort(-1).values.diff(dim=-1)
+    step = torch.where(steps > 0, steps, math.inf).amin(-1).nan_to_num(posinf=0.0)  # [C]
+    step = torch.maximum(step[:, None], torch.finfo(torch.float32).eps * samples.abs())
+    digits = torch.rand(samples.shape, generator=generator, dtype=torch.float64) - 0.5
+    return samples + digits * step
+
+
+def _jumps(double: SlipDetector, base: Comparison) -> tuple[float, list[str]]:
+    """What columns that jump can add to or take from a score of a calibration bin, and which.
+
+    Columns of ``mode`` and ``cv`` may go anywhere in their range; those of ``entropy`` by one value
+    in another cell, or by the worst seen. Of a quadratic form pairs of them count as well.
+    """
+    lines = double.pool.maps.num_lines  # the shortest rows
+    bits = (math.log2(lines) + 1 / math.log(2)) / lines
+    width = (double.scaler.maximum - double.scaler.minimum).clamp(min=1e-300)
+    jumping = {i: n for i, n in enumerate(double.selected_names) if n.descriptor in JUMPING}
+    total, sizes = torch.zeros_like(base.exact), torch.zeros(len(width), dtype=torch.float64)
+    plain = double.head(base.scaled)
+    for i, name in jumping.items():
+        size = 2.0
+        if name.descriptor == "entropy":
+            seen = float(base.scaled_error[:, i].max())
+            size = min(2.0, FACTOR * max(seen, 2 * bits / float(width[i])))
+        sizes[i] = size
+        moves = []
+        for sign in (-1, 1):
+            z = base.scaled.clone()
+            z[:, i] = (z[:, i] + sign * size).clamp(-1.0, 1.0)
+            moves.append((double.head(z) - plain).abs())
+        total += torch.maximum(*moves)
+    pairs = 0.0
+    if isinstance(double.head, QuadraticForm):
+        bend = double.head.dense_quadratic.abs()
+        pairs = float(sizes @ (bend - bend.diag().diag()) @ sizes)
+    return float(total.max()) + pairs, [str(name) for name in jumping.values()]
+
+
+def _at_boundary(
+    single: SlipDetector,
+    samples: Tensor,
+    base: Comparison,
+    number: int,
+    generator: torch.Generator,
+) -> Tensor | None:
+    """Bins on lines between calibration bins of either decision, where float32 is about to turn.
+
+    Shape:
+        - samples: ``[N, C, T]``; output: ``[number, C, T]``, float64; None without both decisions
+    """
+    is_slip = base.rounded >= 0
+    if not 0 < int(is_slip.sum()) < len(samples) or not number:
+        return None
+
+    def drawn(mask: Tensor) -> Tensor:
+        rows = mask.nonzero()[:, 0]
+        return samples[rows[torch.randint(len(rows), (number,), generator=generator)]]
+
+    low, high = drawn(~is_slip), drawn(is_slip)
+    for _ in range(_HALVINGS):
+        middle = low + (high - low) / 2
+        parts = [single.predict_raw(x.float()).score for x in middle.split(_CHUNK_BINS * 16)]
+        is_high = (torch.cat(parts) >= 0)[:, None, None]
+        low, high = torch.where(is_high, low, middle), torch.where(is_high, middle, high)
+    return torch.where((torch.arange(number) % 2 == 0)[:, None, None], low, high)
+
+
+def _boundary_facts(
+    turning: Comparison, detector: SlipDetector, margin: float, known: Tensor
+) -> dict[str, Any]:
+    """How many bins at the edge turn outside the margin, of those that are valid and in range."""
+    is_known = turning.is_valid & ~_is_outside(turning.covers, detector, known)
+    turned = turning.flips & is_known
+    worst = turning.exact.abs()[turned]
+    return {
+        "bins": len(is_known),
+        "valid_in_range": int(is_known.sum()),
+        "flips": int(turned.sum()),
+        "outside_margin": int((worst > margin).sum()),
+        "worst_margins": float(worst.max()) / margin if len(worst) else 0.0,
+    }
+
+
+def _is_outside(covers: Tensor, detector: SlipDetector, known: Tensor) -> Tensor:
+    """Which bins reach beyond what calibration bins cover, in a channel in use, ``[N]``."""
+    used = {name.channel for name in detector.extractor.names}
+    is_used = torch.tensor([name in used for name in detector.pool.hand.names])
+    return (covers < known)[:, is_used].flatten(1).any(1)
+
+
 def _set_facts(
     compared: Comparison, detector: SlipDetector, margin: float, sd: float, known: Tensor
 ) -> dict[str, Any]:
     inside = compared.exact.abs() <= margin
     flips, outside = compared.flips & inside, compared.flips & ~inside
-    used = {name.channel for name in detector.extractor.names}
-    is_used = torch.tensor([name in used for name in detector.pool.hand.names])
     by_feature = compared.scaled_error.amax(0)
     worst = by_feature.argmax()
     return {
         "bins": len(inside),
         "invalid": int((~compared.is_valid).sum()),
-        "outside_range": int((compared.covers < known)[:, is_used].flatten(1).any(1).sum()),
+        "outside_range": int(_is_outside(compared.covers, detector, known).sum()),
         "not_finite": int((~compared.rounded.isfinite()).sum()),
         "error": error_facts(compared.error, sd),
         "error_of_valid": error_facts(compared.error[compared.is_valid], sd),
@@ -319,6 +438,12 @@ def _conditions(content: Mapping[str, Any]) -> list[dict[str, Any]]:
     check("error of the head, worst seen", seen, wanted, within)
     tight = None if head["ratio"] is None else head["ratio"] <= LARGEST_RATIO
     check("bound of the head / worst seen", head["ratio"], f"<= {LARGEST_RATIO:g}", tight)
+    margin, edge = content["margin"], content["boundary"]
+    wanted = f"<= {MOST_MARGIN_SD:g}" + (f" ({REMEDY})" if margin["jump"] > 0 else "")
+    check("margin, sd", margin["sd"], wanted, margin["sd"] <= MOST_MARGIN_SD)
+    if edge is not None:
+        turned = edge["outside_margin"]
+        check("bins where float32 turns: flips outside the margin", turned, "0", turned == 0)
     for name, facts in content["sets"].items():
         worst = facts["error"]["worst_sd"]
         check(f"{name}: worst error, sd", worst, f"<= {WORST_SD:g}", worst <= WORST_SD)

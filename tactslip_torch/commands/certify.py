@@ -46,7 +46,7 @@ def certify(config: DictConfig) -> dict[str, Any]:
         ValueError: for bad input, in one line.
         FileNotFoundError: if there is no such detector.
     """
-    for name in ("bins", "scored_bins", "extremes"):
+    for name in ("bins", "scored_bins", "extremes", "boundary"):
         check_number(name, config[name], whole=True)
     check_number("seed", config.seed, least=0, whole=True)
     detector = SlipDetector.load(config.model)
@@ -75,6 +75,7 @@ def certify(config: DictConfig) -> dict[str, Any]:
         drawn,
         simulated=source.is_simulated,
         extremes=config.extremes,
+        boundary=config.boundary,
         seed=config.seed,
     )
     content: dict[str, Any] = plain(found.content) | {

@@ -16,7 +16,9 @@ Channels = Literal["all", "films", "gauges"]
 Components = Literal[
     "all", "unsorted", "deep_spectra", "time", "steady", "moments", "time_moments", "spreads"
 ]
-_JUMPING = frozenset({"mode", "cv", "entropy"})  # by several deviations at 1 nV of noise
+JUMPING = ("mode", "cv", "entropy")
+"""Descriptors that the least rounding can move far: ``mode`` to another of nearly equal counts,
+``cv`` to the other sign where the mean is 0, ``entropy`` by what a value adds to a cell."""
 _SPREADS = frozenset({"std", "range"})
 ATTRIBUTES = ("kind", "finger", "channel", "component", "domain", "descriptor")
 _DEEP = 3  # from this level on a branch has a rank below a fifth of the bin
@@ -116,7 +118,7 @@ def _is_of(name: FeatureName, components: str) -> bool:
     if components == "deep_spectra":
         return name.domain == "time" or int(name.component[1:]) >= _DEEP
     if components in ("steady", "moments", "time_moments"):
-        is_left_out = name.descriptor in _JUMPING
+        is_left_out = name.descriptor in JUMPING
         if components != "steady":
             is_left_out |= name.descriptor in ORDERED
         return not is_left_out and (components != "time_moments" or name.domain == "time")

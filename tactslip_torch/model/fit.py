@@ -7,6 +7,7 @@ bin, and primal, one unknown per monomial of the features.
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from dataclasses import dataclass
@@ -20,12 +21,12 @@ from tactslip_torch.model.kernels import (
     PAPER_KERNEL,
     Head,
     Kernel,
-    KernelSum,
     Polynomial,
     QuadraticForm,
     collapse,
     gram_matrix,
     machine_of,
+    stated,
 )
 from tactslip_torch.model.moments import ProductSums
 from tactslip_torch.model.solve import check_weights, solve_by_autograd, solve_symmetric
@@ -120,10 +121,14 @@ def fit_machine(
         moment = kernel.sum_of_monomials(bins.features, bins.sample_weight * bins.targets)
         return kernel.solve(normal, moment, penalty, bins.features.shape[1])[0]
     gram = gram_matrix(kernel, bins.features)
-    beta, report, _ = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
-    machine = machine_of(bins.features, beta, kernel)
-    machine.solved = report
-    if isinstance(machine, KernelSum):
+    solution = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
+    make = functools.partial(machine_of, bins.features, kernel=kernel)
+    machine = make(solution.x)
+    if isinstance(kernel, Polynomial) and isinstance(machine, QuadraticForm):
+        num_monomials = kernel.num_monomials(bins.features.shape[1])
+        machine.solved = stated(machine, solution, make, num_monomials)
+    else:
+        machine.solved = solution.report
         log.info(
             "%s does not fold into a quadratic form: all %d training bins are kept, %s",
             kernel,
@@ -202,7 +207,7 @@ def fit_quadratic(
             [checkpoint(normal, *chunk, offset, use_reentrant=False) for chunk in chunks]
         ).sum(0)
         right, ridge = kernel.sum_of_monomials(z, weights * targets), (1 / c).expand(len(system))
-    _, report, _ = solve_symmetric(
+    _, report, *_ = solve_symmetric(
         system,
         right,
         c.item(),

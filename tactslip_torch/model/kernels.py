@@ -11,14 +11,14 @@ fixed size (REFERENCE.md section 5):
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.model.solve import SolveReport, solve_symmetric
+from tactslip_torch.model.solve import Solution, SolveReport, solve_symmetric
 
 _GRAM_ROWS = 512
 _MOST_QUADRATIC = 1000
@@ -146,12 +146,16 @@ class Polynomial:
         Shape:
             - normal: ``[P, P]``; moment: ``[P]``
         """
-        weights, report, factor = solve_symmetric(
+        solution = solve_symmetric(
             normal, moment, penalty, name="X'WX", in_span=True, most_condition=most_condition
         )
-        machine = self.head(weights, num_features)
-        machine.solved = report
-        return machine, factor
+
+        def make(weights: Tensor) -> QuadraticForm:
+            return self.head(weights, num_features)
+
+        machine = make(solution.x)
+        machine.solved = stated(machine, solution, make, len(normal))
+        return machine, solution.factor
 
     def _pairs(self, num_features: int) -> tuple[Tensor, Tensor]:
         """The two variables of each monomial, of which 0 is the constant 1."""
@@ -252,6 +256,31 @@ def gram_matrix(kernel: Kernel, z: Tensor) -> Tensor:
         for rows, some in zip(gram.split(_GRAM_ROWS), z.split(_GRAM_ROWS), strict=True):
             rows.copy_(kernel(some, z))
     return gram
+
+
+def stated(
+    machine: QuadraticForm, solution: Solution, make: Callable[[Tensor], Head], most_rank: int
+) -> SolveReport:
+    """The report on a machine's solution, with the error of its coefficients.
+
+    Args:
+        machine: of the solution.
+        solution: of its weights.
+        make: a machine of weights.
+        most_rank: as many components as can differ from 0, those of the map.
+    """
+    moved = max(float(_coefficients(make(move)).abs().max()) for move in solution.moves.mT)
+    largest = float(_coefficients(machine).abs().max())
+    report = solution.report
+    is_known = report.rank >= min(report.size, most_rank)
+    elsewhere = moved / largest if is_known and largest > 0 else 0.0 if is_known else math.inf
+    return replace(report, elsewhere=elsewhere)
+
+
+def _coefficients(machine: Head) -> Tensor:
+    assert isinstance(machine, QuadraticForm)
+    parts = (machine.dense_quadratic.flatten(), machine.linear, machine.constant[None])
+    return torch.cat(parts)
 
 
 class Cost(NamedTuple):

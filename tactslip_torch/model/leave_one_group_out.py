@@ -121,7 +121,7 @@ class HeldOut:
         return HeldOutFit(head, scores)
 
     def _dual(self, penalty: float) -> tuple[Head, Tensor]:
-        beta, report, factor = solve_symmetric(
+        beta, report, factor, _ = solve_symmetric(
             self._system,
             self._targets,
             penalty,

@@ -29,6 +29,7 @@ _EPS = torch.finfo(torch.float64).eps
 _TINY = torch.finfo(torch.float64).tiny
 _MOST_CONDITION = 1e12  # of what Cholesky may solve
 _LARGEST_ERROR = 1e-2  # of a solution that is handed out
+_MOVES, _ROUNDINGS = 8, 64  # how often roundings are drawn, and of how many eps each is
 _LARGEST_UNSAID = 1e-3  # that may be left out of a least-squares solution without a word
 
 
@@ -53,6 +54,9 @@ class SolveReport:
         left_out: for ``"eigen"``, what the components left out could add to a score of a training
             bin, relative to the targets: 0 if they are null, as those of exact duplicates are, but
             no more than this if they only are too small for float64 to tell.
+        elsewhere: error of the machine's coefficients, relative to the largest, as random roundings
+            of the matrix move them; infinite where what was left out may tell apart bins elsewhere.
+            ``None`` where there are no coefficients.
     """
 
     method: Literal["cholesky", "eigen"]
@@ -64,6 +68,7 @@ class SolveReport:
     rank: int
     error: float
     left_out: float | None = None
+    elsewhere: float | None = None
 
     def facts(self) -> dict[str, Any]:
         """All of it as JSON holds it; an infinite number is the string ``"inf"``."""
@@ -80,6 +85,10 @@ class SolveReport:
         text += f": condition {self.condition:.1e}, relative error{of} up to {self.error:.0e}"
         if self.left_out is not None and self.left_out == self.error:
             text += " unless what is left out is null"
+        if self.elsewhere == math.inf:
+            text += "; scores of bins unlike those of training may be others"
+        elif self.elsewhere is not None:
+            text += f", of the coefficients up to {self.elsewhere:.0e}"
         return text
 
 
@@ -91,11 +100,13 @@ class Solution(NamedTuple):
         report: on the solve.
         factor: ``[n, n]``, float64, the lower Cholesky factor of ``A + diag(1 / (C w))``; ``None``
             if the method was another.
+        moves: ``[n, 8]``, how roundings of the matrix may move ``x``.
     """
 
     x: Tensor
     report: SolveReport
     factor: Tensor | None
+    moves: Tensor
 
 
 def solve_symmetric(
@@ -131,7 +142,7 @@ def solve_symmetric(
 
     Example:
         >>> twice = torch.ones(2, 2, dtype=torch.float64)  # one bin, twice
-        >>> x, report, _ = solve_symmetric(twice, twice[0], penalty=1e30)
+        >>> x, report, *_ = solve_symmetric(twice, twice[0], penalty=1e30)
         >>> x, report.method, report.rank
         (tensor([0.5000, 0.5000], dtype=torch.float64), 'eigen', 1)
     """
@@ -171,9 +182,10 @@ def solve_symmetric(
         if condition <= (limit if most_condition is None else min(limit, most_condition)):
             factor.mul_(scale[:, None])
             x = torch.cholesky_solve(right[:, None], factor)[:, 0]
+            noise = _noise(scale * x) * scale[:, None]
             error = math.sqrt(size) * _EPS * condition
             report = replace(report, condition=condition, error=error)
-            return Solution(_finite(x, name), report, factor)
+            return Solution(_finite(x, name), report, factor, torch.cholesky_solve(noise, factor))
         reason = f"{name} + I/C at penalty={penalty:g} has condition {condition:.1e}"
         if most_condition is not None:
             raise ValueError(f"{reason}, wanted up to {most_condition:.0e}; lower the penalty")
@@ -185,10 +197,10 @@ def solve_symmetric(
             f"{float(weights.min()):.1e} to {float(weights.max()):.1e} too far apart to leave only "
             "noise out; bring them closer, or lower the penalty"
         )
-    x, report = _truncated(matrix, right, report, weights.sqrt(), in_span, name)
+    x, report, moves = _truncated(matrix, right, report, weights.sqrt(), in_span, name)
     if not math.isinf(penalty) or (report.left_out or 0.0) > _LARGEST_UNSAID:
         log.warning("%s: solved by %s", name, report)
-    return Solution(_finite(x, name), report, None)
+    return Solution(_finite(x, name), report, None, moves)
 
 
 def solve_by_autograd(system: Tensor, right: Tensor) -> Tensor:
@@ -220,8 +232,8 @@ def _truncated(
     roots: Tensor,
     in_span: bool,
     name: str,
-) -> tuple[Tensor, SolveReport]:
-    """The solution on what is above rounding; ``roots`` are those of the weights.
+) -> tuple[Tensor, SolveReport, Tensor]:
+    """The solution on what is above rounding, and how it moves; ``roots`` are of the weights.
 
     Raises:
         ValueError: if the matrix is not positive semi-definite, its rounding drowns what is kept,
@@ -274,9 +286,24 @@ def _truncated(
         unseen = unseen.clamp(max=max(ridge, _TINY))  # where it would add most
     left_out = added(unseen)
     error = max(error, left_out)
-    return roots * (vectors @ solved), replace(
+    report = replace(
         report, method="eigen", condition=condition, rank=rank, error=error, left_out=left_out
     )
+    noise = top * _noise(solved) / torch.where(kept, values + ridge, math.inf)[:, None]
+    return roots * (vectors @ solved), report, roots[:, None] * (vectors @ noise)
+
+
+def _noise(x: Tensor) -> Tensor:
+    """What roundings of a matrix with a norm of one may add to its product with ``x``, ``[n, 8]``.
+
+    Each of its entries is off by a few eps, independently, so each of the product by as much of the
+    length of ``x``.
+    """
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.randn(len(x), _MOVES, generator=generator, dtype=torch.float64).to(x.device)
+    size: Tensor = torch.linalg.vector_norm(x)
+    moved: Tensor = _ROUNDINGS * _EPS * size * normal
+    return moved
 
 
 def _condition(factor: Tensor, norm: float) -> float:
