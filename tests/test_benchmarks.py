@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -22,27 +20,36 @@ SUBJECTS = [
 """Benchmarks of the harness, one a file; ``crossval_general`` is another's."""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SUBJECTS)
-def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path) -> None:
-    arguments = ["--quick", "--out", str(tmp_path)]
-    if name in ("real", "realism"):
-        arguments.append(f"data.root={_real_set(tmp_path / 'set')}")
-    _run(name, *arguments)
-    assert json.loads((tmp_path / f"{name}.json").read_text())["quick"]
-    assert (tmp_path / f"{name}.md").read_text().count("|") > 10
-    assert (tmp_path / f"{name}.png").stat().st_size > 10_000
-    _run(name, "--render", *arguments)
-
-
-@pytest.mark.parametrize("name", SUBJECTS)
-def test_a_section_has_its_place_in_a_page(name: str) -> None:
+def _subject(name: str) -> type[Benchmark]:
     module = import_module(f"benchmarks.{name}")
     (subject,) = (
         of
         for of in vars(module).values()
         if isinstance(of, type) and issubclass(of, Benchmark) and of.__module__ == module.__name__
     )
+    return subject
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path, monkeypatch) -> None:
+    """In this process: commands that a subject runs have theirs."""
+    monkeypatch.chdir(ROOT)
+    arguments = ["--quick", "--out", str(tmp_path)]
+    if name in ("real", "realism"):
+        arguments.append(f"data.root={_real_set(tmp_path / 'set')}")
+    subject = _subject(name)()
+    assert subject.run(arguments) == 0
+    assert json.loads((tmp_path / f"{name}.json").read_text())["quick"]
+    assert (tmp_path / f"{name}.md").read_text().count("|") > 10
+    assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+    assert subject.run(["--render", *arguments]) == 0
+
+
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_a_section_has_its_place_in_a_page(name: str) -> None:
+    subject = _subject(name)
     page = (ROOT / subject.page).read_text(encoding="utf-8")
     marker = subject.markers or subject.name
     assert f"<!-- {marker} -->" in page
@@ -73,12 +80,6 @@ def test_only_what_stands_between_the_markers_is_replaced() -> None:
     assert between_markers(text, "a", "new") == text.replace("old", "new")
     with pytest.raises(ValueError, match="not both there"):
         between_markers(text, "b", "new")
-
-
-def _run(name: str, *arguments: str) -> None:
-    command = [sys.executable, "-m", f"benchmarks.{name}", *arguments]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
 
 
 def _real_set(root: Path) -> Path:

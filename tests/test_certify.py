@@ -153,7 +153,7 @@ def test_the_exit_status_is_0_if_it_holds_and_1_if_not(run, tmp_path):
         ("evaluate=[train]", "got calibrate=train evaluate=[train]"),
         ("fold=other", "fold must be one of unseen4, got other"),
         ("data.channels=3", "the features expect 4 channels SG1..PVDF2, the recordings have 3"),
-        ("+scene.broken=A/0", "repair or leave out A/0"),
+        ("+data.broken=A/0", "repair or leave out A/0"),
         ("out=taken", "taken is a file, out= must be a folder; give another"),
         ("out=taken/deeper", "taken is a file, out= must be a folder; give another"),
         ("out=foreign", "certificate.json is no certificate of ours; move it, or give another"),

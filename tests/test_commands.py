@@ -35,21 +35,21 @@ BAD_INPUT = (ValueError, KeyError, TypeError, OSError, InstantiationException)
 class TinyRecordings:
     """Recordings of a stand-in for real sensors: two strokes, louder while the hand slides.
 
-    ``scene`` may hold ``slide_s``, ``quiet`` (materials that never slip long enough for a bin),
-    ``broken`` (a recording that ends in NaN) and ``rate``; ``channels`` how many of the four
-    channels there are.
+    ``scene`` may hold ``slide_s``, ``quiet`` (materials that never slip long enough for a bin) and
+    ``rate``; ``channels`` says how many of the four channels there are, ``broken`` which recording
+    ends in NaN.
     """
 
     is_simulated = False
 
-    def __init__(self, seed, cycles, materials, channels=None, scene=None, **simulated):
+    def __init__(self, seed, cycles, materials, channels=None, scene=None, broken="", **simulated):
         rows = [
             {"name": f"{kind}{i}", "kind": kind, "finger": finger, "segment": "distal"}
             for kind in ("SG", "PVDF")
             for i, finger in enumerate(("index", "thumb"), 1)
         ]
         self.hand = HandLayout.from_rows(rows[-channels:] if channels else rows)
-        knobs = {"slide_s": 0.8, "quiet": (), "rate": 2000.0, "broken": ""} | (scene or {})
+        knobs = {"slide_s": 0.8, "quiet": (), "rate": 2000.0, "broken": broken} | (scene or {})
         assert not simulated.get("extra_scenes")
         self.sample_rate_hz = knobs["rate"]
         self.ids = tuple(RecordingId(m, c) for m in materials for c in range(cycles))
@@ -447,7 +447,7 @@ def test_every_experiment_runs_fast(name, tmp_path):
     """One recording of each pass, or two; the whole set is named, not simulated."""
     overrides = (f"+exp={name}", "num_workers=0", f"cache={tmp_path / 'cache'}", "export=false")
     # the first recordings of these are of scenes without slip
-    num = {"confound": 2, "deploy": 2, "onset": 4, "biotacsp_dos": 2}.get(name, 1)
+    num = {"confound": 2, "deploy": 2, "onset": 7, "biotacsp_dos": 2}.get(name, 1)
     told = write_biotac(tmp_path / "biotac") if name == "biotacsp_dos" else []
     if name == "deploy":
         told = ["~recipe.scene_weights"]  # of scenes that one recording does not have

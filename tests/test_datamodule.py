@@ -115,3 +115,5 @@ def test_loaders_give_the_recordings_of_their_roles_in_order(num_workers):
     assert trained == data.split.having("train")
     assert len(trained) == 8
     assert [batch.recording for batch in data.test_dataloader()] == sorted(source.ids)
+    with pytest.raises(ValueError, match="9 processes or shards for 8 recordings; use fewer"):
+        data.loader(["train"], parts=9)
