@@ -300,6 +300,17 @@ def test_bad_input_is_one_line(run, overrides, message):
     assert content(run) == state
 
 
+def test_a_detector_without_its_statistics_says_how_to_get_them(run, trained):
+    other = SlipDetector.load(run / "detector.pt")
+    other.head.constant += 1
+    other.save(run / "detector.pt")
+    with pytest.raises(ValueError, match="belongs to another detector"):
+        adapt(settings(run, "action=list"), run / "results")
+    (run / "statistics.pt").unlink()
+    with pytest.raises(FileNotFoundError, match="train with recipe=robust statistics=true"):
+        adapt(settings(run, "action=list"), run / "results")
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

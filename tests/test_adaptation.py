@@ -14,6 +14,7 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.training import adaptation
 from tactslip_torch.training.adaptation import (
     FACTORS,
+    AccuracyChange,
     KnownBins,
     Machine,
     RecordingBins,
@@ -121,6 +122,17 @@ def test_machine_and_scores_without_a_recording_are_those_of_refits(old, trained
         found = solved.scores[solved.known.of_recordings([name])]
         expected = refitted_without(name, everyone[name].z)
         torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-9)
+
+
+def test_a_change_of_accuracy_names_what_falls():
+    same = {"a": 0.9, "b": 0.8}
+    assert AccuracyChange(same, same).problem(0.0) is None
+    assert AccuracyChange({}, {}).problem(0.0) is None
+    fall = AccuracyChange(same, {"a": 0.88, "b": 0.8})
+    assert fall.problem(0.0101) is None
+    assert fall.problem(0.005).startswith("old materials fall from 85.00 to 84.00 %")
+    of_one = AccuracyChange(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7})
+    assert of_one.problem(0.01).startswith("b falls from 80.00 to 75.00 %")  # four times as much
 
 
 def test_known_bins_of_a_recording_give_way_to_those_that_changed(old, trained, new):

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from tactslip_torch.data.labels import NO_POSITION, LabelRule, label_bins
+from tactslip_torch.data.labels import LabelRule, label_bins
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.onset.events import LatencyParts
 from tactslip_torch.training.datamodule import RecordingFeatures
@@ -129,19 +129,6 @@ def test_random_decisions_raise_the_alarms_that_rules_by_hand_do(layout, hop_ms)
             ]
             assert events[name].false_alarms_s == pytest.approx(false)
             assert sum(own) == len(alarms) - len(false) > 0
-
-
-def test_bins_of_no_stroke_are_watched_and_a_hole_between_them_is_not():
-    batch = batch_of(onsets=(), ends=(), stretches=((1.0, 3.0), (5.0, 6.0)))
-    assert bool((batch.position == NO_POSITION).all())
-    says_slip = torch.zeros(60, dtype=torch.bool)
-    says_slip[[10, 39, 40, 59]] = True  # the last of the first stretch, the first of the second
-    events = events_of(batch, says_slip)
-    assert events["first_transition"].quiet_s == pytest.approx(3.0)
-    expected = [1.55 + 0.0125, 3.0 + 0.0125, 5.05 + 0.0125, 6.0 + 0.0125]
-    assert events["first_transition"].false_alarms_s == pytest.approx(expected)
-    assert events["two_of_three"].false_alarms_s == ()
-    assert events["first_transition"].onsets == ()
 
 
 def test_stretches_of_slip_and_of_none_are_watched_in_the_order_of_time():

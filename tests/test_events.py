@@ -189,18 +189,6 @@ def test_numbers_of_many_are_sums_of_what_the_loops_count(rng):
     json.dumps(metrics, allow_nan=False)
 
 
-def test_order_and_shift_change_no_bit(rng):
-    made = [random_recording(rng, number) for number in range(20)]
-    for one in made:  # of the whole, a shift would add a time in front
-        one["stretches"] = one["stretches"] or [(0, one["duration"])]
-    before = event_metrics([as_watched(one) for one in made], RULES, LATENCY)
-    turned = event_metrics([as_watched(one) for one in made[::-1]], RULES, LATENCY)
-    shifted = [as_watched(one, shift_s=1234.5678) for one in made]
-    assert turned == before
-    assert list(turned["per_material"]) == list(before["per_material"])
-    assert event_metrics(shifted, RULES, LATENCY) == before
-
-
 def test_rounding_moves_no_alarm_over_an_edge():
     assert 0.9 < 1.1 - 0.2  # as floats see it
     assert outcomes([0.9], [1.1]) == ["early"]

@@ -7,6 +7,7 @@ precisions. Kinds of bins at 100 samples, and engines, stand in ``contract/test_
 
 import math
 import zlib
+from functools import cache
 
 import numpy as np
 import onnxruntime
@@ -106,17 +107,28 @@ def assert_close(found, expected, names, tolerance, least=0.0):
 # Equal to the oracle -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("options", OPTIONS, ids=str)
-def test_every_feature_equals_the_oracle(options, backend, rng):
+@cache
+def oracle_of(place, dtype):
+    """Bins of a length, rounded to a dtype, and their features by the oracle: of all backends."""
+    options, rng = OPTIONS[place], np.random.default_rng(place)
     num = options.get("bin_samples", 100)
     bins = rng.standard_normal((9, 3, num))
     bins[6:] = oracles.integer_bins(rng, 3, 3, num)  # ties, and an offset
     bins[6:] += [[3.0], [2.0], [-5.0]]
-    found, bins = features_by(backend, bins, **options)
+    bins = bins.astype(dtype).astype(np.float64)
     given = {k: v for k, v in options.items() if k not in ("bin_samples", "spectrum")}
     method = options.get("spectrum", "reference")
-    expected = np.stack([oracles.pool(one, 1, method=method, **given) for one in bins])
+    return bins, np.stack([oracles.pool(one, 1, method=method, **given) for one in bins])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+def test_every_feature_equals_the_oracle(options, backend):
+    bins, expected = oracle_of(
+        OPTIONS.index(options), backend.split()[-1].replace("torch", "float64")
+    )
+    found, given = features_by(backend, bins, **options)
+    assert np.array_equal(given, bins)
     names = oracles.pool_names(1, 2, options.get("level", 4))
     assert_close(found, expected, names, BACKENDS[backend])
 

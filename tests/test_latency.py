@@ -3,7 +3,6 @@
 import json
 
 import pytest
-import torch
 from small_detector import HAND, small_detector
 
 from tactslip_torch.analysis import latency as module
@@ -22,7 +21,6 @@ from tactslip_torch.analysis.latency import (
 )
 from tactslip_torch.features.bank import make_plan
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.selection import rank_per_cost
 from tactslip_torch.signals.filtering import ChannelFilter
 
 RATE_HZ = 2000
@@ -132,18 +130,6 @@ def test_shared_work_is_on_the_bill_once(names, bill):
     assert MODEL.compute_us(detector_parts(needed, everything)) == pytest.approx(priced(**bill))
     pooled = priced(**bill | {"columns": 5, "pooled": len(names)})  # five numbers of all of them
     assert MODEL.compute_us(detector_parts(needed, everything, 5)) == pytest.approx(pooled)
-
-
-def test_the_bill_for_a_ranking_adds_up_and_no_column_is_free():
-    needed = parts("SG1 raw time mean", "PVDF1 A2 time median", "PVDF1 A2 time std")
-    needs, prices = MODEL.bill(needed)
-    for row, own in zip(needed, (needs.long() @ prices).tolist(), strict=True):
-        assert own == pytest.approx(1000 * (MODEL.compute_us(row) / 2 - 0.5))
-    nothing = dict.fromkeys(GROUPS, 0.0)
-    needs, prices = CostModel(0.0, nothing, nothing).bill(needed)
-    assert (needs.long() @ prices == 1).all()
-    # of equal price the higher score wins: nothing is taken just because it is free
-    assert rank_per_cost(torch.tensor([1.0, 3.0, 2.0]), needs, prices, 3).tolist() == [1, 2, 0]
 
 
 def test_prices_are_found_again_in_timings_that_follow_them(monkeypatch):

@@ -1,7 +1,6 @@
 """Tables and figures of a run: what they say, of what, and that files are written whole."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -303,21 +302,6 @@ def test_a_figure_is_written_whole_and_says_what_is_simulated(drawn, tmp_path, n
     FIGURES[name](path, simulated)
     assert_png(path)
     assert ("SIMULATED" in drawn[0].get_suptitle()) == simulated
-
-
-def test_a_failed_write_keeps_the_older_figure(tmp_path, monkeypatch):
-    path = tmp_path / "figure.png"
-    path.write_bytes(b"an older figure")
-
-    def full_disk(self, target, **_):
-        Path(target).write_bytes(b"half")
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", full_disk)
-    with pytest.raises(OSError, match="no space left"):
-        confusion_figure(metrics_of(), path)
-    assert path.read_bytes() == b"an older figure"
-    assert list(tmp_path.iterdir()) == [path]
 
 
 # All of a run ----------------------------------------------------------------------------------

@@ -84,27 +84,6 @@ def test_loss_is_the_mean_over_groups_and_classes_by_the_slope_of_least_loss(rng
     assert grouped_loss(scores + 1.0, is_slip, groups).loss > fitted.loss + 0.05  # decides at 0
 
 
-def test_few_bins_of_each_group_and_class_keep_the_weight_of_their_class(small, bins):
-    _, sample, plan, _ = small
-    for kind in (True, False):
-        own = bins.is_slip == kind
-        assert bins.group[own].bincount().tolist() == [12] * 3
-        total = sample_weight(RECIPE, sample)[sample.is_slip == kind].sum()
-        assert float(bins.weights[own].sum()) == pytest.approx(float(total))
-    sampled = sample.features[:, list(plan.selection.selected)].double()
-    assert set(map(tuple, bins.features.tolist())) <= set(map(tuple, sampled.tolist()))
-
-
-def test_a_scaler_holds_what_scales_do(settings, bins, small):
-    settings.requires_grad_(False)
-    expected = small[2].selection.scaler(bins.features)
-    torch.testing.assert_close(settings.scaled(bins.features), expected, rtol=0, atol=1e-12)
-    assert (float(settings.penalty), float(settings.offset)) == pytest.approx((0.1, 0.5))
-    settings.logs["scales"].copy_(torch.linspace(0.5, -2, 6))
-    z = settings.scaled(bins.features)
-    torch.testing.assert_close(settings.scaler()(bins.features), z, rtol=0, atol=1e-12)
-
-
 def test_gradients_of_every_setting_are_those_of_differences(settings, bins):
     with torch.no_grad():  # away from the start, where clipped values lie on the edge
         settings.logs["scales"] -= 0.1
