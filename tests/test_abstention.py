@@ -173,12 +173,12 @@ def test_thresholds_survive_the_file_and_decide_where_it_abstains(tmp_path):
     score = torch.tensor([-1.0, -0.1, 0.1, 1.0, 1.0])
     is_valid = torch.tensor([True, True, True, True, False])
     decisions = Decider(settings, 2000.0, 100, 25).decide(score, is_valid)
-    assert Abstention.of(detector.info) is None
+    assert Abstention.of(detector) is None
     assert answer_of(detector, decisions).tolist() == [0, 0, 1, 1, -1]  # by the sign
     detector.info[KEY] = kept.to_dict()
     assert answer_of(detector, decisions).tolist() == [0, -1, -1, 1, -1]
     detector.save(tmp_path / "a.pt")
-    assert Abstention.of(SlipDetector.load(tmp_path / "a.pt").info) == kept
+    assert Abstention.of(SlipDetector.load(tmp_path / "a.pt")) == kept
     assert replace(kept, high=0.0).answer(torch.zeros(1)).tolist() == [1]
 
 

@@ -95,7 +95,7 @@ def export_detector(
 def _metadata(detector: SlipDetector, kind: GraphKind, precision: Precision) -> dict[str, Any]:
     """All that a host must know of a graph."""
     hand, info, raw = detector.pool.hand, detector.info, RawBin.of(detector)
-    calibrated, abstain = calibration_of(detector), Abstention.of(detector.info)
+    calibrated, abstain = calibration_of(detector), Abstention.of(detector)
     metadata = {
         "format": FORMAT,
         "version": __version__,

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -29,6 +29,12 @@ SLIP, NON_SLIP, ABSTAIN = 1, 0, -1
 """What ``Abstention.answer`` is made of."""
 
 _ROUNDING = 1e-12  # of a risk, which is a mean of at most some 1e6 shares
+
+
+class _HasInfo(Protocol):
+    """A ``SlipDetector``."""
+
+    info: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -141,9 +147,9 @@ class Abstention:
             raise ValueError(f"no thresholds of abstention of this version: {error}") from None
 
     @classmethod
-    def of(cls, info: Mapping[str, Any]) -> Abstention | None:
-        """The thresholds in a detector's ``info``, None if there are none: it never abstains."""
-        plain = info.get(KEY)
+    def of(cls, detector: _HasInfo) -> Abstention | None:
+        """The thresholds in a detector's file, None if there are none: it never abstains."""
+        plain = detector.info.get(KEY)
         return None if plain is None else cls.from_dict(plain)
 
 

@@ -521,7 +521,7 @@ def answer_of(detector: SlipDetector, decisions: Decisions) -> Tensor:
     Shape:
         - output: ``[*, m]`` as the decisions, int8
     """
-    abstention = Abstention.of(detector.info) or Abstention(0.5, 0.0, 0.0)
+    abstention = Abstention.of(detector) or Abstention(0.5, 0.0, 0.0)
     given = abstention.answer(decisions.score)
     return given.masked_fill(~decisions.is_valid, ABSTAIN)
 

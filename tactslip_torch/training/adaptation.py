@@ -834,7 +834,7 @@ def refitted(
             info["calibration"] = calibration or info["calibration"]
         if ALARM in info:
             info[ALARM] = _alarm(info[ALARM], calibration)
-    if (abstention := Abstention.of(new.info)) is not None:
+    if (abstention := Abstention.of(new)) is not None:
         info[ABSTAIN] = _thresholds(bins, known, machine, abstention)
     return new
 

@@ -360,7 +360,7 @@ class SlipLearner(L.LightningModule):
         scaled = self.detector.scaled(chosen.to(device))
         score = self.detector.head(scaled).cpu()
         baselines = self.baselines(batch.features, scaled.cpu()) if self.baselines else {}
-        abstention = Abstention.of(self.detector.info)
+        abstention = Abstention.of(self.detector)
         answer = abstention.answer(score) if abstention else None
         for role, part in evaluated_bins(batch, score >= 0, baselines, answer).items():
             self._evaluated[role].append(part)
@@ -373,7 +373,7 @@ class SlipLearner(L.LightningModule):
         baselines = self.baselines.metadata() if self.baselines else {}
         for about in baselines.values():
             about["splits"] = {}
-        pool, abstention = self.detector.pool, Abstention.of(self.detector.info)
+        pool, abstention = self.detector.pool, Abstention.of(self.detector)
         latency = LatencyParts(
             self.detector.look_ahead / pool.sample_rate_hz, pool.bin_samples / pool.sample_rate_hz
         )
