@@ -262,9 +262,8 @@ def _budget_rows(seeds: Mapping[str, Any]) -> list[dict[str, Any]]:
         alarms, amount = sum(row["alarms"] for row in rows), sum(row["amount"] for row in rows)
         if not amount:
             continue
-        low, high = (replace(budget, confidence=side) for side in (0.025, 0.975))
-        least = low.bound(alarms - 1, amount) if alarms else 0.0
-        ends = f"[{factor * least:.2f}, {factor * high.bound(alarms, amount):.2f}]"
+        low, high = budget.interval(alarms, amount)
+        ends = f"[{factor * low:.2f}, {factor * high:.2f}]"
         within = sum(row["rate"] <= row["limit"] for row in rows if row["amount"])
         own = cells.setdefault(
             (scene, role),

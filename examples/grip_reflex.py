@@ -88,7 +88,9 @@ def alarms_of(run: Path) -> tuple[SlipDetector, dict[str, AlarmSettings]]:
     names = [each.name for each in fields(AlarmSettings) if each.name != "onset"]
     others = [
         AlarmSettings.from_dict(
-            {name: methods[method][name] for name in names}, hand, detector.pool.sample_rate_hz
+            {name: value for name, value in methods[method].items() if name in names},
+            hand,
+            detector.pool.sample_rate_hz,
         )
         for method in (joint.rule.name, DETAIL)
     ]

@@ -108,6 +108,13 @@ class AlarmSettings:
         """A length of time in decisions, rounded up."""
         return -(-round(seconds * sample_rate_hz) // self.decision_samples)
 
+    def latch_times(self, sample_rate_hz: float) -> dict[str, int]:
+        """What a latch is told, in decisions."""
+        return {
+            "rearm": self.decisions(self.rearm_s, sample_rate_hz),
+            "refractory": self.decisions(self.refractory_s, sample_rate_hz),
+        }
+
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain JSON types."""
         plain = dict(self.__dict__)
@@ -343,8 +350,7 @@ class Decider:
         self.settings = settings
         self._rate = sample_rate_hz
         self._first, self._frame = bin_samples + look_ahead, frame_samples
-        self._rearm = settings.decisions(settings.rearm_s, sample_rate_hz)
-        self._refractory = settings.decisions(settings.refractory_s, sample_rate_hz)
+        self._latch_times = settings.latch_times(sample_rate_hz)
         self.reset()
 
     def reset(self) -> None:
@@ -481,9 +487,8 @@ class Decider:
         self, rows: list[list[float]], threshold: float, latches: list[Latch]
     ) -> tuple[Tensor, Tensor, list[Latch]]:
         """Alarms of every stream, whether one stands, and the latches after them."""
-        times = {"rearm": self._rearm, "refractory": self._refractory}
         made = [
-            latch(row, threshold, **times, state=state)
+            latch(row, threshold, **self._latch_times, state=state)
             for row, state in zip(rows, latches, strict=True)
         ]
         alarms, standing = (

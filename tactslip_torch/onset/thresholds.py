@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -177,6 +177,11 @@ class Budget:
         if alarms >= amount:
             return 1.0
         return float(betaincinv(alarms + 1, amount - alarms, self.confidence))
+
+    def interval(self, alarms: int, amount: float, level: float = 0.95) -> tuple[float, float]:
+        """The central interval of the rate, or share, that so many alarms show."""
+        low, high = (replace(self, confidence=(1 + side * level) / 2) for side in (-1, 1))
+        return low.bound(alarms - 1, amount) if alarms else 0.0, high.bound(alarms, amount)
 
     def allowed(self, amount: float) -> int:
         """Most alarms in so many hours, or knocks, whose bound lies within the limit.

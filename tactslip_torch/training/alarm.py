@@ -306,10 +306,7 @@ def threshold_curve(
     falling = np.sort(np.concatenate(scores))[::-1]
     falling = falling[falling > NOTHING_YET]
     ranks = np.unique(np.geomspace(1, len(falling), _NUM_TRIED).astype(int)) - 1
-    times = {
-        "rearm": settings.decisions(settings.rearm_s, rate_hz),
-        "refractory": settings.decisions(settings.refractory_s, rate_hz),
-    }
+    times = settings.latch_times(rate_hz)
     points = list[list[float]]()
     for value in dict.fromkeys(falling[ranks].tolist()):
         alarms = sum(
@@ -365,18 +362,18 @@ def _push_seconds(detector: SlipDetector, settings: AlarmSettings) -> float:
     return statistics.median(seconds[_PUSHES // 10 :])
 
 
-def _lead_s(streams: Sequence[Stream], settings: AlarmSettings, timing: Timing) -> float:
-    """From an onset to where the run of ratios that found it began: the median."""
+def _lead_s(
+    streams: Sequence[Stream], settings: AlarmSettings, timing: Timing, by_onset: bool
+) -> float:
+    """From an onset to what alarms of one of the classifiers estimate it to be: the median."""
     errors = []
-    for stream, decisions in decide(streams, settings, timing):
-        seen = watched(stream, decisions)
-        for onset_s in seen.onsets_s:
-            later = [
-                estimate - onset_s
-                for alarm, estimate in zip(seen.alarms_s, seen.onset_estimates_s, strict=True)
-                if onset_s <= alarm <= onset_s + EventRules().found_within_s
-            ]
-            errors += later[:1]
+    for stream, made in decide(streams, settings, timing):
+        own, times = made.is_alarm & (made.by_onset == by_onset), stream.times
+        alarms = list(zip(made.available_s[own].tolist(), made.onset_s[own].tolist(), strict=True))
+        firsts = first_releases(times.onsets_s, times.released_s)
+        for first_s, onset_s in zip(firsts, times.onsets_s, strict=True):
+            until_s = onset_s + EventRules().found_within_s
+            errors += [at - onset_s for alarm_s, at in alarms if first_s <= alarm_s <= until_s][:1]
     return statistics.median(errors) if errors else 0.0
 
 
@@ -710,22 +707,12 @@ class CalibratedAlarm:
             if all(row["alarms"] <= row["allowed"] for row in rows):
                 break
             value *= _STEP
-        lead_s = _lead_s(streams, replace(settings, onset=None), timing)
+        lead_s = _lead_s(streams, replace(settings, onset=None), timing, by_onset=False)
+        settings = replace(settings, lead_s=lead_s)
         if settings.onset is None:
-            return replace(settings, lead_s=lead_s)
-        leads = [
-            alarm_s - onset_s
-            for stream, made in decide(streams, settings, timing)
-            for alarm_s in made.available_s[made.is_alarm & made.by_onset].tolist()
-            for first_s, onset_s in zip(
-                first_releases(stream.times.onsets_s, stream.times.released_s),
-                stream.times.onsets_s,
-                strict=True,
-            )
-            if first_s <= alarm_s <= onset_s + EventRules().found_within_s
-        ]
-        joint = replace(settings.onset, lead_s=statistics.median(leads) if leads else 0.0)
-        return replace(settings, onset=joint, lead_s=lead_s)
+            return settings
+        lead_s = _lead_s(streams, settings, timing, by_onset=True)
+        return replace(settings, onset=replace(settings.onset, lead_s=lead_s))
 
     def _settings(self, rule: Rule, calibration: Calibration, hop_samples: int) -> AlarmSettings:
         """Without a threshold yet."""
@@ -774,7 +761,7 @@ class CalibratedAlarm:
         of_allowed: float = 1.0,
     ) -> float:
         """The lowest threshold of a score that keeps every budget, or so much of each."""
-        times = self._times(settings)
+        times = settings.latch_times(self.streams.sample_rate_hz)
         return max(
             lowest_threshold(
                 getattr(scores, name),
@@ -790,7 +777,10 @@ class CalibratedAlarm:
         """The settings, with what their thresholds gave on the recordings that they were set on."""
         rows = list[dict[str, Any]]()
         for budget, scores in scored.items():
-            alarms, amount = scores.alarms(settings, self._times(settings)), scores.amount(budget)
+            alarms, amount = (
+                scores.alarms(settings, settings.latch_times(self.streams.sample_rate_hz)),
+                scores.amount(budget),
+            )
             rows.append(
                 {
                     "scene": budget.scene,
@@ -818,13 +808,6 @@ class CalibratedAlarm:
     @property
     def _rate_per_h(self) -> float:
         return 3600 * self.streams.sample_rate_hz
-
-    def _times(self, settings: AlarmSettings) -> dict[str, int]:
-        rate = self.streams.sample_rate_hz
-        return {
-            "rearm": settings.decisions(self.rearm_s, rate),
-            "refractory": settings.decisions(self.refractory_s, rate),
-        }
 
     def _say_what_costs(self, numbers: Mapping[str, Any], settings: AlarmSettings) -> None:
         """Warn where budgets leave fewer slips found than wanted, and name what costs them."""
@@ -862,13 +845,7 @@ class CalibratedAlarm:
                 amount = sum(len(self.streams.timeline(one).non_slip_s) for one in own)
             if not amount:
                 continue
-            sides = ((1 - self.level) / 2, (1 + self.level) / 2)
-            low, high = (
-                replace(budget, confidence=side).bound(alarms - (side < 0.5), amount)
-                if alarms or side > 0.5
-                else 0.0
-                for side in sides
-            )
+            low, high = budget.interval(alarms, amount, self.level)
             rows.append(
                 {
                     "role": role,
