@@ -130,7 +130,7 @@ def test_a_classifier_of_features_is_kept_too(data: Any, tmp_path: Path) -> None
 
 
 def test_an_exported_file_scores_as_the_classifier(
-    data: Any, fitted: SlipClassifier, tmp_path: Path
+    data: Any, fitted: SlipClassifier, tmp_path: Path, capfd: Any
 ) -> None:
     import onnxruntime
 
@@ -139,6 +139,7 @@ def test_an_exported_file_scores_as_the_classifier(
     given = session.get_inputs()[0]
     (score, *_) = session.run(None, {given.name: data[0].astype(np.float32)})
     np.testing.assert_allclose(-score, fitted.decision_function(data[0]), atol=1e-4)
+    assert capfd.readouterr().err == ""
 
 
 MISTAKES = {

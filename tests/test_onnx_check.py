@@ -51,11 +51,9 @@ def bin_run(detector, change=lambda samples, out: out):
     context = detector.context_before - raw.before, detector.context_after - raw.after
 
     def run(inputs):
-        samples, mask = (torch.tensor(inputs.get(k, [])) for k in ("samples", "masked_channels"))
+        samples = torch.tensor(inputs["samples"])
         with torch.no_grad():
-            score, is_valid, *_ = single.predict_raw(
-                pad(samples, context), masked_channels=mask if len(mask) else None
-            )
+            score, is_valid, *_ = single.predict_raw(pad(samples, context))
         stated = probability(settings.calibration.llr(score), settings.slip_share)
         out = {"score": score.numpy(), "probability": stated.numpy(), "valid": is_valid.numpy()}
         return change(samples, out)
@@ -139,7 +137,7 @@ def test_a_right_bin_graph_passes_and_is_measured(detector):
     assert found["bins"] == 320
     assert 0 < found["worst_sd"] < 1e-3
     assert set(found["degenerate_worst_sd"]) == set(DEGENERATE)
-    assert list(found["masked_worst_sd"]) == ["the first", "every other", "all"]
+    assert list(found["missing_worst_sd"]) == ["the first", "every other", "all"]
 
 
 def test_a_probability_comes_only_of_a_calibration(detector):
@@ -173,10 +171,7 @@ class StreamRun:
         if not inputs["tail"].size or not self.remembers:
             settings = AlarmSettings.of(self.detector)
             settings = replace(settings, threshold=float(inputs["threshold"][0]))
-            masked = torch.tensor(inputs.get("masked_channels", [False] * 4))
-            self.stream = StreamingDetector(
-                self.detector, settings, dtype=torch.float32, masked_channels=masked
-            )
+            self.stream = StreamingDetector(self.detector, settings, dtype=torch.float32)
         made = self.stream.push(inputs["samples"])
         out = {name: getattr(made, field).numpy() for name, field in STREAM_OUTPUTS.items()}
         out["next_tail"] = np.zeros((self.timing.tail, 4), np.float32)

@@ -19,7 +19,7 @@ from tactslip_torch.deploy.stream import (
     onset_scores,
     stream_graph,
 )
-from tactslip_torch.deploy.value import BOOL, F32, F64, I64, Graph
+from tactslip_torch.deploy.value import F32, F64, I64, Graph
 from tactslip_torch.model.calibration import LARGEST_LLR, Isotonic, Platt, probability
 from tactslip_torch.onset.decisions import AlarmSettings, score_stream
 from tactslip_torch.onset.evidence import OnsetStream
@@ -172,7 +172,7 @@ def test_fast_evidence_in_any_cut_is_that_of_the_detector(
 
 
 @pytest.mark.parametrize("kinds", ["F", "FF", "GF", "GGF"])
-def test_onset_scores_of_any_hand_and_mask(kinds):
+def test_onset_scores_of_any_hand_with_channels_missing(kinds):
     hand = some_hand(kinds)
     names = [{"G": 0, "F": 2}[kind] + i % 2 for i, kind in enumerate(kinds)]
     samples = signal(4000, 6)[names]
@@ -181,18 +181,18 @@ def test_onset_scores_of_any_hand_and_mask(kinds):
     for masked in ([False] * len(hand), [False, *[True] * (len(hand) - 1)]):
         graph = Graph()
         x, memory = graph.input("x", F64, ("n", len(hand))), graph.input("memory", F64, ("m",))
-        mask, places = graph.input("mask", BOOL, (len(hand),)), graph.input("places", I64, ("k",))
-        made = onset_scores(x, places, memory, classifier, mask)
+        places = graph.input("places", I64, ("k",))
+        made = onset_scores(x, places, memory, classifier)
         for name, value in zip("sm", made, strict=True):
             graph.output(name, value, ("j",))
         run, evidence = runner(session_of(graph.model())), classifier.evidence
         memory = np.full(memory_size(evidence), np.nan)
         before = np.full((evidence.context, len(hand)), np.nan)
         held, found = np.concatenate([before, samples.T.numpy()]), []
+        held[:, masked] = np.nan
         for start, stop in pairwise([0, 1, 2, 100, 350, 398, 400]):
             piece = held[10 * start : 10 * stop + evidence.context]
-            feeds = {"x": piece, "places": np.arange(stop - start), "memory": memory}
-            made = run(feeds | {"mask": np.array(masked)})
+            made = run({"x": piece, "places": np.arange(stop - start), "memory": memory})
             found.append(made["s"])
             memory = made["m"]
         expected = OnsetStream(classifier).push(samples, torch.tensor(masked))

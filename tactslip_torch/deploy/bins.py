@@ -96,7 +96,6 @@ def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph
 
     Shape:
         - in ``samples``: ``[batch, C, RawBin.length]``, volts
-        - in ``masked_channels``: ``[C]``, bool; may be left out: none is
         - out ``score``, ``valid`` (bool) and, if calibrated, ``probability``: ``[batch]``
 
     Raises:
@@ -105,14 +104,13 @@ def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph
     graph, raw, dtype = Graph(), RawBin.of(detector), dtype_of(precision)
     num_channels = len(detector.pool.hand)
     samples = graph.input("samples", dtype, ("batch", num_channels, raw.length))
-    masked = masked_input(graph, detector)
     calibrated = calibration_of(detector)
     outputs: dict[str, np.dtype[Any]] = {"score": dtype, "valid": BOOL}
     if calibrated is not None:
         outputs["probability"] = dtype
 
     def scores() -> list[Value]:
-        found = score_bins(samples.take(raw.channels, 1), detector, masked)
+        found = score_bins(samples.take(raw.channels, 1), detector)
         if calibrated is None:
             return [found.score, found.is_valid]
         stated: Any = probability(found.llr(calibrated[0]), calibrated[1])
@@ -127,30 +125,20 @@ def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph
     return graph
 
 
-def masked_input(graph: Graph, detector: SlipDetector) -> Value:
-    """The input ``masked_channels [C]``, bool: by default no channel is."""
-    num = len(detector.pool.hand)
-    return graph.input("masked_channels", BOOL, (num,), np.zeros(num, bool))
-
-
-def score_bins(windows: Value, detector: SlipDetector, masked: Value) -> Scored:
+def score_bins(windows: Value, detector: SlipDetector) -> Scored:
     """Score raw bins.
 
     Args:
         windows: raw samples in volts of the channels in use, in the dtype that scores shall have.
         detector: that scores them.
-        masked: which channels of the hand are missing whatever they say, bool.
 
     Shape:
         - windows: ``[B, channels in use, RawBin.length]``, at least one bin
-        - masked: ``[C]``
     """
     features, is_missing, is_trusted = described(windows, detector)
-    is_masked = masked.take(detector.extractor.plan.channels, 0)
-    is_missing = is_missing | is_masked
     score, variance = scored(features, is_missing, detector, windows.dtype)
     is_finite = score.isfinite()
-    is_valid = (is_trusted & ~is_masked).all(1) & is_finite
+    is_valid = is_trusted.all(1) & is_finite
     return Scored(score, is_valid, is_finite & ~is_missing.all(1), variance)
 
 

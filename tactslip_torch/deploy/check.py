@@ -1,8 +1,8 @@
 """The self-check behind every export: a graph in onnxruntime against the detector in float64.
 
-Bins: noise and a simulated slip in batches of several sizes, bins at which formulas end, masked
-channels. Streams: a simulated slip in pieces of several sizes, another threshold, broken and masked
-channels.
+Bins: noise and a simulated slip in batches of several sizes, bins at which formulas end, channels
+that are missing. Streams: a simulated slip in pieces of several sizes, another threshold, channels
+that are broken or missing.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tactslip_torch.deploy.stream import Timing
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import probability, widened_llr
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import ChannelMask, Prediction
+from tactslip_torch.model.missing_channels import Prediction, without
 from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
 from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.onset.streaming import StreamingDetector
@@ -195,7 +195,7 @@ def check_bins(run: Run, detector: SlipDetector, precision: Precision) -> dict[s
         mixed = torch.cat([bins[:1], slip[:_EACH]])  # where a graph may go another way
         compare(mixed, f"simulated bins behind a degenerate one ({kind})", behind=1)
     of_mask = {
-        name: compare(slip, f"simulated bins without {name}", degenerate=True, mask=mask)
+        name: compare(without(slip, mask, hand.names), f"bins without {name}", degenerate=True)
         for name, mask in _masks(detector).items()
     }
     return {
@@ -203,7 +203,7 @@ def check_bins(run: Run, detector: SlipDetector, precision: Precision) -> dict[s
         "score_sd": sd,
         "worst_sd": worst,
         "degenerate_worst_sd": of_kind,
-        "masked_worst_sd": of_mask,
+        "missing_worst_sd": of_mask,
     }
 
 
@@ -217,7 +217,6 @@ class _BinComparison(_Comparison):
         *,
         degenerate: bool = False,
         behind: int = 0,
-        mask: Tensor | None = None,
     ) -> float:
         """The worst score error, in standard deviations, of those that rounding does not decide.
 
@@ -226,29 +225,25 @@ class _BinComparison(_Comparison):
             what: they are, for messages.
             degenerate: whether the larger tolerance counts.
             behind: so many bins, the scores are compared.
-            mask: masked channels.
 
         Raises:
             ValueError: if anything differs by more than it may.
         """
-        exact = _predicted(self.detector, samples.double(), mask)
+        exact = _predicted(self.detector, samples.double())
         of_score, calibrated = f"{self.precision}[{len(samples)}]", calibration_of(self.detector)
         wanted = {"score": of_score, "valid": f"bool[{len(samples)}]"}
         if calibrated is not None:
             wanted["probability"] = of_score
-        feeds = {"samples": samples.numpy()}
-        if mask is not None:
-            feeds["masked_channels"] = mask.numpy()
-        got = self.outputs(feeds, wanted, what)
+        got = self.outputs({"samples": samples.numpy()}, wanted, what)
         score = got["score"].astype(np.float64)
         if not np.isfinite(score).all():
             raise ValueError(f"{what}: {(~np.isfinite(score)).sum()} scores are not finite")
         # a channel is trusted by what its samples resolve in the precision they come in
-        is_valid = _predicted(self.detector, samples, mask).is_valid.numpy()
+        is_valid = _predicted(self.detector, samples).is_valid.numpy()
         _same_flags(got["valid"], is_valid, f"{what}: valid")
         error = np.abs(score - exact.score.numpy())[behind:] / self.sd
         worst = WORST_DEGENERATE_SD[self.precision]
-        if degenerate and mask is None and not (error <= worst).all():
+        if degenerate and not (error <= worst).all():
             error = np.where(self._rounding_decides(samples, exact.score, worst), 0.0, error)
         found = self.score_error(error, degenerate, what)
         if calibrated is not None:
@@ -275,12 +270,12 @@ class _BinComparison(_Comparison):
         return ((moved - score).abs() > worst * self.sd).any(0).numpy()
 
 
-def _predicted(detector: SlipDetector, samples: Tensor, mask: Tensor | None = None) -> Prediction:
+def _predicted(detector: SlipDetector, samples: Tensor) -> Prediction:
     """What the detector says of a graph's bins; what no filter in use takes in is 0."""
     raw = RawBin.of(detector)
     ends = detector.context_before - raw.before, detector.context_after - raw.after
     with torch.no_grad():
-        return detector.predict_raw(pad(samples, ends), masked_channels=mask)
+        return detector.predict_raw(pad(samples, ends))
 
 
 # Streams ---------------------------------------------------------------------------------------
@@ -344,15 +339,15 @@ def check_stream(run: Run, detector: SlipDetector, precision: Precision) -> dict
         middling = replace(settings, onset=onset)
     compare(samples, middling, by_hop, "another threshold")
     broken = _broken(samples, detector.needed_index.tolist())
-    mask = _masks(detector)["every other"]
+    fewer = without(samples.T, _masks(detector)["every other"], detector.pool.hand.names).T
     return {
         "decisions": len(usual["score"]),
         "alarms": int(usual["alarm"].sum()),
         "score_sd": sd,
         "worst_sd": worst,
         "broken_worst_sd": compare(broken, settings, by_hop, "broken channels", degenerate=True),
-        "masked_worst_sd": compare(
-            samples, settings, by_hop, "masked channels", degenerate=True, mask=mask
+        "missing_worst_sd": compare(
+            fewer.contiguous(), settings, by_hop, "missing channels", degenerate=True
         ),
     }
 
@@ -368,7 +363,6 @@ class _StreamComparison(_Comparison):
         what: str,
         *,
         degenerate: bool = False,
-        mask: Tensor | None = None,
     ) -> float:
         """The worst score error, in standard deviations.
 
@@ -378,13 +372,12 @@ class _StreamComparison(_Comparison):
             cuts: places where a piece of the stream ends and the next begins.
             what: it is, for messages.
             degenerate: whether the larger tolerance counts.
-            mask: masked channels.
 
         Raises:
             ValueError: if anything differs by more than it may.
         """
-        expected = _decided(self.detector, samples, settings, () if mask is None else mask)
-        got = self._watched(samples.numpy(), settings, cuts, mask, what)
+        expected = _decided(self.detector, samples, settings)
+        got = self._watched(samples.numpy(), settings, cuts, what)
         for name in expected.keys() & _FLAGS:
             _same_flags(got[name], expected[name], f"{what}: {name}")
         off = {name: np.abs(got[name].astype(np.float64) - expected[name]) for name in expected}
@@ -408,15 +401,12 @@ class _StreamComparison(_Comparison):
         samples: NDArray[Any],
         settings: AlarmSettings,
         cuts: Sequence[int],
-        mask: Tensor | None,
         what: str,
     ) -> dict[str, NDArray[Any]]:
         """All columns, by a host that hands on tail and state and nothing else."""
         timing, columns = Timing.of(self.detector, settings), _columns(settings)
         threshold = np.array([(settings.onset or settings).threshold])
         feeds = {"tail": samples[:0], "state": np.empty(0), "threshold": threshold}
-        if mask is not None:
-            feeds["masked_channels"] = mask.numpy()
         pieces = []
         for start, stop in pairwise([0, *cuts, len(samples)]):
             num = timing.decisions(stop) - timing.decisions(start)
@@ -433,11 +423,11 @@ class _StreamComparison(_Comparison):
 
 
 def _decided(
-    detector: SlipDetector, samples: Tensor, settings: AlarmSettings, mask: ChannelMask = ()
+    detector: SlipDetector, samples: Tensor, settings: AlarmSettings
 ) -> dict[str, NDArray[Any]]:
     """What the detector says of a stream, under the graph's names."""
     exact, in_its_own = (
-        StreamingDetector(detector, settings, dtype=dtype, masked_channels=mask)
+        StreamingDetector(detector, settings, dtype=dtype)
         for dtype in (torch.float64, samples.dtype)
     )
     decisions = exact.push(samples)

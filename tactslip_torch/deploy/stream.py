@@ -17,7 +17,7 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor
 
-from tactslip_torch.deploy.bins import Precision, RawBin, Scored, dtype_of, masked_input, score_bins
+from tactslip_torch.deploy.bins import Precision, RawBin, Scored, dtype_of, score_bins
 from tactslip_torch.deploy.head import machine, scaled
 from tactslip_torch.deploy.value import BOOL, END, F64, I64, Graph, Value
 from tactslip_torch.model.calibration import probability
@@ -83,8 +83,7 @@ def stream_graph(
 ) -> Graph:
     """The graph of a stream: what comes next, and what was kept, to decisions and what is kept.
 
-    Inputs ``samples [n, C]``, ``tail [r, C]``, ``state [s]``, ``threshold [t]`` and
-    ``masked_channels [C]``, which may be left out; outputs
+    Inputs ``samples [n, C]``, ``tail [r, C]``, ``state [s]`` and ``threshold [t]``; outputs
     ``score``, ``probability``, ``statistic``, ``valid``, ``alarm``, ``on``, ``time_s``,
     ``onset_s``, ``[k]`` each, ``next_tail [Timing.tail, C]`` and ``next_state
     [Timing.state_size]``. A stream begins with an empty tail and state; without a threshold that of
@@ -112,7 +111,6 @@ def stream_graph(
     tail = graph.input("tail", dtype, ("r", num_channels))
     state = graph.input("state", F64, ("s",))
     threshold = graph.input("threshold", F64, ("t",))
-    masked = masked_input(graph, detector)
 
     onset = settings.onset
     before = 0.0 if onset is None else math.nan  # what no stream has is no evidence
@@ -152,7 +150,7 @@ def stream_graph(
         places = _count_up((decided - made).cast(I64))
         number = places.cast(F64) + made
         windows = _windows(held, seen, made * float(timing.hop), places, detector, timing)
-        scored = score_bins(windows.cast(dtype), detector, masked)
+        scored = score_bins(windows.cast(dtype), detector)
         llr = graph.where(scored.is_usable, scored.llr(settings.calibration), NEUTRAL)
         return number, scored, llr, *statistic_of(settings.rule, llr, of_rule)
 
@@ -218,7 +216,7 @@ def stream_graph(
             number = places.cast(F64) + first
             origin = first * hop - seen - float(onset.evidence.context)  # counted from the end
             x = held.slice(origin.cast(I64), END, 0)
-            onset_score, after = onset_scores(x, places, memory, onset, masked)
+            onset_score, after = onset_scores(x, places, memory, onset)
             by_onset = onset_score >= level(onset.threshold, F64)
             samples = (number + 1.0) * hop
             last = ((samples - float(timing.first)) / of_bin).floor()
@@ -368,7 +366,7 @@ def memory_start(graph: Graph, evidence: OnsetEvidence) -> Value:
 
 
 def onset_scores(
-    samples: Value, places: Value, memory: Value, classifier: OnsetClassifier, masked: Value
+    samples: Value, places: Value, memory: Value, classifier: OnsetClassifier
 ) -> tuple[Value, Value]:
     """Scores of hops, ``NOTHING_YET`` where there is no evidence, and what is kept.
 
@@ -377,10 +375,9 @@ def onset_scores(
         places: of the hops, from 0.
         memory: of ``memory_start`` or the call before.
         classifier: that scores.
-        masked: channels that are not to be listened to.
 
     Shape:
-        - samples: ``[m, C]``; places: ``[k]``, int64, k at least 1; masked: ``[C]``
+        - samples: ``[m, C]``; places: ``[k]``, int64, k at least 1
         - output: ``[k]``, float64, and as memory
     """
     evidence, graph = classifier.evidence, samples.graph
@@ -428,13 +425,13 @@ def onset_scores(
         (graph.constant(to_means, F64) @ latest).reshape(0, num_windows, num_filters, len(fast)),
         floor.reshape(0, num_filters, len(fast)),
         None,
-        ~masked.take(fast, 0),
+        graph.constant(np.ones(len(fast)), BOOL),
         None,
     ]
     if slow:
         latest = windows(rows[1], first, range(len(evidence.step_matrix)))
         measured[2] = graph.constant(evidence.step_matrix.T, F64) @ (latest - latest.slice(0, 1, 1))
-        measured[4] = ~masked.take(slow, 0)
+        measured[4] = graph.constant(np.ones(len(slow)), BOOL)
     pooled: Any = evidence.pooled(*measured)
     columns, is_usable = pooled
     score = machine(scaled(columns, classifier.scaler), classifier.head, F64)

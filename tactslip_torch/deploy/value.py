@@ -15,7 +15,7 @@ from typing import Any, TypeGuard, Union
 import numpy as np
 import onnx
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from onnx import helper, numpy_helper
 from torch import Tensor
 
@@ -47,7 +47,6 @@ class _Body:
             if needed.intersection(node.output):
                 needed |= _read_by(node)
                 nodes.insert(0, node)
-        needed |= {given.name for given in self.inputs}  # their tensors are defaults
         tensors = [tensor for tensor in self.tensors if tensor.name in needed]
         return helper.make_graph(nodes, "tactslip_torch", self.inputs, self.outputs, tensors)
 
@@ -59,14 +58,12 @@ class Graph:
         self._bodies = [_Body()]
         self._count = 0
 
-    def input(
-        self, name: str, dtype: np.dtype[Any], shape: Shape, default: NDArray[Any] | None = None
-    ) -> Value:
-        """An input; axes that are named may have any length. One with a default may be left out."""
+    def input(self, name: str, dtype: np.dtype[Any], shape: Shape) -> Value:
+        """An input; axes that are named may have any length. None may be left out.
+
+        One with a default could, but onnxruntime warns of it whenever such a file is loaded.
+        """
         self._bodies[-1].inputs.append(_info(name, dtype, shape))
-        if default is not None:
-            tensor = numpy_helper.from_array(default.astype(dtype), name)
-            self._bodies[-1].tensors.append(tensor)
         return Value(self, name, dtype)
 
     def output(self, name: str, value: Value, shape: Shape | None) -> None:

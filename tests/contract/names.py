@@ -199,7 +199,6 @@ TRAINING_RECORDINGS = "train_recordings"  # in the detector's info
 
 # Graphs: inputs and outputs
 BIN_INPUT, BIN_OUTPUTS = "samples", ("score", "probability", "valid")
-MASK_INPUT = "masked_channels"
 STREAM_INPUTS = ("samples", "tail", "state", "threshold")
 STREAM_HANDED_ON = {"tail": "next_tail", "state": "next_state"}
 STREAM_OUTPUTS = {

@@ -13,7 +13,6 @@ from .names import (
     BIN_GRAPH,
     BIN_INPUT,
     BIN_OUTPUTS,
-    MASK_INPUT,
     SIDECAR,
     STREAM_GRAPH,
     STREAM_HANDED_ON,
@@ -90,15 +89,13 @@ def test_the_bin_graph_scores_as_the_detector(exported, kind):
         assert not found["valid"].all()
 
 
-def test_the_bin_graph_takes_a_mask_of_channels(exported):
+def test_a_channel_that_is_nan_is_left_out_by_the_bin_graph(exported):
     folder, detector, precision = exported
     bins = kinds_of_bin(detector)["ordinary"].astype(precision)
     name = detector.pool.hand.names[detector.needed_index[0]]
-    feeds = {BIN_INPUT: bins, MASK_INPUT: np.array([n == name for n in NAMES])}
-    score, valid = session_of(folder / BIN_GRAPH).run(["score", "valid"], feeds)
-    missing = torch.from_numpy(bins.copy()).double()
-    missing[:, NAMES.index(name)] = torch.nan
-    expected = predict_raw(detector, missing).score.numpy()
+    bins[:, NAMES.index(name)] = np.nan
+    score, valid = session_of(folder / BIN_GRAPH).run(["score", "valid"], {BIN_INPUT: bins})
+    expected = predict_raw(detector, torch.from_numpy(bins).double()).score.numpy()
     close = CLOSE[precision] * (np.abs(expected) + expected.std())
     assert (np.abs(score - expected) <= close).all()
     assert not valid.any()
