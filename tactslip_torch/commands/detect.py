@@ -146,9 +146,10 @@ def _detect_in(
         stream = StreamingDetector(
             detector, context.settings, dtype=samples.dtype, masked_channels=masked
         )
-        drawn = {hand.names[i]: i for i in hand.fast or range(len(hand))}
+        drawn = {name: row for row, name in enumerate(hand.names)}
+        kinds = [channel.kind for channel in hand.channels]
         view = view_of(config.view, entry["duration_s"])
-        traces = Traces(drawn, rate, stream.hop_s, view, context.units)
+        traces = Traces(drawn, rate, stream.hop_s, view, context.units, kinds)
         truth = archived.recording if archived else None
         counts = DecisionCounts(first_releases(truth.onsets_s, truth.released_s) if truth else ())
 
@@ -183,6 +184,7 @@ def _detect_in(
             traces,
             path,
             alarms=alarms,
+            delays_s=[alarm.get("delay_s") for alarm in entry["alarms"]],
             truth=entry["truth"],
             onset_threshold=None if onset is None else onset.threshold,
             title=title,

@@ -29,7 +29,7 @@ from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.pooling import pooled_names
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
-from tactslip_torch.onset.decisions import KEY, Scorer
+from tactslip_torch.onset.decisions import KEY, Scorer, calibration_of
 from tactslip_torch.own_files import read_checkpoint
 from tactslip_torch.report.results import print_results, tuning_figure, write_results
 from tactslip_torch.runtime import is_first_process, whole_file
@@ -287,6 +287,11 @@ def _run_fold(
         detector.save(folder / "detector.pt")  # what was fitted stays, whatever comes
         if isinstance(alarming, CalibratedAlarm):
             alarm = alarming(detector, _baselines(detector), config.num_workers)
+        elif calibration_of(detector) is None:
+            log.warning(
+                "no alarm is set, so that detect and stream.onnx do not work on this detector: "
+                "onset=debounced needs scores of validation; give several recipe.penalties"
+            )
         else:
             alarming(detector)
     told = time.perf_counter()

@@ -54,6 +54,7 @@ _INVALID: dict[str, Any] = {
     "facecolor": "none", "edgecolor": "#999999", "hatch": "////", "linewidth": 0, "zorder": 0.5,
 }  # fmt: skip
 _ABSTAINS: dict[str, Any] = {"facecolor": "#DDD6E8", "edgecolor": "none", "zorder": 0.2}
+_MOST_DELAYS = 12  # told beside their alarms
 _ONSET: dict[str, Any] = {"color": INK, "linestyle": "-."}
 _RELEASE: dict[str, Any] = {"color": GREY, "linestyle": ":"}
 _ALARM: dict[str, Any] = {"color": ALARM, "linestyle": "-"}
@@ -116,6 +117,7 @@ class Traces:
         hop_s: distance of two decisions.
         view: start and end of what is drawn, in seconds.
         units: of the samples.
+        kinds: of each channel; those of a kind are drawn to one scale.
     """
 
     def __init__(
@@ -125,8 +127,10 @@ class Traces:
         hop_s: float,
         view: tuple[float, float],
         units: str = "V",
+        kinds: Sequence[str] = (),
     ) -> None:
         self.channels, self.view, self.units = channels, view, units
+        self.kinds = tuple(kinds) or ("",) * len(channels)
         self._sample_rate_hz, self._hop_s = sample_rate_hz, hop_s
         self._first, self._stop = (round(edge * sample_rate_hz) for edge in view)
         length, num_decisions = self._stop - self._first, round((view[1] - view[0]) / hop_s)
@@ -386,6 +390,7 @@ def onset_figure(
     path: str | Path,
     *,
     alarms: Segments = (),
+    delays_s: Sequence[float | None] = (),
     truth: Mapping[str, Any] | None = None,
     onset_threshold: float | None = None,
     title: str,
@@ -398,11 +403,12 @@ def onset_figure(
         traces: what was gathered of the recording.
         path: the PNG to write, replaced as a whole if it exists.
         alarms: of each, when it was raised and when its slip is estimated to have begun.
+        delays_s: of each, how long after the true onset it came; ``None``: it found none.
         truth: of an entry of ``onsets.json``; ``None`` if it is not known.
         onset_threshold: of the onset classifier; ``None``: there is none.
         title: of the figure; says what is simulated.
     """
-    heights = [max(1.2, 0.42 * len(traces.channels)), 0.55, 1.3]
+    heights = [max(1.2, 0.3 * len(traces.channels)), 0.55, 1.3]
     heights += [] if onset_threshold is None else [1.3]
     figure = new_figure(12.0, sum(heights) + 1.3, title)
     panels = figure.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights})
@@ -436,6 +442,7 @@ def onset_figure(
         (panels[2], estimates_s, "estimate", _ESTIMATE),
     ):
         _mark(axes, times, name, **style)
+    _tell_delays(panels[0], raised_s, delays_s)
     panels[-1].set_xlabel("time, s")
     handles: list[Any] = [
         Line2D([], [], color=REST, linewidth=2, label="decided: no slip"),
@@ -454,11 +461,15 @@ def onset_figure(
 def _draw_channels(axes: Axes, traces: Traces, slips: Segments) -> None:
     """A lane per channel around its median, in the colours of the status; bursts may cross."""
     times, samples = traces.samples()
-    height = lane_height(samples)
-    middles = -height * np.arange(len(samples))
+    of_kind = {
+        kind: [values for values, own in zip(samples, traces.kinds, strict=True) if own == kind]
+        for kind in dict.fromkeys(traces.kinds)
+    }
+    heights = {kind: lane_height(lines) for kind, lines in of_kind.items()}
+    middles = -np.arange(len(samples))
     is_slip = np.searchsorted(np.ravel(slips), times, side="right") % 2 == 1
     for place, values in enumerate(samples):
-        lane = values - median(values) + middles[place]
+        lane = (values - median(values)) / heights[traces.kinds[place]] + middles[place]
         for colour, shown in ((REST, ~is_slip), (SLIP, is_slip)):
             reaching = shown.copy()
             reaching[1:] |= shown[:-1]  # to the first point of the other colour: no hole
@@ -466,9 +477,30 @@ def _draw_channels(axes: Axes, traces: Traces, slips: Segments) -> None:
             axes.plot(times, line, color=colour, linewidth=0.6, gid=f"channel {place}")
     _shade(axes, slips, "slip", facecolor="#FFF0CC", edgecolor="none", zorder=0)
     axes.set_yticks(middles, list(traces.channels), fontsize=7)
-    axes.set_ylim(middles[-1] - 0.8 * height, 0.8 * height)
+    axes.set_ylim(middles[-1] - 0.8, 0.8)
     axes.grid(visible=False)
-    axes.set_ylabel(f"channels, lanes {height:.2g} {traces.units} apart")
+    told = ", ".join(f"{kind} {high:.2g} {traces.units}".strip() for kind, high in heights.items())
+    axes.set_ylabel(f"channels; distance of lanes: {told}")
+
+
+def _tell_delays(axes: Axes, times: Sequence[float], delays_s: Sequence[float | None]) -> None:
+    """How late each alarm came, beside its line, where there is place for it."""
+    first, last = axes.get_xlim()
+    told = [(t, d) for t, d in zip(times, delays_s, strict=False) if d is not None]
+    told = [(time, delay) for time, delay in told if first <= time <= last]
+    if len(told) > _MOST_DELAYS:
+        return
+    for time, delay in told:
+        text: dict[str, Any] = {"color": ALARM, "fontsize": 8, "va": "bottom"}
+        place = 4, 2  # points
+        axes.annotate(
+            f"{1000 * delay:+.0f} ms",
+            (time, 1.0),
+            xycoords=axes.get_xaxis_transform(),
+            xytext=place,
+            textcoords="offset points",
+            **text,
+        )
 
 
 def lane_height(lines: Iterable[Array]) -> float:

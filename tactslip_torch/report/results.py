@@ -14,14 +14,13 @@ from statistics import mean
 from typing import Any
 
 import numpy as np
-import torch
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from tactslip_torch.report import published
-from tactslip_torch.report.metrics import CLASSES, covered_fractions
+from tactslip_torch.report.metrics import CLASSES
 from tactslip_torch.report.style import (
     ALARM,
     BLUE,
@@ -490,7 +489,7 @@ def validation_figure(metrics: _Metrics, path: str | Path) -> None:
     axes.set_xscale("log")
     axes.set_xlabel("C")
     axes.set_ylabel("balanced accuracy on the group left out, %")
-    axes.legend(handlelength=3.5, **UPPER_LEFT_OUTSIDE)
+    axes.legend(handlelength=6.0, **UPPER_LEFT_OUTSIDE)
     save(figure, path)
 
 
@@ -843,7 +842,7 @@ def answers_table(metrics: _Metrics) -> str:
 
 @styled
 def answers_figure(metrics: _Metrics, path: str | Path) -> None:
-    """Write the coverage of every recording, and what became of the bins of each role, as a PNG.
+    """Write how often each class is answered right, with "unsure", and wrong, by role, as a PNG.
 
     Args:
         metrics: the content of ``metrics.json``, with ``answers``.
@@ -851,32 +850,25 @@ def answers_figure(metrics: _Metrics, path: str | Path) -> None:
     """
     answers: Mapping[str, Mapping[str, Any]] = metrics["answers"]
     rows = [(role, truth) for role in answers for truth in (1, 0)]
-    title = "Prediction sets of a detector that may abstain: what they cover"
-    figure = new_figure(11.0, 1.7 + 0.55 * len(rows), title, simulated=metrics["simulated"])
-    left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": [1.25, 1.0]})
-    outcomes = {"right": GREEN, "abstains": "#BBBBBB", "wrong": ALARM}
+    title = 'Answers of a detector that may say "unsure"'
+    figure = new_figure(8.4, 1.7 + 0.5 * len(rows), title, simulated=metrics["simulated"])
+    axes = figure.subplots()
+    outcomes = {"right": GREEN, "unsure": "#BBBBBB", "wrong": ALARM}
     for lane, (role, truth) in enumerate(rows):
-        scores = answers[role]
-        counts = torch.tensor(list(scores["recordings"].values())).view(-1, 2, 3)
-        covered = 100 * covered_fractions(counts, truth).numpy()
-        if len(covered):  # a dot for each recording, spread over the lane, and their mean
-            heights = lane + _spread(len(covered), 0.28)
-            left.plot(covered, heights, "o", color=(BLUE, ORANGE)[truth], ms=3, alpha=0.6, mew=0)
-            left.plot([covered.mean()] * 2, [lane - 0.38, lane + 0.38], color=INK, lw=2)
-        abstains, *rest = scores["counts"][truth]
-        scale = 100 / max(abstains + sum(rest), 1)
-        widths = [scale * count for count in (rest[truth], abstains, rest[1 - truth])]
-        stack(right, lane, widths, outcomes.values())
+        unsure, *rest = answers[role]["counts"][truth]
+        scale = 100 / max(unsure + sum(rest), 1)
+        widths = [scale * count for count in (rest[truth], unsure, rest[1 - truth])]
+        stack(axes, lane, widths, outcomes.values())
     asked: dict[str, Any] = {"color": INK, "ls": "--", "lw": 1}
     for coverage in {scores["coverage"] for scores in answers.values()}:
-        left.axvline(100 * coverage, **asked)
-    lanes(left, [f"{role}, {CLASSES[truth].replace('_', '-')}" for role, truth in rows])
-    right.grid(visible=False, axis="y")
-    left.set_xlabel("covered of a recording's bins, %; bar: mean over recordings")
-    right.set_xlabel("of the bins of a class, %")
-    right.set_xlim(0, 100)
+        axes.axvline(100 * coverage, **asked)
+    lanes(axes, [f"{role}, {CLASSES[truth].replace('_', '-')}" for role, truth in rows])
+    axes.grid(visible=False, axis="y")
+    axes.set_xlabel("bins of the class, %")
+    axes.set_xlim(0, 100)
     handles: list[Any] = [Patch(color=colour, label=label) for label, colour in outcomes.items()]
-    legend_below(figure, [*handles, Line2D([], [], label="asked of the mean", **asked)], 4)
+    limit = "asked: wrong only right of this line"
+    legend_below(figure, [*handles, Line2D([], [], label=limit, **asked)], 4)
     save(figure, path)
 
 
