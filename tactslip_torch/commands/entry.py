@@ -7,20 +7,22 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.mistakes import Mistake, checked, folder_problem, with_lists
 from tactslip_torch.commands.stopping import Stopped, stopping
+from tactslip_torch.report.sweep import sweep_table, write_sweep
 from tactslip_torch.runtime import is_first_process, process_number, write_json
 
 log = logging.getLogger(__name__)
@@ -73,6 +75,8 @@ def entry_point(
             if problem := folder_problem(arguments, default):
                 raise Mistake(problem)
 
+            runs: list[_Run] = []
+
             def in_folder(config: DictConfig) -> None:
                 with _kept_in_log(), errors_in_one_line():
                     if composed is not None:
@@ -83,10 +87,14 @@ def entry_point(
                             "%s holds an earlier run; files of the same names are replaced", folder
                         )
                     try:
-                        run(config, folder)
+                        returned = run(config, folder)
                     except Stopped as stop:
                         again = shlex.join(["tactslip", command, *arguments])
                         raise stop.saying(saved(config, folder, again)) from None
+                    if HydraConfig.get().mode == RunMode.MULTIRUN and _are_scores(returned):
+                        source = str(OmegaConf.select(config, "data._target_"))
+                        given = list(HydraConfig.get().overrides.task)
+                        runs.append(_Run(given, returned, folder.parent, "simulation" in source))
 
             in_folder.__module__ = f"{__package__}.{name}"  # Hydra names job and log file by it
             sys.argv[1:] = known
@@ -96,8 +104,34 @@ def entry_point(
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=name)(
                 in_folder
             )()
+            if runs and is_first_process():
+                _compare(runs)
 
     return main
+
+
+class _Run(NamedTuple):
+    """A run of a sweep: what was set, its scores, where they are, and whether simulated."""
+
+    given: list[str]
+    scores: Mapping[str, float]
+    place: Path
+    simulated: bool
+
+
+def _compare(runs: Sequence[_Run]) -> None:
+    """A table and a figure of the runs of a sweep, by what differs between them."""
+    common = set(runs[0].given).intersection(*(run.given for run in runs))
+    told = [(" ".join(o for o in r.given if o not in common) or "all", r.scores) for r in runs]
+    place, simulated = runs[0].place, any(run.simulated for run in runs)
+    write_sweep(told, place, simulated=simulated)
+    print(f"\n{sweep_table(told, simulated=simulated)}\n\nruns.csv and runs.png in {place}")
+
+
+def _are_scores(returned: Any) -> bool:
+    """Whether a run returned numbers by name, which those of a sweep are compared by."""
+    is_mapping = isinstance(returned, Mapping) and bool(returned)
+    return is_mapping and all(type(value) is float for value in returned.values())
 
 
 def leave_results(

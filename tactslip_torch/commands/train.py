@@ -45,6 +45,7 @@ from tactslip_torch.training.experiment import (
     make_trainer,
     merged_results,
     save_config,
+    write_tensorboard,
 )
 from tactslip_torch.training.learner import SlipLearner
 from tactslip_torch.training.plan import Abstaining
@@ -132,6 +133,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     rows = feature_rows([by_name[name] for name in metrics["selected"]], source.hand)
     if is_first:
         write_results(folder, metrics, rows)
+        write_tensorboard(folder, config, metrics)
         print_results(metrics, rows)
         print(f"\nresults in {folder}")
     exports = [found for fold in fold_metrics.values() for found in fold["onnx"].values()]

@@ -14,11 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Checkpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
+from PIL import Image
+from torch.utils.tensorboard import SummaryWriter
 
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
@@ -270,6 +273,48 @@ def save_config(config: DictConfig, folder: Path) -> None:
     """Write the resolved configuration."""
     with whole_file(folder / "config.yaml") as temporary:
         temporary.write_text(OmegaConf.to_yaml(config, resolve=True))
+
+
+def write_tensorboard(folder: Path, config: DictConfig, metrics: Mapping[str, Any]) -> None:
+    """Add to a run's TensorBoard its figures, validation, configuration, and final scores.
+
+    The curve of validation has the choices in the order of C as its steps.
+
+    Args:
+        folder: of the run, with its figures.
+        config: of the run.
+        metrics: the content of ``metrics.json``.
+    """
+    plain: Any = OmegaConf.to_container(config, resolve=True)
+    flat = {key: value for key, value in _flat(plain) if "._" not in key}
+    is_simple = (bool, int, float, str)
+    given = {key: v if isinstance(v, is_simple) else str(v) for key, v in flat.items()}
+    final = {
+        f"final/{role}/{name}": scores[name]
+        for role, scores in metrics["splits"].items()
+        for name in ("accuracy", "balanced_accuracy")
+        if scores[name] is not None
+    }
+    with SummaryWriter(str(folder / "tensorboard")) as board:
+        board.add_text("configuration", f"```yaml\n{OmegaConf.to_yaml(config, resolve=True)}```")
+        for path in sorted(folder.glob("*.png")):
+            with Image.open(path) as image:
+                board.add_image(path.stem, np.asarray(image.convert("RGB")), dataformats="HWC")
+        choices = sorted(metrics.get("validation") or (), key=lambda row: row["penalty"])
+        penalties = sorted({row["penalty"] for row in choices})
+        for row in choices:
+            kernel = "_".join(f"{k}={v}" for k, v in row["kernel"].items())
+            name = f"validation/{row.get('use', 'channel')}/K={row['num_features']}/{kernel}"
+            board.add_scalar(name, row["mean"], penalties.index(row["penalty"]))
+        board.add_hparams(given, final, run_name=".")
+
+
+def _flat(section: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in section.items():
+        if isinstance(value, dict) and value:
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def feature_rows(names: Sequence[FeatureName], hand: HandLayout) -> list[dict[str, str]]:
