@@ -1,6 +1,5 @@
 """``adapt`` as a command: what it leaves, takes back and refuses, on files of a tiny hand."""
 
-import hashlib
 import json
 from dataclasses import replace
 
@@ -18,6 +17,7 @@ from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.entry import one_line
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.folder import RecordingFolder, write_manifest
+from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
@@ -154,13 +154,15 @@ def test_thresholds_are_of_machines_that_never_met_what_was_left_out(run, files,
     assert f"without its {left_out}" in kept["adapted"]
 
 
-def test_steps_in_and_out_are_listed_and_taken_back_to_the_bit(run, files, trained, capsys):
+def test_steps_in_and_out_are_listed_and_taken_back_to_the_bit(
+    run, files, trained, capsys, monkeypatch
+):
     """Graphs beside it are told to be of another detector while they are."""
     adapt(settings(run, "action=list"), run / "results")
     assert "no step since training" in capsys.readouterr().out
-    (run / "model.onnx").touch()
-    facts = {"detector_sha256": hashlib.sha256((run / "detector.pt").read_bytes()).hexdigest()}
-    (run / "model.onnx.json").write_text(json.dumps(facts))
+    monkeypatch.setattr("tactslip_torch.deploy.export.check_model", lambda *_: {"worst_sd": 0.0})
+    source = run / "detector.pt"
+    export_detector(SlipDetector.load(source), run, ["bin"], source=source)
     add_c(run, files, "weight=2")
     stale = "model.onnx beside it: of another detector; python -m tactslip_torch export model="
     assert stale in capsys.readouterr().out
