@@ -463,6 +463,8 @@ _CHECKPOINT = {
     },
     "*": _any,
 }
+_TENSOR = {"tensor": _text}
+_BINS = {"material": _text, "z": _TENSOR, "is_slip": _TENSOR, "key?": _text}
 _SUMS = {
     "num_features": _number(1, 10**5, whole=True),
     "degree?": _one_of(1, 2),
@@ -489,6 +491,39 @@ SCHEMAS: Mapping[str, Wanted] = {
         "info": _INFO,
     },
     SUMS: {**_SUMS, "batches": {"*": _text}},
+    STATISTICS: {
+        "sums": {
+            **_SUMS,
+            "seen_batches": {"*": _text},
+            "sums": _TENSOR,
+            "count": _TENSOR,
+        },
+        "machine": {
+            "penalty": _number(1e-300, math.inf),
+            "offset": _number(0, 1e100),
+            "balance": _one_of("weights", "none"),
+        },
+        "labels": {"*": _any},
+        "rehearsal": {
+            **dict.fromkeys(("z", "is_slip", "weight", "sample_weight", "recording"), _TENSOR),
+            "recordings": _names,
+            "materials": _names,
+        },
+        "detector": _text,
+        "bins": {"*": _BINS},
+        "weights": {"*": _number(0, 1e300)},
+        "steps": [
+            {
+                "entry": {"*": _any},
+                "weights": {"*": _number(0, 1e300)},
+                "changed": {"*": _number(0, 1e300)},
+                "replaced": {"*": _BINS},
+                "detector": _text,
+                "file": _TENSOR,
+            },
+            10**4,
+        ],
+    },
     SIDECAR: {
         "format": _one_of(SIDECAR),
         "graph": _one_of("bin", "stream"),

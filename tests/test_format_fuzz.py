@@ -2,16 +2,22 @@
 
 import io
 import itertools
+import json
+import math
 import os
 import pickle
+import random
 import resource
 import shutil
 import struct
+import time
 import warnings
 import zipfile
 import zlib
+from collections import Counter
 from pathlib import Path
 
+import generated
 import h5py
 import numpy as np
 import pyarrow as pa
@@ -19,20 +25,45 @@ import pyarrow.parquet as pq
 import pytest
 import scipy.io
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from message_bags import Sent as SentMessages
 from message_bags import json_message, write_mcap
+from small_detector import alarming_detector, small_detector
+from small_set import SmallSet, small_maker, small_recipe
+from test_learner import trainer
 
-from tactslip_torch import HandLayout, Recording
-from tactslip_torch.data.formats import FORMATS, pieces
+from tactslip_torch import HandLayout, Recording, SlipDetector, StreamingDetector
+from tactslip_torch.commands.entry import BAD_INPUT as ONE_LINE
+from tactslip_torch.commands.entry import one_line
+from tactslip_torch.data.formats import FORMATS, Reading, pieces
 from tactslip_torch.data.manifest import read_manifest
+from tactslip_torch.data.splits import random_bins
+from tactslip_torch.deploy.export import export_detector, read_sidecar, summary
+from tactslip_torch.model.moments import SufficientStats
+from tactslip_torch.onset.decisions import AlarmSettings
+from tactslip_torch.own_files import (
+    DETECTOR,
+    STATISTICS,
+    SUMS,
+    load_table,
+    read_checkpoint,
+    save_table,
+)
+from tactslip_torch.training.adaptation import (
+    KnownBins,
+    Machine,
+    RecordingBins,
+    Statistics,
+    Step,
+)
+from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.learner import SlipLearner
 
 FORM = "tactslip_torch recording 1"
 MOST_BYTES = 2**33
 """Of address space beyond what is in use; libraries reserve gigabytes that they never touch."""
-MOST_TAKEN = 200 * 2**20
+MOST_TAKEN = 300 * 2**20
 """Of memory really touched by one file."""
+LONGEST_S = 5
 LONGEST = 1000  # characters of a line for people, beside the path
 SAMPLES = np.random.default_rng(3).standard_normal((40, 3))
 TIMES = np.arange(40) / 100
@@ -189,23 +220,22 @@ _WORDS += [b"\r", b"\0", b"\xb0", b"\xef\xbb\xbf", b"\xff\xfe", "\u0663".encode(
 _WORDS += [b"{", b"}", b"[", b"../", b"%n", b"!!python/object:os.system", b"&a", b"*a"]
 
 
-@st.composite
-def damage(draw, content):
+def damaged(content, draw):
     """The bytes with up to three of the things that befall files."""
-    for _ in range(draw(st.integers(1, 3))):
+    for _ in range(draw.randint(1, 3)):
         size = len(content)
-        places = st.integers(0, min(size, 600)) | st.integers(max(size - 600, 0), size)
-        where = draw(places | st.integers(0, size))
-        length = draw(st.integers(1, 64) | st.integers(1, max(size // 2, 1)))
+        end = draw.randint(max(size - 600, 0), size)
+        where = draw.choice([draw.randint(0, min(size, 600)), end, draw.randint(0, size)])
+        length = draw.choice([draw.randint(1, 64), draw.randint(1, max(size // 2, 1))])
         head, tail = content[:where], content[where:]
-        word = draw(st.sampled_from(_NUMBERS + _WORDS) | st.binary(max_size=20))
+        word = draw.choice([*_NUMBERS, *_WORDS, draw.randbytes(draw.randint(0, 20))])
         content = {
             "cut": head,
             "over": head + word + tail[len(word) :],
             "in": head + word + tail,
             "drop": head + tail[length:],
             "twice": head + tail[:length] + tail,
-        }[draw(st.sampled_from(["cut", "over", "in", "drop", "twice"]))]
+        }[draw.choice(["cut", "over", "in", "drop", "twice"])]
     return content
 
 
@@ -223,20 +253,6 @@ def place(tmp_path_factory):
         return path
 
     return empty
-
-
-@pytest.mark.parametrize("name", FORMATS)
-@given(data=st.data())
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_damaged_files(name, data, seeds, place):
-    form, seed = FORMATS[name], data.draw(st.sampled_from(seeds[name]))
-    path = place() / seed.name
-    (shutil.copytree if seed.is_dir() else shutil.copy)(seed, path)
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    file = data.draw(st.sampled_from(files))
-    file.write_bytes(data.draw(damage(file.read_bytes())))
-    for call in (lambda path: looked(form, path), form.load):
-        is_read(call, path)
 
 
 MANIFESTS = {
@@ -262,13 +278,315 @@ def set_of_files(folder, name, content):
     return folder / "set" / name
 
 
-@pytest.mark.parametrize("name", MANIFESTS)
-@given(data=st.data())
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_damaged_manifests(name, data, place):
-    whole = MANIFESTS[name].encode()
-    assert is_read(listed, set_of_files(place(), name, whole))
-    is_read(listed, set_of_files(place(), name, data.draw(damage(whole))))
+# Files of ours, forged: whole, so that every digest fits, but for one value ----------------------
+
+_VALUES = [None, True, 0, 1, -1, 3, 99_999, 2**31, -(2**63), 10**30, 10**400, 0.5, -1e308, 1e-308]
+_VALUES += [math.nan, math.inf, -math.inf, "", "nan", "../x", "a" * 10_000, [], {}, [[]], [1e400]]
+_VALUES += [{"name": "cusum"}, {"tensor": "/x"}, [0] * 5000, ["a", 1], "polynomial", "float32"]
+
+
+def forged(value, draw):
+    """A tree of JSON with one of its values replaced, left out, doubled or put among others."""
+    if isinstance(value, dict | list) and value and draw.random() < 0.9:
+        place = draw.choice(list(value) if isinstance(value, dict) else range(len(value)))
+        changed = value.copy()
+        if draw.random() < 0.1:
+            del changed[place]
+        elif draw.random() < 0.05 and isinstance(value, list):
+            changed += changed[:1] * draw.choice([1, 1000])
+        else:
+            changed[place] = forged(value[place], draw)
+        return changed
+    if isinstance(value, dict) and draw.random() < 0.3:
+        return value | {draw.choice(["", "x", "kernel", "metadata"]): draw.choice(_VALUES)}
+    if type(value) in (int, float) and draw.random() < 0.4:
+        return draw.choice([value + 1, -value, value * 1000, value / 3, float(value), str(value)])
+    return draw.choice(_VALUES)
+
+
+def forged_tensor(x, draw):
+    """The tensor in another shape, dtype or with values that it should not have."""
+    values = [0.0, 1e308, -1e308, math.nan, math.inf, 1e-320, -1.0]
+    flat = x.flatten().clone()
+    if len(flat) and draw.random() < 0.5:
+        value = draw.choice(values)
+        flat[draw.randrange(len(flat))] = value if x.is_floating_point() else -(2**40)
+        return flat.reshape(x.shape)
+    dtypes = [torch.float32, torch.int64, torch.bool, torch.float16, torch.uint8]
+    return draw.choice(
+        [x[..., :-1] if x.ndim else x[None], x[None], flat, x.to(draw.choice(dtypes))]
+    )
+
+
+def forged_table(form):
+    def write(path, draw):
+        metadata, tensors = load_table(path, form)
+        if draw.random() < 0.7:
+            metadata = forged(metadata, draw)
+        else:
+            name = draw.choice(sorted(tensors))
+            tensors = {**tensors, name: forged_tensor(tensors[name], draw)}
+        save_table(path, form, metadata, tensors)
+
+    return write
+
+
+def forged_json(path, draw):
+    path.write_text(json.dumps(forged(json.loads(path.read_text()), draw)))
+
+
+def forged_checkpoint(path, draw):
+    content = torch.load(path, weights_only=True)
+    if draw.random() < 0.3:
+        where = content["plan"]["scaler"]
+        name = draw.choice(sorted(where))
+        where[name] = forged_tensor(where[name], draw)
+    else:
+        content = forged(content, draw)
+    torch.save(content, path)
+
+
+def forged_npz(path, draw):
+    with np.load(path) as file:
+        content = dict(file)
+    name = draw.choice(sorted(content))
+    if content[name].dtype.kind == "U" and content[name].ndim == 0 and draw.random() < 0.7:
+        try:
+            content[name] = np.array(json.dumps(forged(json.loads(str(content[name])), draw)))
+        except ValueError:
+            content[name] = np.array("x")
+    else:
+        content[name] = np.array(draw.choice([math.nan, 1e300, "x", 10**18, [], [[1.0]], [1, 2]]))
+    np.savez(path, **content)
+
+
+def forged_text(path, draw):
+    """A cell or a word of the header replaced."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    place = draw.randrange(min(len(lines), 5))
+    cells = lines[place].split(",")
+    cells[draw.randrange(len(cells))] = str(draw.choice(_VALUES))[:500]
+    lines[place] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+
+
+# What is done with a file that was read: all that a program does with it
+
+
+def detect(path):
+    detector = SlipDetector.load(path)
+    num = detector.context_before + detector.pool.bin_samples + detector.context_after
+    noise = torch.randn(2, len(detector.pool.hand), num, dtype=torch.float64)
+    assert detector.predict_raw(noise).score.isfinite().all()
+    if "alarm" in detector.info:
+        AlarmSettings.of(detector)
+        stream = StreamingDetector(detector)
+        stream.push(torch.randn(400, len(detector.pool.hand)))
+
+
+def solve(path):
+    SufficientStats.load(path).solve(1.0)
+
+
+def adapt(path):
+    statistics = Statistics.load(path)
+    assert statistics.known().material.min() >= 0
+    assert statistics.materials
+    statistics.sums.solve(statistics.machine.penalty, statistics.machine.offset)
+
+
+def resume(path):
+    read_checkpoint(path)
+    learner = a_learner()
+    learner._fingerprint = lambda: "made"
+    learner.on_load_checkpoint(torch.load(path, weights_only=True))
+    assert learner.plan.selection.size
+
+
+def told(path):
+    read_sidecar(path.with_suffix(""))
+    summary(path.with_suffix(""))
+
+
+def form_of(name):
+    def read(path):
+        looked(FORMATS[name], path)
+        FORMATS[name].load(path)
+
+    return read
+
+
+def a_learner():
+    maker = small_maker(SmallSet())
+    return SlipLearner(maker.pool, maker.channel_filter, small_recipe(), with_baselines=False)
+
+
+OWN = {  # what is forged, and what is done with it
+    "detector.pt": (forged_table(DETECTOR), detect),
+    "sums.pt": (forged_table(SUMS), solve),
+    "statistics.pt": (forged_table(STATISTICS), adapt),
+    "last.ckpt": (forged_checkpoint, resume),
+    "model.onnx.json": (forged_json, told),
+    "recording.npz": (forged_npz, form_of("npz")),
+    "recording.csv": (forged_text, form_of("text")),
+    "manifest.csv": (forged_text, listed),
+    "manifest.yaml": (forged_text, listed),
+}
+
+
+@pytest.fixture(scope="module")
+def own_files(tmp_path_factory, seeds):
+    """A whole file of each kind."""
+    folder = tmp_path_factory.mktemp("own")
+    detector = alarming_detector()
+    detector.save(folder / "detector.pt")
+    z = torch.rand(60, 4, generator=torch.Generator().manual_seed(0)).double() * 2 - 1
+    sums = SufficientStats(4, {"names": ["a"]})
+    sums.update("M1/0", z, z[:, 0] > 0)
+    sums.save(folder / "sums.pt")
+    known = KnownBins(
+        z, z[:, 0] > 0, torch.ones(60).double(), torch.ones(60).double(),
+        torch.zeros(60, dtype=torch.int64), ("M1/0",), ("M1",),
+    )  # fmt: skip
+    bins = {"M2/0": RecordingBins("M2", z[:9], z[:9, 0] > 0, "key")}
+    step = Step({"action": "add"}, {}, {"M2/0": 0.0}, {}, "0" * 32, torch.zeros(9).byte())
+    labels = {"layout": "whole_slide", "bin_ms": 50.0}
+    machine = Machine(1.0, 0.5, "weights")
+    Statistics(sums, machine, labels, known, "0" * 32, bins, {"M2/0": 0.0}, (step,)).save(
+        folder / "statistics.pt"
+    )
+    (path,) = export_detector(small_detector(), folder, ["bin"])
+    assert path.name == "model.onnx"
+    source = SmallSet()
+    split, data = random_bins(source.ids, seen=["a", "b", "c"])[0], small_maker(source)
+    learner, fit = a_learner(), trainer(max_epochs=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Lightning's own
+        fit.fit(learner, datamodule=SlipDataModule(data, split, num_workers=0))
+    learner._fingerprint = lambda: "made"
+    fit.save_checkpoint(folder / "last.ckpt")
+    for name in ("npz", "text"):
+        shutil.copy(seeds[name][0], folder / f"recording{seeds[name][0].suffix}")
+    for name, text in MANIFESTS.items():
+        (folder / name).write_text(text)
+    for name, (_, use) in OWN.items():
+        use(
+            set_of_files(folder, name, (folder / name).read_bytes())
+            if use is listed
+            else folder / name
+        )
+    return folder
+
+
+def outcome(use, path):
+    """What comes of using a file, in a process of its own: ``None`` if it is read, or one line."""
+    reader, writer = os.pipe()
+    started = time.perf_counter()
+    if (child := os.fork()) == 0:
+        said, before = "", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        resource.setrlimit(resource.RLIMIT_CPU, (LONGEST_S, LONGEST_S + 1))
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                use(path)
+        except BaseException as error:
+            kind = "refused" if isinstance(error, ONE_LINE) else "BROKE"
+            line = one_line(error)
+            if "\n" in line or len(line) > LONGEST + len(str(path)):
+                kind = "BROKE"
+            said = f"{kind}: {type(error).__name__}: {line}"
+        taken = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+        if taken > MOST_TAKEN >> 10:
+            said = f"BROKE: took {taken >> 10} MiB, {said}"
+        os.write(writer, said.encode(errors="replace")[:60_000])
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader, "rb") as pipe:
+        said = pipe.read().decode(errors="replace")
+    _, status = os.waitpid(child, 0)
+    if status:
+        return f"BROKE: ended by {status} after {time.perf_counter() - started:.1f} s"
+    return said or None
+
+
+FEW = 30
+"""Cases of a kind in the fast tier."""
+MANY = int(os.environ.get("TACTSLIP_HOSTILE_FILES", "5000"))
+"""Cases of a slow run, of all kinds together."""
+
+
+def numbers_of(*kinds):
+    """Cases of each kind: a few; slow: as many as the run has."""
+    many = pytest.param(MANY // (len(OWN) + len(FORMATS)), marks=pytest.mark.slow)
+    return pytest.mark.parametrize("num", [FEW, many])
+
+
+@pytest.mark.parametrize("name", OWN)
+@numbers_of()
+def test_hostile_files_of_ours(name, num, own_files, place):
+    forge, use = OWN[name]
+    whole, counts, broke = (own_files / name).read_bytes(), Counter(), []
+    for number in range(num):
+        draw = random.Random(f"{generated.SEED} {name} {number}")
+        folder = place()
+        path = folder / name
+        if use is listed:
+            path = set_of_files(folder, name, whole)
+        else:
+            path.write_bytes(whole)
+        if number % 2:
+            path.write_bytes(damaged(whole, draw))
+        else:
+            forge(path, draw)
+        before = content_of(path.parent)
+        said = outcome(use, path)
+        counts["read" if said is None else said.split(":")[0]] += 1
+        if said and said.startswith("BROKE"):
+            broke.append(f"{number}: {said}")
+        assert content_of(path.parent) == before, f"{number}: what was there is lost"
+    print(f"{name}: {dict(counts)}")
+    assert not broke, "\n".join(broke[:20])
+
+
+def content_of(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@numbers_of()
+def test_hostile_files_of_all_formats(name, num, seeds, place):
+    form, counts = FORMATS[name], Counter()
+    for number in range(num):
+        draw = random.Random(f"{generated.SEED} {name} {number}")
+        seed = draw.choice(seeds[name])
+        path = place() / seed.name
+        (shutil.copytree if seed.is_dir() else shutil.copy)(seed, path)
+        files = sorted(path.iterdir()) if path.is_dir() else [path]
+        file = draw.choice(files)
+        file.write_bytes(damaged(file.read_bytes(), draw))
+        for call in (lambda path: looked(form, path), form.load):
+            counts[is_read(call, path)] += 1
+    print(f"{name}: {dict(counts)}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+def test_hostile_files_in_a_process_of_their_own(name, seeds, place):
+    """What a library does there, however long or large, ends in one line."""
+    form, how = FORMATS[name], Reading(isolate=True, isolate_gib=1.0, isolate_s=20.0)
+    for number in range(3):
+        draw = random.Random(f"{generated.SEED} {name} {number}")
+        seed = draw.choice(seeds[name])
+        path = place() / seed.name
+        (shutil.copytree if seed.is_dir() else shutil.copy)(seed, path)
+        file = draw.choice(sorted(path.iterdir()) if path.is_dir() else [path])
+        file.write_bytes(damaged(file.read_bytes(), draw))
+
+        def read(path):
+            with form.open(path, how) as opened:
+                opened.samples.read(0, 3)
+
+        is_read(read, path)
 
 
 # Files made to do harm -------------------------------------------------------------------------

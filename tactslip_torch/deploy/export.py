@@ -206,8 +206,9 @@ def stale_graphs(source: Path) -> tuple[Path, ...]:
 
     def is_stale(path: Path) -> bool:
         try:
-            return bool(read_sidecar(path)["detector_sha256"] != digest)
-        except (OSError, ValueError, KeyError):
+            told = json.loads(sidecar_path(path).read_bytes())
+            return bool(told["detector_sha256"] != digest)
+        except (OSError, ValueError, LookupError, TypeError):
             return True
 
     paths = [source.with_name(name) for name in FILES.values()]

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.solve import check_weights
+from tactslip_torch.own_files import FORGED, load_table, save_table
 from tactslip_torch.own_files import SUMS as FORMAT
-from tactslip_torch.own_files import load_table, save_table
 from tactslip_torch.runtime import SeenBatches, content_digest
 
 _CLASSES = ("non-slip", "slip")
@@ -166,10 +166,36 @@ class SufficientStats:
             FileNotFoundError: if there is no such file.
             ValueError: if it holds no sums, or is damaged.
         """
-        facts, tensors = load_table(path, FORMAT)
-        stats = cls(facts["num_features"], facts["about"], facts["degree"])
-        stats.seen_batches = SeenBatches(facts["batches"])
-        stats.sums, stats.count = tensors["sums"], tensors["count"]
+        metadata, tensors = load_table(path, FORMAT)
+        parts: dict[str, Any] = metadata | tensors
+        try:
+            return cls.restored(**parts)
+        except FORGED as error:
+            raise ValueError(f"{os.fspath(path)} is damaged: {error}; make it again") from error
+
+    @classmethod
+    def restored(
+        cls,
+        num_features: int,
+        about: Mapping[str, Any],
+        batches: Mapping[str, str],
+        sums: Tensor,
+        count: Tensor,
+        degree: int = 2,
+    ) -> SufficientStats:
+        """The sums that had these attributes.
+
+        Raises:
+            ValueError: if sums or counts are not those of so many features.
+        """
+        wanted = (2, ProductSums(num_features, degree).num_held)
+        if sums.shape != wanted or sums.dtype != torch.float64:
+            raise ValueError(f"sums must be float64 {list(wanted)}, got {list(sums.shape)}")
+        if count.shape != (2,) or count.dtype != torch.int64 or bool((count < 0).any()):
+            raise ValueError(f"count must be two whole numbers from 0, got {count!r:.60}")
+        stats = cls(num_features, about, degree)
+        stats.seen_batches = SeenBatches(batches)
+        stats.sums, stats.count = sums, count
         return stats
 
     def solve(

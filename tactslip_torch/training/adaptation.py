@@ -43,9 +43,9 @@ from tactslip_torch.model.leave_one_group_out import MOST_CONDITION, HeldOut, re
 from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.onset.decisions import KEY as ALARM
+from tactslip_torch.own_files import FORGED, load_table, save_table
 from tactslip_torch.own_files import STATISTICS as _FORMAT
-from tactslip_torch.own_files import load_table, save_table
-from tactslip_torch.runtime import SeenBatches, bar, content_digest
+from tactslip_torch.runtime import bar, content_digest
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.plan import TrainingPass, solve_metadata
 from tactslip_torch.training.recipe import recalls
@@ -112,6 +112,15 @@ class KnownBins:
     recording: Tensor
     recordings: tuple[str, ...]
     materials: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        each = (self.is_slip, self.weight, self.sample_weight, self.recording)
+        is_whole = all(x.shape == (len(self.z),) for x in each)
+        if not is_whole or len(self.recordings) != len(self.materials):
+            raise ValueError("known bins must have a class, weights and a recording each")
+        places = self.recording
+        if len(places) and not 0 <= int(places.min()) <= int(places.max()) < len(self.recordings):
+            raise ValueError(f"recordings of bins must lie in 0..{len(self.recordings) - 1}")
 
     def with_others(
         self, bins: Mapping[str, RecordingBins], weights: Mapping[str, float]
@@ -350,11 +359,15 @@ class Statistics:
             FileNotFoundError: if there is no such file.
             ValueError: if it is another kind of file, or damaged.
         """
-        plain = _with_tensors(*load_table(path, _FORMAT))
+        metadata, tensors = load_table(path, _FORMAT)
+        try:
+            return cls._restored(_with_tensors(metadata, tensors))
+        except FORGED as error:
+            raise ValueError(f"{os.fspath(path)} is damaged: {error}; train again") from error
+
+    @classmethod
+    def _restored(cls, plain: dict[str, Any]) -> Statistics:
         of_sums = plain["sums"]
-        sums = SufficientStats(of_sums["num_features"], of_sums["about"])
-        sums.seen_batches = SeenBatches(of_sums["seen_batches"])
-        sums.sums, sums.count = of_sums["sums"], of_sums["count"]
         rehearsal = plain["rehearsal"]
         for name in ("recordings", "materials"):
             rehearsal[name] = tuple(rehearsal[name])
@@ -364,13 +377,19 @@ class Statistics:
 
         steps = [Step(**own | {"replaced": bins(own["replaced"])}) for own in plain["steps"]]
         restored = {
-            "sums": sums,
+            "sums": SufficientStats.restored(batches=of_sums.pop("seen_batches"), **of_sums),
             "machine": Machine(**plain["machine"]),
             "rehearsal": KnownBins(**rehearsal),
             "bins": bins(plain["bins"]),
             "steps": tuple(steps),
         }
-        return cls(**plain | restored)
+        made = cls(**plain | restored)
+        num = made.sums.num_features
+        every: list[KnownBins | RecordingBins] = [made.rehearsal, *made.bins.values()]
+        for own in every:
+            if own.z.shape != (len(own.is_slip), num) or own.is_slip.dtype != torch.bool:
+                raise ValueError(f"bins must have {num} features and their classes")
+        return made
 
 
 def _without_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any:
