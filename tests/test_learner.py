@@ -5,11 +5,14 @@ from dataclasses import replace
 import lightning as L
 import pytest
 import torch
-from small_set import RATE_HZ, SmallSet, small_maker, small_recipe
+from small_set import RATE_HZ, SMALL_HAND, SmallSet, small_maker, small_recipe
 
+from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.splits import random_bins, seen6, unseen4
 from tactslip_torch.features.cache import FeatureCache
+from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.onset.events import LatencyParts
+from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.learner import SlipLearner, evaluated_bins, events_by_rule
 
@@ -118,6 +121,13 @@ def test_a_finished_pass_survives_a_checkpoint_for_the_same_bins(plain, cache, t
     for other in ((others, maker), (split, louder)):
         with pytest.raises(ValueError, match="other training bins"):
             fit(*other, checkpoint=path)
+
+
+def test_a_detector_computes_by_the_backend_of_its_training(cache):
+    source = SmallSet()
+    pool = FeaturePool(SMALL_HAND, backend="torch")
+    maker = FeatureMaker(source, pool, ChannelFilter([51, 11]), LabelRule(), cache)
+    assert learn(source, unseen_c(source), maker).detector.extractor.backend == "torch"
 
 
 def test_a_test_without_a_detector_is_refused():

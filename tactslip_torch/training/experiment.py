@@ -134,6 +134,7 @@ def feature_maker(
         level=_checked_level(level, bin_samples, wavelet),
         spectrum=spectrum,
         arithmetic="native" if dtype == "float32" else "double",
+        backend=backend,
     )
     channel_filter = ChannelFilter(lengths, polyorder, align)
     computed_in, computed_by = DTYPES[dtype], backend_of(backend)

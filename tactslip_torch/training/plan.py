@@ -718,9 +718,9 @@ class Plan:
         channel_filter: ChannelFilter,
         head: Head,
         info: Mapping[str, Any],
-        backend: BackendName = "auto",
+        backend: BackendName | None = None,
     ) -> SlipDetector:
-        """The detector of this plan with a machine that was solved for it."""
+        """The detector of this plan with a machine that was solved for it; backend of the pool."""
         selection = self.selection
         return SlipDetector(
             pool,
@@ -732,7 +732,7 @@ class Plan:
             self.imputation,
             self.gaussians,
             selection.pooling,
-            backend=backend,
+            backend=backend or pool.backend,
         )
 
     def to_dict(self) -> dict[str, Any]:
