@@ -13,7 +13,7 @@ from arguments import Parser
 from command import run, say
 from files import load_model, load_recording
 
-BATCH = 256  # bins judged at a time
+BATCH = 256  # bins scored at a time
 
 
 def score_bins(session, facts, recording):
@@ -35,8 +35,8 @@ def main(options):
     """Print a line a bin."""
     session, facts = load_model(options.model, "bin")
     recording = load_recording(options.recording, facts)
-    for judged in score_bins(session, facts, recording):
-        say(json.dumps(judged))
+    for scored in score_bins(session, facts, recording):
+        say(json.dumps(scored))
 
 
 if __name__ == "__main__":

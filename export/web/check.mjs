@@ -73,7 +73,7 @@ async function slider(page) {
   const threshold = page.locator("#threshold");
   const move = async (act) => {
     await act();
-    await page.waitForFunction(() => document.body.ariaBusy === "false"); // all is judged again
+    await page.waitForFunction(() => document.body.ariaBusy === "false"); // all is scored again
     const step = Number(await threshold.inputValue());
     return { step, pixels: await slipPixels(page), lines: await decisionLines(page) };
   };

@@ -10,7 +10,7 @@ import { describe, describeSimulated, report } from "./readout.mjs";
 import { Scope } from "./scope.mjs";
 import { thresholdScale } from "./threshold.mjs";
 
-const AGAIN_MS = 150; // the slider rests for so long before all is judged again
+const AGAIN_MS = 150; // the slider rests for so long before all is scored again
 const element = (id) => document.getElementById(id);
 let player = null;
 
@@ -123,7 +123,7 @@ function connectFiles(scope) {
   element("file").disabled = false;
 }
 
-/** Returns whether the slider has moved and nothing was judged by it yet. */
+/** Returns whether the slider has moved and nothing was scored with it yet. */
 function connectThreshold(facts) {
   const scale = thresholdScale(facts);
   const slider = element("threshold");
@@ -143,7 +143,7 @@ function connectThreshold(facts) {
     clearTimeout(waiting);
     waiting = setTimeout(() => {
       waiting = 0;
-      player.judgeAgain();
+      player.scoreAgain();
     }, AGAIN_MS);
   };
   element("threshold-title").textContent = scale.title;

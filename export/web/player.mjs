@@ -50,8 +50,8 @@ export class Player {
     this.latencies.clear();
   }
 
-  /** Judge all that was played again, at the stream's threshold as it is now. */
-  async judgeAgain() {
+  /** Score again all that was played, at the stream's threshold as it is now. */
+  async scoreAgain() {
     await this.#rewind(this.position);
   }
 

@@ -58,7 +58,7 @@ export function report(player, rate) {
 
 function positionText(player, recording, seconds) {
   const where = `${seconds(player.position)} of ${seconds(recording.rows)} s`;
-  return `${recording.name}: ${player.isCatchingUp ? "judging again" : where}`;
+  return `${recording.name}: ${player.isCatchingUp ? "scoring again" : where}`;
 }
 
 function reportLatencies(latencies) {
