@@ -77,10 +77,10 @@ export function panels(facts, height) {
   return { groups, centre, status, probability, statistic, onset, axis: top };
 }
 
-/** Channels that the detector uses: those its features are of. */
-export function usedChannels(facts) {
-  const named = new Set(facts.features.map((feature) => feature.split(" ")[0]));
-  return facts.channels.map((name) => named.has(name));
+/** Channels that the detector uses: those its features are of; a pooled one is of a whole kind. */
+export function usedChannels({ channels, features, kinds }) {
+  const named = new Set(features.map((feature) => feature.split(" ")[0]));
+  return channels.map((name, i) => named.has(name) || named.has(kinds[i]));
 }
 
 /** Lowest and highest statistic shown. */
