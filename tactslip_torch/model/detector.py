@@ -152,19 +152,19 @@ class SlipDetector(nn.Module):
 
     @property
     def context_before(self) -> int:
-        """Samples that a raw bin comes with before it; of a causal filter all of them."""
+        """Samples that a raw bin needs before it; with a causal filter, all of its context."""
         return self.channel_filter.context_before
 
     @property
     def context_after(self) -> int:
-        """Samples that a raw bin comes with behind it, ``look_ahead`` of which matter."""
+        """Samples that a raw bin has after it; only the first ``look_ahead`` matter."""
         return self.channel_filter.context_after
 
     @property
     def look_ahead(self) -> int:
-        """Samples behind a bin that its score waits for: those the channels in use are filtered by.
+        """Samples after a bin that its score needs, by the filters of the channels in use.
 
-        What stands behind them may be anything; so a stream that uses films alone waits for 5
+        What comes after them may be anything; so a stream that uses films alone waits for 5
         samples, 2.5 ms, and fills up the rest.
         """
         return max(self.channel_filter.reaches[i][1] for i in self.extractor.plan.channels)

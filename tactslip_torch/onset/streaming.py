@@ -46,7 +46,7 @@ class StreamingDetector:
         detector: fitted on this hand.
         settings: hop, calibration, rule and threshold; by default those in the detector's file.
         dtype: of the samples, float32 or float64, and of the scores; what is pushed is converted.
-        masked_channels: names of channels that are not to be listened to.
+        masked_channels: names of channels to leave out.
         max_gap_s: longest gap that is filled.
 
     Attributes:
@@ -105,7 +105,7 @@ class StreamingDetector:
 
     @property
     def masked_channels(self) -> tuple[str, ...]:
-        """Channels that are not listened to, in the order of the hand."""
+        """Channels that are left out, in the order of the hand."""
         return self._masked_channels
 
     @masked_channels.setter
@@ -117,17 +117,17 @@ class StreamingDetector:
 
     @property
     def look_ahead_s(self) -> float:
-        """From the end of a bin until its decision is made."""
+        """Time from the end of a bin to its decision."""
         return self.detector.look_ahead / self._clock.sample_rate_hz
 
     @property
     def bin_s(self) -> float:
-        """What a decision is about."""
+        """Length of a bin."""
         return self.detector.pool.bin_samples / self._clock.sample_rate_hz
 
     @property
     def hop_s(self) -> float:
-        """Between two decisions."""
+        """Time between two decisions."""
         return self.settings.decision_samples / self._clock.sample_rate_hz
 
     @property
