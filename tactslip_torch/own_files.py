@@ -158,11 +158,7 @@ class _TableReader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if module == "torch" and name in _STORAGES:
             return _STORAGES[name]
-        known = {
-            ("torch._utils", "_rebuild_tensor_v2"): _tensor,
-            ("collections", "OrderedDict"): dict,
-        }
-        return known[module, name]
+        return _KNOWN[module, name]
 
     def persistent_load(self, about: Any) -> Tensor:
         _, dtype, key, _, num = about
@@ -232,11 +228,10 @@ def read_json(path: str | os.PathLike[str], form: str, most_bytes: int = 2**24) 
         FileNotFoundError: if there is no such file.
         ValueError: if it is no JSON, longer than that, or not what the schema wants.
     """
+    file = regular_file(path, most_bytes)
     try:
-        content = json.loads(regular_file(path, most_bytes).read_bytes())
+        content = json.loads(file.read_bytes())
     except (ValueError, RecursionError) as error:
-        if str(error).startswith(os.fspath(path)):
-            raise
         raise ValueError(f"{os.fspath(path)} is damaged ({error}); make it again") from None
     found: dict[str, Any] = checked(os.fspath(path), content, form)
     return found
@@ -269,7 +264,7 @@ def _problem(value: Any, wanted: Wanted, field: str) -> str | None:
     if isinstance(wanted, list):
         each, most = wanted
         if not isinstance(value, list) or len(value) > most:
-            said = f"{len(value)}" if isinstance(value, list) else f"{value!r:.60}"
+            said = len(value) if isinstance(value, list) else f"{value!r:.60}"
             return f"{field} must be a list of at most {most}, got {said}"
         problems = (_problem(x, each, f"{field}[{i}]") for i, x in enumerate(value))
         return next(filter(None, problems), None)
@@ -436,9 +431,10 @@ _INFO = {
     "train_sessions?": _names,
     "*": _any,
 }
+CHECKPOINT = "tactslip_torch checkpoint 1"
 _epoch = _number(0, 2, whole=True)
 _CHECKPOINT = {
-    "format": _one_of("tactslip_torch checkpoint 1"),
+    "format": _one_of(CHECKPOINT),
     "epoch": _epoch,
     "fingerprint": _text,
     "loops": {
@@ -476,7 +472,6 @@ DETECTOR, SUMS, STATISTICS = (
     "tactslip_torch statistics 4",
 )
 SIDECAR = "tactslip_torch onnx 1"
-CHECKPOINT = "tactslip_torch checkpoint 1"
 SCHEMAS: Mapping[str, Wanted] = {
     DETECTOR: {
         "channels": _CHANNELS,

@@ -58,6 +58,8 @@ def checked(command: str, name: str, arguments: Sequence[str]) -> tuple[list[str
     if given & _ELSEWHERE:
         return [*overrides, *options], None
     folder = _folder_of(options)
+    if folder is not None and not Path(folder).is_dir():
+        raise Mistake(f"--config-dir {folder}: there is no such folder")
     _check_words(command, name, overrides)
     if problem := unknown_choice(arguments):
         raise Mistake(problem)
@@ -67,7 +69,7 @@ def checked(command: str, name: str, arguments: Sequence[str]) -> tuple[list[str
     try:
         composed = Composed(name, first, folder)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
-        raise Mistake(_translated(command, name, first, error)) from error
+        raise Mistake(_translated(command, name, first, error, folder)) from error
     for key in unknown_keys(composed):
         raise Mistake(_no_key(command, name, first, key, composed))
     return [*overrides, *options], composed
@@ -99,8 +101,8 @@ def _apart(command: str, name: str, arguments: Sequence[str]) -> tuple[list[str]
             if option not in actions:
                 key = option.lstrip("-").replace("-", "_")
                 near = _nearest(key, _names(_plain(name))) or "KEY"
-                if not found and arguments[place + 1 :]:
-                    value = arguments[place + 1]
+                if not found:
+                    value = next((x for x in arguments[place + 1 :][:1] if x[:1] != "-"), "")
                 hint = f"write {near}={value or 'VALUE'}, without dashes"
                 raise Mistake(f"{command} has no option {option}; {hint}")
             options.append(argument)
@@ -126,7 +128,7 @@ def _check_words(command: str, name: str, overrides: Sequence[str]) -> None:
     """
     for place, word in enumerate(overrides):
         key, found, value = word.partition("=")
-        if word.startswith("~"):
+        if word.startswith("~") and key != "~":
             continue
         if what := _unclosed(word):
             whole = " ".join(overrides[place:])
@@ -141,7 +143,7 @@ def _check_words(command: str, name: str, overrides: Sequence[str]) -> None:
             raise Mistake(f"{word} has a {extra} too many; write '{word.removesuffix(extra)}'")
         if not found:
             raise Mistake(_no_value(command, name, word, overrides[place + 1 :]))
-        if not key.strip("+ "):
+        if not key.strip("+~ "):
             raise Mistake(f"{word} has no key; write KEY=VALUE, {_LIST_KEYS.format(command)}")
         if value.startswith("="):
             raise Mistake(f"{word} has two =; write {key}={value.lstrip('=')}")
@@ -252,9 +254,26 @@ def unknown_choice(arguments: Sequence[str]) -> str | None:
     return None
 
 
-def _translated(command: str, name: str, overrides: Sequence[str], error: Exception) -> str:
+def _translated(
+    command: str, name: str, overrides: Sequence[str], error: Exception, folder: str | None
+) -> str:
     """What Hydra raised, in one line."""
     said = str(error)
+    if found := re.search(r"Could not override '([^']+)'", said):
+        added = [f"+{o}" if o.startswith(f"{found[1]}=") else o for o in overrides]
+        try:
+            composed = Composed(name, added, folder)
+        except (HydraException, OmegaConfBaseException):
+            composed = _plain(name)
+        section = composed.known.get(found[1].rpartition(".")[0])
+        if isinstance(section, dict) and not unknown_keys(composed):
+            return f"{found[1]} has no default; write +{found[1]}=VALUE"
+    if found := re.search(r"Multiple values for ([\w/@.]+)\. .*: ([\w/.-]+)'", said):
+        group, option = found[1], found[2]
+        if group == "exp":
+            given = [o.partition("=")[2] for o in overrides if o.startswith("+exp=")]
+            return f"+exp is given twice; write '+exp=[{','.join(given)}]'"
+        return f"+{group}={option} adds a group that is there already; write {group}={option}"
     if found := re.search(r"Could not (?:override|delete from config\.) '([^']+)'", said):
         return _no_key(command, name, overrides, found[1])
     if found := re.search(r"An item is already at '([^']+)'", said):
@@ -262,6 +281,8 @@ def _translated(command: str, name: str, overrides: Sequence[str], error: Except
         return f"{word} adds a key that is there already; write {word.lstrip('+')}"
     if found := re.search(r"Ambiguous value for argument '(.+)'", said):
         key, _, value = found[1].partition("=")
+        if _is_choice(key) and not key.startswith("+"):
+            return f"{found[1]} has several values; choose one, or add -m for a run of each"
         return (
             f"{found[1]} has several values; write '{key}=[{value}]' for a list, "
             "or add -m for a run of each"

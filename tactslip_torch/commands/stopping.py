@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -44,12 +45,16 @@ def stopping() -> Iterator[None]:
         if os.getpid() == first:
             for each in _SIGNALS:  # what tidies up is not to be stopped
                 signal.signal(each, signal.SIG_IGN)
+            # torch's would raise, as its workers end by the same signal
+            before[signal.SIGCHLD] = signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             raise Stopped(number)
         if number != signal.SIGINT:
             os._exit(128 + number)
 
+    before: dict[int, Any] = {}
     try:
-        before = {each: signal.signal(each, stop) for each in _SIGNALS}
+        for each in _SIGNALS:
+            before[each] = signal.signal(each, stop)
     except ValueError:  # not the main thread: whoever started it has the signals
         yield
         return

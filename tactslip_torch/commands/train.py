@@ -138,7 +138,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         print(f"\nresults in {folder}")
     exports = [found for fold in fold_metrics.values() for found in fold["onnx"].values()]
     if problems := [found for found in exports if isinstance(found, str)]:
-        raise ValueError(f"all else is written: {problems[0]}")
+        raise ValueError(f"an ONNX file was not written, all other results are: {problems[0]}")
     return {
         f"{role}/{name}": scores[name]
         for role, scores in metrics["splits"].items()
@@ -418,12 +418,8 @@ def _saved(config: DictConfig, folder: Path, again: str) -> str:
     if kept and not config.statistics and not config.tuning:
         where = ", ".join(str(path) for path in kept)
         return f"the first pass is saved in {where}; resume it: {again} ckpt_path={folder}"
-    made = (
-        "the features made so far are lost"
-        if config.cache in ("off", False)
-        else ("the features made so far are in the cache")
-    )
-    return f"no pass is finished, {made}; start again: {again}"
+    where = "lost" if config.cache in ("off", False) else "in the cache"
+    return f"no pass is finished, the features made so far are {where}; start again: {again}"
 
 
 main = entry_point("train", train, _saved)
