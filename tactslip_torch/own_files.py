@@ -264,8 +264,8 @@ def _problem(value: Any, wanted: Wanted, field: str) -> str | None:
     if isinstance(wanted, list):
         each, most = wanted
         if not isinstance(value, list) or len(value) > most:
-            said = len(value) if isinstance(value, list) else f"{value!r:.60}"
-            return f"{field} must be a list of at most {most}, got {said}"
+            got = len(value) if isinstance(value, list) else f"{value!r:.60}"
+            return f"{field} must be a list of at most {most}, got {got}"
         problems = (_problem(x, each, f"{field}[{i}]") for i, x in enumerate(value))
         return next(filter(None, problems), None)
     if not isinstance(value, dict):

@@ -458,6 +458,19 @@ _function: Callable[[Any], Any] | None = None
 """What the processes of ``in_processes`` call."""
 
 
+def num_processes(num_workers: int | None) -> int:
+    """``num_workers``, or for ``None`` as many as there are processors, at most 8.
+
+    Raises:
+        ValueError: if there is no such number of processes.
+    """
+    if num_workers is None:
+        return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1, 8)
+    if type(num_workers) is not int or num_workers < 0:
+        raise ValueError(f"num_workers must be null or a number from 0, got {num_workers!r}")
+    return num_workers
+
+
 def in_processes(
     function: Callable[[Item], Result],
     items: Sequence[Item],
@@ -482,10 +495,7 @@ def in_processes(
         ValueError: if there is no such number of processes.
         Exception: what ``function`` raised; what was not begun is left out.
     """
-    if num_workers is not None and (type(num_workers) is not int or num_workers < 0):
-        raise ValueError(f"num_workers must be null or a number from 0, got {num_workers!r}")
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    count = min(min(available, 8) if num_workers is None else num_workers, len(items))
+    count = min(num_processes(num_workers), len(items))
     if count < 2 or "fork" not in multiprocessing.get_all_start_methods():
         yield from map(function, bar(items, what, unit))
         return

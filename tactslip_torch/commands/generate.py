@@ -24,7 +24,7 @@ from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written, write
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.features.cache import source_digest
 from tactslip_torch.report.recordings import DrawnRecording, signals_figure, written_table
-from tactslip_torch.runtime import bar, in_processes
+from tactslip_torch.runtime import bar, in_processes, num_processes
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.experiment import frame_lengths, save_config
 
@@ -47,9 +47,7 @@ def generate(config: DictConfig, folder: Path) -> list[Written]:
     started = time.perf_counter()
     if not isinstance(config.materials, ListConfig):
         raise ValueError(f"materials must be a list such as [M1,M6], got {config.materials!r}")
-    count = config.num_workers
-    if count is not None and not (isinstance(count, int) and count >= 0):
-        raise ValueError(f"num_workers must be null or a number of processes, got {count!r}")
+    num_processes(config.num_workers)  # refused before anything is made
     source: RecordingSource = instantiate(config.data, _convert_="all")
     made_by = {
         "code": source_digest(),
@@ -61,7 +59,9 @@ def generate(config: DictConfig, folder: Path) -> list[Written]:
     files.check()
     save_config(config, folder)
     (folder / MANIFEST).unlink(missing_ok=True)  # it must not speak of files that are replaced
-    written = list(in_processes(files.write, source.ids, "recordings", "recording", count))
+    written = list(
+        in_processes(files.write, source.ids, "recordings", "recording", config.num_workers)
+    )
     write_manifest(folder, written)
     seconds = time.perf_counter() - started
     for scene in bar(shown, "figures", "scene") if shown else ():

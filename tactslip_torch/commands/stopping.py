@@ -68,5 +68,5 @@ def stopping() -> Iterator[None]:
         raise SystemExit(128 + end.number) from None
     finally:
         if os.getpid() == first:
-            for each, handler in before.items():
-                signal.signal(each, handler)
+            for own, handler in before.items():
+                signal.signal(own, handler)

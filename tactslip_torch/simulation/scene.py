@@ -819,8 +819,8 @@ def paper_scenes(
         >>> scenes[0].disturbances.burst_rate_hz
         0.1
     """
-    if cycles < 1:
-        raise ValueError(f"cycles must be at least 1, got {cycles}")
+    if not isinstance(cycles, int) or cycles < 1:
+        raise ValueError(f"cycles must be a whole number of at least 1, got {cycles!r}")
     values = _grouped(overrides)
     known = {f.name for f in fields(Scene)} - {"material", "hand", "seed", "cycle"}
     if unknown := sorted(set(values) - known):

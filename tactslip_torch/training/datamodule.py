@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -32,6 +31,7 @@ from tactslip_torch.data.splits import ROLES, Split
 from tactslip_torch.features.cache import FeatureCache, cache_key, source_digest
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.native import BackendName
+from tactslip_torch.runtime import num_processes
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter, extended
 
@@ -312,8 +312,7 @@ class SlipDataModule(L.LightningDataModule):
         super().__init__()
         self.maker = maker
         self.split = split
-        processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-        self.num_workers = min(processors, 8) if num_workers is None else num_workers
+        self.num_workers = num_processes(num_workers)
         self._shares_processors = num_workers is None
 
     def train_dataloader(self) -> DataLoader[RecordingFeatures]:
