@@ -283,7 +283,7 @@ def test_a_damaged_file_in_a_folder_costs_the_others_nothing(model, tmp_path, mo
     assert "2 of 5 recordings failed, first: " in line
     assert "c.npz is damaged or no recording of ours (Bad CRC-32" in line
     assert "; the others are in" in line
-    assert "of 2 slips 2 found" in out
+    assert "slips found: 2 of 2" in out
     written = json.loads((tmp_path / "out" / "onsets.json").read_text())
     assert [entry["file"] for entry in written["recordings"]] == ["a.npz", "b.npz", "d.npz"]
     assert [entry["file"] for entry in written["failed"]] == ["c.npz", "e.npz"]

@@ -61,6 +61,8 @@ def test_the_wheel_holds_the_package_and_its_configuration(unpacked):
         assert (package / name).is_dir()
     held = {p.relative_to(package / "conf") for p in (package / "conf").rglob("*.yaml")}
     assert held == {p.relative_to(ROOT / "conf") for p in (ROOT / "conf").rglob("*.yaml")}
+    for name in ("export/c/README.md", "pretrained/paper24-sim.pt", "pretrained/paper24-sim.npz"):
+        assert (package / name).is_file()
     code = {p.relative_to(package) for p in package.rglob("*.py")}
     code = {path for path in code if path.parts[0] != "export"}
     ours = ROOT / "tactslip_torch"

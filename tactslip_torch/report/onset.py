@@ -345,7 +345,7 @@ def onsets_summary(content: Mapping[str, Any], seconds: float) -> str:
     invalid = sum(entry["decisions"]["invalid"] for entry in entries)
     number = sum(entry["decisions"]["number"] for entry in entries)
     lines = [
-        f"{alarms} alarms in {duration_s:.1f} s of {len(entries)} recordings; "
+        f"alarms: {alarms} in {duration_s:.1f} s (recordings: {len(entries)}); "
         f"took {seconds:.1f} s, {duration_s / seconds:.0f} times real time"
     ]
     if invalid:
@@ -359,9 +359,9 @@ def onsets_summary(content: Mapping[str, Any], seconds: float) -> str:
         if slid := events["slid_mm"]:
             median += f" ({slid['median']['value']:.1f} mm slid)"
         lines.append(
-            f"of {events['num_onsets']} slips {events['num_found']} found{median}, "
-            f"{events['num_early']} early, {events['num_missed']} missed; "
-            f"{events['num_false_alarms']} false alarms in {60 * events['quiet_hours']:.2f} "
+            f"slips found: {events['num_found']} of {events['num_onsets']}{median}; "
+            f"early: {events['num_early']}, missed: {events['num_missed']}; "
+            f"false alarms: {events['num_false_alarms']} in {60 * events['quiet_hours']:.2f} "
             "minutes without slip"
         )
     return "\n".join(lines)
