@@ -92,6 +92,10 @@ def _apart(command: str, name: str, arguments: Sequence[str]) -> tuple[list[str]
     takes = 0
     for place, argument in enumerate(arguments):
         if takes:
+            known = actions[options[-1]].choices
+            if known and argument not in known:
+                wanted = ", ".join(map(str, known))
+                raise Mistake(f"{options[-1]} must be one of {wanted}, got {argument}")
             options.append(argument)
             takes = 0
         elif not argument.startswith("-") or argument == "-":
@@ -107,6 +111,8 @@ def _apart(command: str, name: str, arguments: Sequence[str]) -> tuple[list[str]
                 raise Mistake(f"{command} has no option {option}; {hint}")
             options.append(argument)
             takes = 0 if found or actions[option].nargs == 0 else 1
+    if takes and actions[options[-1]].nargs is None:
+        raise Mistake(f"{options[-1]} needs a value; {_LIST_KEYS.format(command)}")
     return overrides, options
 
 

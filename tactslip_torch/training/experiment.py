@@ -202,6 +202,7 @@ def feature_cache(setting: str | bool | None) -> Iterator[FeatureCache]:
     cache = FeatureCache(
         default_cache_folder() if setting in ("auto", True) else Path(str(setting)).expanduser()
     )
+    cache.folder.mkdir(parents=True, exist_ok=True)  # refused before a pass has begun
     yield cache
     cache.prune()
 
