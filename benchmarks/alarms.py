@@ -131,7 +131,7 @@ class Alarms(Benchmark[Sizes]):
     """Every seed, then the first under other pulses and knocks."""
 
     name = "alarms"
-    title = "The alarm: budget kept, slips found, how late"
+    title = "The alarm: slips found, and how late"
     about = "alarms of +exp=onset within the default budget, on recordings that set nothing"
     page, markers, has_headings = "docs/onset.md", "onset", False
     sizes = Sizes()

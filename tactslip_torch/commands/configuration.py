@@ -29,16 +29,25 @@ _WIDTH = 100
 _INDENT = 34
 
 
-def conf_dir() -> Path:
-    """The ``conf`` folder: inside the package (wheel) or beside it (checkout, editable install).
+def packaged_folder(name: str, hint: str) -> Path:
+    """A folder inside the package (wheel) or beside it (checkout, editable install).
+
+    Args:
+        name: of the folder.
+        hint: a file that is in it.
 
     Raises:
         FileNotFoundError: if there is none.
     """
-    for folder in (_PACKAGE / "conf", _PACKAGE.parent / "conf"):
-        if (folder / _CONF_HINT).is_file():
+    for folder in (_PACKAGE / name, _PACKAGE.parent / name):
+        if (folder / hint).is_file():
             return folder
-    raise FileNotFoundError(f"no conf folder with {_CONF_HINT} in or beside {_PACKAGE}; reinstall")
+    raise FileNotFoundError(f"no {name} folder with {hint} in or beside {_PACKAGE}; reinstall")
+
+
+def conf_dir() -> Path:
+    """The ``conf`` folder."""
+    return packaged_folder("conf", _CONF_HINT)
 
 
 class Comments(NamedTuple):

@@ -6,7 +6,7 @@ import argparse
 import shutil
 from pathlib import Path
 
-_PACKAGE = Path(__file__).resolve().parents[1]  # runtime, which knows it too, imports torch
+from tactslip_torch.commands.configuration import packaged_folder
 
 NEEDED = {"web": ("web", "node")}
 """Hosts of several folders: the page shares the reader and the stream of ``node``."""
@@ -14,15 +14,8 @@ _LEFT = shutil.ignore_patterns("node_modules", "__pycache__", "*.o")
 
 
 def hosts_dir() -> Path:
-    """The ``export`` folder: inside the package (wheel) or beside it (checkout).
-
-    Raises:
-        FileNotFoundError: if there is none.
-    """
-    for folder in (_PACKAGE / "export", _PACKAGE.parent / "export"):
-        if (folder / "README.md").is_file():
-            return folder
-    raise FileNotFoundError(f"no export folder in or beside {_PACKAGE}; reinstall")
+    """The ``export`` folder."""
+    return packaged_folder("export", "README.md")
 
 
 def host_names() -> list[str]:
