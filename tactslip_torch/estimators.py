@@ -30,7 +30,7 @@ from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import calibration_of
-from tactslip_torch.own_files import load_table, save_table
+from tactslip_torch.own_files import FORGED, load_table, save_table
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.spectrum import SpectrumMethod
 from tactslip_torch.signals.wavelet import highest_level
@@ -486,7 +486,7 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         """
         score = torch.from_numpy(self._score(X))
         slip = probability(self._slope.llr(score), 0.5).numpy()
-        return np.stack(self._ordered([1 - slip, slip], is_from_slip=True), axis=1)
+        return np.stack(self._ordered([1 - slip, slip]), axis=1)
 
     def to_detector(self, features: TactileFeatures | None = None) -> SlipDetector:
         """A ``SlipDetector``, for streams, ONNX and the commands.
@@ -598,7 +598,7 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
             return cls.from_detector(SlipDetector.load(path))
         try:
             return cls._from_table(metadata, tensors)
-        except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        except FORGED as error:
             raise ValueError(f"{os.fspath(path)} is a damaged classifier: {error}") from error
 
     @classmethod
@@ -649,7 +649,7 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         found: Array = score.numpy()
         return found
 
-    def _ordered(self, pair: list[Any], *, is_from_slip: bool = False) -> list[Any]:
+    def _ordered(self, pair: list[Any]) -> list[Any]:
         """Non-slip and slip of what is in the order of ``classes_``, or the other way round."""
         return pair if self.slip_label_ == self.classes_[1] else pair[::-1]
 

@@ -241,15 +241,14 @@ def unknown_choice(arguments: Sequence[str]) -> str | None:
         >>> unknown_choice(["+exp=quik"])[:31]
         'unknown exp quik; known: quick,'
     """
-    options = [argument for argument in arguments if argument.startswith("-")]
-    further = [Path(place) for place in (_folder_of(arguments),) if options and place]
+    own = _folder_of(arguments)
     for argument in arguments:
         key, found, value = argument.lstrip("+").partition("=")
         group = key.partition("@")[0]
         if argument.startswith("-") or not found or not group or not (conf_dir() / group).is_dir():
             continue
         known = list(options_of(group))
-        known += [path.stem for folder in further for path in (folder / group).glob("*.yaml")]
+        known += [path.stem for path in Path(own, group).glob("*.yaml")] if own else []
         for choice in value.strip("'\"[]").split(","):
             if choice and choice.strip() not in known and not value.startswith("{"):
                 near = get_close_matches(choice, known, 5)
@@ -308,7 +307,7 @@ def _no_key(
     command: str, name: str, overrides: Sequence[str], key: str, composed: Composed | None = None
 ) -> str:
     """That a key is unknown: what is near it, or which option has it."""
-    groups = {option: g for g in _plain(name).groups for option in [g.name]}
+    groups = {group.name: group for group in _plain(name).groups}
     head, _, rest = key.partition(".")
     if rest and head in groups:
         having = [o for o in groups[head].options if rest in _keys_of(f"{head}/{o}")]
