@@ -17,6 +17,7 @@ ARROWS = {
     "model": ("features", "signals", "native", "hand"),
     "onset": ("model", "features", "signals", "native", "hand"),
     "deploy": ("features", "model", "onset", "signals", "hand"),
+    "live": ("hand", "data", "signals", "model", "onset", "deploy"),
     "training": (*_LOWER, "onset", "deploy", "report"),
     "analysis": (*_LOWER, "onset", "deploy", "training"),
     "report": (),

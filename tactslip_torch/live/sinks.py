@@ -1,0 +1,198 @@
+"""What a live stream hands on: blocks of samples, events, and the sinks that take decisions.
+
+A sink takes everything in order, from one thread. Whatever it raises ends the stream.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, TextIO
+
+from numpy.typing import NDArray
+
+from tactslip_torch.onset.decisions import Alarm, Decisions
+
+Array = NDArray[Any]
+
+
+class Block(NamedTuple):
+    """Samples that came next, with the channels in the order and units of the detector.
+
+    Attributes:
+        samples: ``[n, C]``, float64; NaN for missing ones.
+        time_s: when each was taken, by the sender's clock, ``[n]``, float64; ``None``: not told.
+    """
+
+    samples: Array
+    time_s: Array | None = None
+
+
+class Event(NamedTuple):
+    """What happened to a stream beside its samples.
+
+    Attributes:
+        kind: ``"connected"``, ``"waiting"``, ``"lost"``, ``"garbage"``, ``"dropped"``, ``"gap"`` or
+            ``"ended"``.
+        text: one line for people.
+    """
+
+    kind: str
+    text: str
+
+
+class Sink(Protocol):
+    """Where samples, decisions and events of a live stream go."""
+
+    def samples(self, first: int, block: Block) -> None:
+        """Take samples, before the decisions on them.
+
+        Args:
+            first: index of the first since the stream's start; those that were dropped count.
+            block: the samples.
+        """
+
+    def decisions(self, decisions: Decisions) -> None:
+        """Take decisions ``[m]``, as ``StreamingDetector.push`` gives them; ``m`` from 1."""
+
+    def event(self, kind: str, text: str) -> None:
+        """Take an ``Event``."""
+
+    def close(self) -> None:
+        """The stream has ended: write what is left."""
+
+
+def decision_columns(decisions: Decisions, *, has_onset: bool) -> dict[str, list[Any]]:
+    """Decisions under the names that all hosts give them, as plain JSON values.
+
+    Args:
+        decisions: of one stream, ``[m]``.
+        has_onset: whether the detector has an onset classifier: only then are there
+            ``onset_score`` and ``raised_by``.
+
+    Returns:
+        ``time_s``, ``onset_s``, ``score``, ``probability``, ``valid``, ``statistic``, ``alarm``
+        and ``on`` (``export/README.md``), ``m`` entries each; ``None`` for what is not finite.
+    """
+    columns = {
+        "time_s": decisions.available_s,
+        "onset_s": decisions.onset_s,
+        "score": decisions.score,
+        "probability": decisions.probability,
+        "valid": decisions.is_valid,
+        "statistic": decisions.statistic,
+        "alarm": decisions.is_alarm,
+        "on": decisions.is_on,
+    }
+    if has_onset:
+        columns["onset_score"] = decisions.onset_score
+    plain = {name: _finite(values.tolist()) for name, values in columns.items()}
+    if has_onset:
+        by = zip(plain["alarm"], decisions.by_onset.tolist(), strict=True)
+        plain["raised_by"] = [("onset" if o else "status") if alarm else None for alarm, o in by]
+    return plain
+
+
+def _finite(values: list[Any]) -> list[Any]:
+    return [value if math.isfinite(value) else None for value in values]
+
+
+_OF_AN_ALARM = ("time_s", "onset_s", "score", "probability", "valid", "raised_by")
+
+
+class JsonLines:
+    """A JSON line for each alarm, or for each decision, as the hosts of an export print them.
+
+    An event is a line ``{"event": kind, "text": text}``; the last line counts decisions and alarms.
+
+    Args:
+        write: takes a text, whole lines; flushes.
+        every: whether to write every decision, not alarms alone.
+        has_onset: whether the detector has an onset classifier.
+        sample_rate_hz: of the stream, for the last line.
+    """
+
+    def __init__(
+        self,
+        write: Callable[[str], object],
+        *,
+        every: bool = False,
+        has_onset: bool = False,
+        sample_rate_hz: float,
+    ) -> None:
+        self._write, self._every, self._has_onset = write, every, has_onset
+        self._rate, self._end = sample_rate_hz, 0
+        self._num_decisions = self._num_alarms = 0
+
+    @classmethod
+    def to_file(cls, file: TextIO, **options: Any) -> JsonLines:
+        """Lines to an open text file, flushed at each write."""
+
+        def write(text: str) -> None:
+            file.write(text)
+            file.flush()
+
+        return cls(write, **options)
+
+    def samples(self, first: int, block: Block) -> None:
+        """Count them."""
+        self._end = first + len(block.samples)
+
+    def decisions(self, decisions: Decisions) -> None:
+        """Write their lines at once."""
+        is_alarm = decisions.is_alarm.tolist()
+        self._num_decisions += len(is_alarm)
+        self._num_alarms += sum(is_alarm)
+        if not self._every and not any(is_alarm):
+            return
+        columns = decision_columns(decisions, has_onset=self._has_onset)
+        if not self._every:
+            columns = {name: columns[name] for name in _OF_AN_ALARM if name in columns}
+        rows = zip(*columns.values(), strict=True)
+        lines = [
+            json.dumps(dict(zip(columns, row, strict=True)))
+            for row, alarm in zip(rows, is_alarm, strict=True)
+            if self._every or alarm
+        ]
+        self._write("".join(f"{line}\n" for line in lines))
+
+    def event(self, kind: str, text: str) -> None:
+        """Write its line."""
+        self._write(json.dumps({"event": kind, "text": text}) + "\n")
+
+    def close(self) -> None:
+        """Write the last line."""
+        counts = {"decisions": self._num_decisions, "alarms": self._num_alarms}
+        self._write(json.dumps({**counts, "seconds": self._end / self._rate}) + "\n")
+
+
+class Callback:
+    """A function that is called with each alarm.
+
+    Args:
+        function: of an ``Alarm``; it holds up the stream until it returns.
+        on_event: of the kind and text of an event.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Alarm], object],
+        on_event: Callable[[str, str], object] = lambda kind, text: None,
+    ) -> None:
+        self._function, self._on_event = function, on_event
+
+    def samples(self, first: int, block: Block) -> None:
+        """Nothing is told of samples."""
+
+    def decisions(self, decisions: Decisions) -> None:
+        """Call the function with each alarm."""
+        for alarm in decisions.alarms:
+            self._function(alarm)
+
+    def event(self, kind: str, text: str) -> None:
+        """Call the other function."""
+        self._on_event(kind, text)
+
+    def close(self) -> None:
+        """Nothing is left to be told."""
