@@ -49,7 +49,7 @@ def test_the_demo_says_when_the_slip_began_and_leaves_all_it_names(
     assert f"alarm at {found['alarms'][0]['alarm_s']:.3f} s" in printed
     assert "simulated" in printed
     files = (
-        "recording_onsets.png model.onnx stream.onnx.json recording.npy web/page.mjs node/npy.mjs"
+        "recording_onsets.png model.onnx stream.onnx.json web/page.mjs web/stream.onnx node/npy.mjs"
     )
     assert all((out / name).is_file() for name in files.split())
     with pytest.raises(SystemExit) as refused:
@@ -67,6 +67,8 @@ def test_hosts_are_copied_whole(
     for path in (ROOT / "export" / name).glob("*.*"):
         if path.is_file():
             assert (tmp_path / name / path.name).read_bytes() == path.read_bytes()
+    if name == "web":  # what it plays when it is started without arguments
+        assert all((tmp_path / "web" / own).is_file() for own in ("stream.onnx", "recording.npz"))
     for wrong, words in ((name, "is there already"), ("rust", "no host 'rust'; there are c, node")):
         with pytest.raises(SystemExit) as refused:
             run(monkeypatch, hosts, wrong, str(tmp_path))

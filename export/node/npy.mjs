@@ -2,21 +2,20 @@
 
 const LAST_VERSION = 3;
 const MAGIC = "\x93NUMPY";
-const TYPES = { "<f4": Float32Array, "<f8": Float64Array };
+export const TYPES = { "<f4": Float32Array, "<f8": Float64Array };
 const CUT = (name) => `${name} is cut off within its header: copy it again`;
 export const HEADER_BYTES = 4096; // enough for any array of numbers
 
 /**
- * What stands in the file, read from its first bytes.
+ * What an array in a .npy file is, from its first bytes.
  *
  * @param {Uint8Array} head the first `HEADER_BYTES`, or all there are
- * @param {number} bytes length of the file
  * @param {string} name of the file, for errors
- * @param {string[]} channels that the detector wants
- * @returns {{Type: Function, rows: number, offset: number}} of the numbers, row by row
- * @throws {Error} if it is no .npy, cut off, of another type or order, or of another hand
+ * @returns {{type: ?string, isFortran: boolean, shape: number[], offset: number}} NumPy's word for
+ *   the type of an element, and where the first one lies
+ * @throws {Error} if it is no .npy, or its header is cut off or of no known form
  */
-export function npyHeader(head, bytes, name, channels) {
+export function npyArray(head, name) {
   const { text, offset } = headerText(head, name);
   const type = /'descr': *'([^']*)'/.exec(text)?.[1];
   const order = /'fortran_order': *(True|False)/.exec(text)?.[1];
@@ -24,6 +23,20 @@ export function npyHeader(head, bytes, name, channels) {
   if (order === undefined || shape === undefined) {
     throw new Error(`${name} has a .npy header of no known form: save it again with numpy.save`);
   }
+  const sizes = shape.split(",").filter((part) => part.trim());
+  return { type, isFortran: order === "True", shape: sizes.map(Number), offset };
+}
+
+/**
+ * The same of a recording, volts [samples, channels], row by row.
+ *
+ * @param {number} bytes length of the file
+ * @param {string[]} channels that the detector wants
+ * @returns {{Type: Function, rows: number, offset: number}}
+ * @throws {Error} as `npyArray`, or if it is cut off, of another type or order, or of another hand
+ */
+export function npyHeader(head, bytes, name, channels) {
+  const { type, isFortran, shape, offset } = npyArray(head, name);
   const Type = TYPES[type];
   if (!Type) {
     throw new Error(
@@ -31,24 +44,20 @@ export function npyHeader(head, bytes, name, channels) {
         "save it with .astype('<f4')",
     );
   }
-  const size = shape
-    .split(",")
-    .filter((part) => part.trim())
-    .map(Number);
-  if (size.length !== 2 || size[1] !== channels.length) {
+  if (shape.length !== 2 || shape[1] !== channels.length) {
     throw new Error(
-      `${name} has shape (${shape.trim()}), wanted (samples, ${channels.length}): a row an ` +
+      `${name} has shape (${shape.join(", ")}), wanted (samples, ${channels.length}): a row an ` +
         `instant, channels ${channels[0]} to ${channels.at(-1)}`,
     );
   }
-  if (order === "True" && size[0] > 1) {
+  if (isFortran && shape[0] > 1) {
     throw new Error(`${name} is in Fortran order, wanted C order: numpy.ascontiguousarray`);
   }
-  const wanted = offset + size[0] * size[1] * Type.BYTES_PER_ELEMENT;
+  const wanted = offset + shape[0] * shape[1] * Type.BYTES_PER_ELEMENT;
   if (bytes < wanted) {
     throw new Error(`${name} is cut off: ${bytes} bytes of ${wanted}; copy it again`);
   }
-  return { Type, rows: size[0], offset };
+  return { Type, rows: shape[0], offset };
 }
 
 function headerText(head, name) {

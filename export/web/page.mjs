@@ -4,7 +4,7 @@ import * as ort from "./ort/ort.mjs";
 
 import { StreamGraph } from "../node/graph.mjs";
 import { decisionLine, summaryLine } from "../node/lines.mjs";
-import { npyVolts } from "../node/npy.mjs";
+import { readRecording } from "./files.mjs";
 import { Player } from "./player.mjs";
 import { describe, describeSimulated, report } from "./readout.mjs";
 import { Scope } from "./scope.mjs";
@@ -42,12 +42,10 @@ async function loadStream(given) {
 /** Take a recording; the one before stays where this one is none. */
 async function take(content, name, isSimulated, scope) {
   const { facts } = player.stream;
-  const volts = npyVolts(content, name, facts.channels);
-  const rows = volts.length / facts.channels.length;
-  if (rows === 0) throw new Error(`${name} holds no samples`);
-  await player.load({ name, volts, rows });
+  const recording = await readRecording(content, name, facts);
+  await player.load(recording);
   scope.show(player.recording);
-  describeSimulated(facts, isSimulated);
+  describeSimulated(facts, isSimulated || recording.isSimulated);
   element("rate").value = facts.sample_rate_hz;
   for (const id of ["play", "restart"]) element(id).disabled = false;
   say(null);

@@ -1,7 +1,7 @@
 #!/usr/bin/env node
-// The page on this machine: node serve.mjs --model stream.onnx --recording recording.npy
+// The page on this machine: node serve.mjs [--model stream.onnx] [--recording recording.npz]
 
-import { createReadStream } from "node:fs";
+import { createReadStream, existsSync } from "node:fs";
 import { access, stat } from "node:fs/promises";
 import { createServer } from "node:http";
 import { basename, extname } from "node:path";
@@ -12,23 +12,15 @@ const HERE = new URL("./", import.meta.url);
 const ORT = "node_modules/onnxruntime-web/dist/";
 const PAGE = {
   "/": "index.html",
-  ...own(
-    "style.css",
-    "controls.css",
-    "readout.css",
-    "page.mjs",
-    "player.mjs",
-    "history.mjs",
-    "scope.mjs",
-    "lanes.mjs",
-  ),
-  ...own("overlay.mjs", "readout.mjs", "threshold.mjs"),
+  ...own("style.css", "page.mjs", "player.mjs", "history.mjs", "files.mjs", "scope.mjs"),
+  ...own("lanes.mjs", "overlay.mjs", "readout.mjs", "threshold.mjs"),
   "/node/graph.mjs": "../node/graph.mjs",
   "/node/npy.mjs": "../node/npy.mjs",
   "/node/lines.mjs": "../node/lines.mjs",
   "/ort/ort.mjs": `${ORT}ort.wasm.bundle.min.mjs`,
   "/ort/ort.wasm": `${ORT}ort-wasm-simd-threaded.wasm`,
 };
+const SAMPLE = ["stream.onnx", "recording.npz"]; // which the package puts beside a copied page
 const TYPES = {
   ".html": "text/html; charset=utf-8",
   ".css": "text/css; charset=utf-8",
@@ -123,7 +115,12 @@ export function given(words, more = {}) {
       ...more,
     },
   });
-  if (!values.model) throw new Error("wanted --model stream.onnx, got none");
+  const [model, recording] = SAMPLE.map((name) => fileURLToPath(new URL(name, HERE)));
+  if (!values.model && !existsSync(model)) {
+    throw new Error("wanted --model stream.onnx; tactslip hosts web DIR gives a page with a sample");
+  }
+  if (!values.model) values.recording ??= recording;
+  values.model ??= model;
   const port = Number(values.port);
   if (!Number.isInteger(port) || port < 0 || port > 65535) {
     throw new Error(`--port must be 0 to 65535, got ${values.port}`);

@@ -20,8 +20,7 @@ def demo(folder: Path) -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} is there and not empty; give another one, --out DIR")
-    import numpy as np  # here and below what --help has no need of
-    from omegaconf import OmegaConf
+    from omegaconf import OmegaConf  # here and below what --help has no need of
 
     from tactslip_torch.commands.configuration import conf_dir
     from tactslip_torch.commands.detect import detect
@@ -29,7 +28,6 @@ def demo(folder: Path) -> None:
     from tactslip_torch.deploy.export import export_detector
     from tactslip_torch.model.detector import SlipDetector
     from tactslip_torch.pretrained import NAME, RECORDING, sample_recording
-    from tactslip_torch.runtime import whole_file
 
     detector, recording = SlipDetector.pretrained(NAME), sample_recording()
     folder.mkdir(parents=True, exist_ok=True)
@@ -42,9 +40,9 @@ def demo(folder: Path) -> None:
     config = OmegaConf.create(plain | {"model": str(model), "input": str(place)})
     (found,) = detect(config, folder)["recordings"]
     export_detector(detector, folder, source=model)
-    with whole_file(folder / "recording.npy") as temporary:
-        np.save(temporary, recording.samples.T.contiguous().numpy())
     page = copy_host("web", folder)
+    for name in ("stream.onnx", "stream.onnx.json", "recording.npz"):
+        shutil.copyfile(folder / name, page / name)
     (onset_s,) = recording.onsets_s
     alarms = [alarm for alarm in found["alarms"] if alarm["alarm_s"] >= onset_s]
     if alarms:
@@ -60,9 +58,8 @@ def demo(folder: Path) -> None:
         f"picture       {folder / 'recording_onsets.png'}\n"
         f"ONNX files    {folder / 'model.onnx'}, {folder / 'stream.onnx'}\n"
         f"page          needs Node 18 or later and, once, the internet:\n"
-        f"              cd {page} && npm ci && node serve.mjs --model ../stream.onnx "
-        f"--recording ../recording.npy --simulated\n"
-        f"              then open the address it prints"
+        f"              cd {page} && npm ci && node serve.mjs\n"
+        f"              then open the address it prints: the recording plays"
     )
 
 

@@ -44,6 +44,16 @@ def copy_host(name: str, folder: Path) -> Path:
     return folder / name
 
 
+def add_sample(page: Path) -> None:
+    """Put the pretrained detector as ``stream.onnx``, and the sample recording, beside the page."""
+    from tactslip_torch.deploy.export import export_detector  # of no need for --help
+    from tactslip_torch.model.detector import SlipDetector
+    from tactslip_torch.pretrained import NAME, RECORDING
+
+    export_detector(SlipDetector.pretrained(NAME), page, graphs=("stream",))
+    shutil.copyfile(RECORDING, page / "recording.npz")
+
+
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(
@@ -58,6 +68,8 @@ def main() -> None:
 
     with errors_in_one_line():
         copied = copy_host(given.name, given.folder)
+        if given.name == "web":
+            add_sample(copied)
         print(f"{copied}\nhow to build and run it: {copied / 'README.md'}")
 
 
