@@ -333,6 +333,7 @@ REFUSED = {
     "tare": (recording, ["tare_s=[0,a]"], "tare_s must be [start, end] in seconds, got [0, 'a']"),
     "view": (recording, ["view=3"], "view must be [start, end] in seconds, got 3"),
     "backend": (recording, ["backend=steam"], "steam"),
+    "mcap": (recording, ["mcap=a.mcap"], "mcap must be true or false, got 'a.mcap'"),
     "masked": (
         recording,
         ["masked_channels=[SG1,SG9]"],

@@ -12,7 +12,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from tactslip_torch.data.file_recordings import hand_file
 from tactslip_torch.data.folder import file_facts, has_truth, recording_files
 from tactslip_torch.data.formats import Reading, open_file, pieces
 from tactslip_torch.data.recording import Recording
+from tactslip_torch.live.mcap_log import McapLog
+from tactslip_torch.live.sinks import Block
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import masked_names
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions, answer_of
@@ -98,6 +100,10 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
     said = config.reading
     said = OmegaConf.to_container(said, resolve=True) if OmegaConf.is_config(said) else said
     reading = Reading.of(said)
+    if type(config.mcap) is not bool:
+        raise ValueError(
+            f"mcap must be true or false, got {config.mcap!r}; files are called as their recordings"
+        )
     context = _DetectionContext(detector, _settings(config, detector), reading, config, folder)
     paths = recording_files(Path(str(config.input)))
     save_config(config, folder)
@@ -139,7 +145,7 @@ def _detect_in(
     given = hand_file(path, hand, rate, context.reading, context.units, config.tare_s)
     header = (*Decisions._fields, "answer")
     written = csv_writer(table, header) if config.decisions else nullcontext()
-    with given as opened, written as write:
+    with given as opened, written as write, ExitStack() as stack:
         samples, archived = opened.samples, opened.archived
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
         masked = config.masked_channels or ()
@@ -152,6 +158,18 @@ def _detect_in(
         traces = Traces(drawn, rate, stream.hop_s, view, context.units, kinds)
         truth = archived.recording if archived else None
         counts = DecisionCounts(first_releases(truth.onsets_s, truth.released_s) if truth else ())
+        log = None
+        if config.mcap:
+            log = McapLog(
+                context.folder / f"{name}.mcap",
+                hand,
+                rate,
+                context.settings,
+                recording=truth,
+                units=context.units,
+                dtype=samples.dtype,
+            )
+            stack.enter_context(log)
 
         def take(decisions: Decisions) -> None:
             columns = decisions._asdict() | {"answer": answer_of(detector, decisions)}
@@ -161,11 +179,15 @@ def _detect_in(
             score = np.where(of["onset_score"] > NOTHING_YET, of["onset_score"], math.nan)
             doubtful = of["answer"] < 0
             traces.add_decisions(times, of["probability"], is_on, is_valid, doubtful, score)
+            if log:
+                log.decisions(decisions)
             if write:
                 write(zip(*(values.tolist() for values in of.values()), strict=True))
 
-        for piece in pieces(samples, context.piece_samples):
+        for first, piece in enumerate(pieces(samples, context.piece_samples)):
             traces.add_samples(piece.numpy())
+            if log:
+                log.samples(first * context.piece_samples, Block(piece.T.double().numpy()))
             take(stream.push(piece.T))
             tick()
         take(stream.flush())

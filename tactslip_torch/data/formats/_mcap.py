@@ -30,7 +30,7 @@ from tactslip_torch.data.formats._reading import (
     text_of,
 )
 
-_RECORDING = "tactslip_torch recording"
+RECORDING = "tactslip_torch recording"
 _MOST_CHUNK = 256 * 2**20
 
 
@@ -41,7 +41,7 @@ def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
     with path.open("wb") as file:
         output = writer.Writer(file, compression=writer.CompressionType.NONE)
         output.start(profile="ros2", library="tactslip_torch")
-        output.add_metadata(_RECORDING, {HEADER: text_of(header)})
+        output.add_metadata(RECORDING, {HEADER: text_of(header)})
         schema = output.register_schema(kind, "ros2msg", types.definition(kind).encode())
         channel = output.register_channel(TOPIC, "cdr", schema)
         for number, (time, message) in enumerate(blocks(samples, header, types)):
@@ -81,9 +81,9 @@ def _reader(path: Path, stack: ExitStack) -> Any:
 
 def _header(reader: Any) -> dict[str, Any] | None:
     summary = reader.get_summary()
-    if summary is None or all(one.name != _RECORDING for one in summary.metadata_indexes):
+    if summary is None or all(one.name != RECORDING for one in summary.metadata_indexes):
         return None
-    own = next(one.metadata for one in reader.iter_metadata() if one.name == _RECORDING)
+    own = next(one.metadata for one in reader.iter_metadata() if one.name == RECORDING)
     return header_in(own.get(HEADER))
 
 
