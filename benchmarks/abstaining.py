@@ -22,9 +22,8 @@ from torch import Tensor
 
 from benchmarks.harness import COLORS, LIGHT, Benchmark, Job, Report, Table, by, percent, say
 from benchmarks.subjects import SEEN_ROLE, FittedMachine, composed, small_recipe, statistics_from
-from tactslip_torch.model.abstention import ABSTAIN, NON_SLIP, SLIP, Abstention
-from tactslip_torch.model.calibration import fit_platt
-from tactslip_torch.model.leave_one_group_out import HeldOut
+from tactslip_torch.model.calibration import ABSTAIN, NON_SLIP, SLIP, Abstention, fit_platt
+from tactslip_torch.model.fit import HeldOut
 from tactslip_torch.report.metrics import CLASSES, answer_counts, answer_metrics
 from tactslip_torch.simulation import SEEN_MATERIALS
 

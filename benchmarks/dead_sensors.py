@@ -27,8 +27,7 @@ from tactslip_torch.model.calibration import (
     reliability,
     widened_llr,
 )
-from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.leave_one_group_out import HeldOut
+from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.missing_channels import ClassGaussians, channel_mask, missing_scores
 
 OURS, REFIT = "closed form", "refit"

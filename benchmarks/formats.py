@@ -35,7 +35,7 @@ from benchmarks.harness import (
 )
 from benchmarks.subjects import Array
 from tactslip_torch.data.formats import FORMATS, Archived, pieces
-from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.simulation.simulate import SimulatedRecordings
 
 LOAD, STRETCHES, SAVE, LIBRARY = "loaded whole", "read by stretches", "written", "by its library"
 LIMITED = ("npz", "hdf5", "mcap")

@@ -29,9 +29,14 @@ from benchmarks.harness import (
     say,
 )
 from benchmarks.model import synthetic_bins
-from tactslip_torch.model.fit import TrainingBins, fit_machine, fit_quadratic
+from tactslip_torch.model.fit import (
+    HeldOut,
+    TrainingBins,
+    fit_machine,
+    fit_quadratic,
+    held_out_scores,
+)
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.model.leave_one_group_out import HeldOut, held_out_scores
 
 Kind = Literal["fit", "left out"]
 FORWARD, OURS, PEER = "forward alone", "differentiable", "autograd"

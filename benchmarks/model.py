@@ -36,9 +36,8 @@ from benchmarks.harness import (
     say,
 )
 from tactslip_torch import SufficientStats
-from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import KernelSum, Polynomial
-from tactslip_torch.model.leave_one_group_out import HeldOut
 
 PENALTY, OFFSET, BATCH = 1.0, 0.5, 4096
 KERNEL = Polynomial(2, OFFSET)

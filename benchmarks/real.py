@@ -58,8 +58,8 @@ from benchmarks.peers.rockets import MINI_ROCKET, MULTI_ROCKET_HYDRA
 from benchmarks.peers.rockets import fit as fit_rocket
 from benchmarks.subjects import composed
 from tactslip_torch import SlipDetector, StreamingDetector
+from tactslip_torch.commands.configuration import unknown_choice
 from tactslip_torch.commands.detect import detect
-from tactslip_torch.commands.mistakes import unknown_choice
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split

@@ -43,7 +43,7 @@ from tactslip_torch.report.metrics import split_metrics
 from tactslip_torch.report.results import BASELINES
 from tactslip_torch.report.style import styled
 from tactslip_torch.simulation.scene import CALIBRATED_PATH, SEEN_MATERIALS
-from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.simulation.simulate import SimulatedRecordings
 
 GROUPS = ("per_material", "per_speed", "per_scene")
 

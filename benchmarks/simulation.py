@@ -36,7 +36,7 @@ from tactslip_torch.simulation import (
     simulate,
     timeline,
 )
-from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.recipe import balanced_accuracy
 
 LEVELS: dict[str, tuple[str, dict[str, int]]] = {

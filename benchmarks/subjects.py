@@ -35,7 +35,7 @@ from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import KEY
 from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.experiment import feature_maker
 from tactslip_torch.training.plan import plan_detector

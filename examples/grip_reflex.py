@@ -31,7 +31,7 @@ from tactslip_torch.onset.baselines import BaselineDetector
 from tactslip_torch.onset.events import first_releases
 from tactslip_torch.report import style
 from tactslip_torch.simulation import MATERIALS, Contact
-from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.alarm import OURS, Timing, decide, score_streams
 
 DETAIL, KINETIC_RATIO, REACH_MM = "largest detail", 0.85, 100.0

@@ -57,8 +57,7 @@ def run(command: str, arguments: list[str]) -> None:
     is_ours = (conf_dir() / f"{name}.yaml").is_file()
     with stopping():
         if is_ours and {"-h", "--help"} & set(arguments):
-            from tactslip_torch.commands.configuration import Composed, help_text
-            from tactslip_torch.commands.mistakes import Mistake, checked
+            from tactslip_torch.commands.configuration import Composed, Mistake, checked, help_text
 
             asked = [each for each in arguments if each not in ("-h", "--help")]
             try:

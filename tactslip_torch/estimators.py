@@ -32,8 +32,7 @@ from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import calibration_of
 from tactslip_torch.own_files import FORGED, load_table, save_table
 from tactslip_torch.signals.filtering import Align, ChannelFilter
-from tactslip_torch.signals.spectrum import SpectrumMethod
-from tactslip_torch.signals.wavelet import highest_level
+from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
 from tactslip_torch.training.plan import Plan, TrainingPass, plan_detector, solve_metadata
 from tactslip_torch.training.recipe import FeatureSelection, Recipe
 

@@ -155,33 +155,6 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def stamps_of(tensors: Iterable[Tensor]) -> list[tuple[Tensor, int | Tensor]]:
-    """What ``are_unchanged`` compares: tensors, and how often each was changed in place.
-
-    Inference tensors do not count that: of those a copy.
-    """
-    return [(x, x.clone() if x.is_inference() else x._version) for x in tensors]
-
-
-def are_unchanged(tensors: Sequence[Tensor], stamps: Sequence[tuple[Tensor, int | Tensor]]) -> bool:
-    """Whether tensors are those of the stamps, none of them replaced or changed since."""
-    return len(tensors) == len(stamps) and all(
-        x is same and (torch.equal(x, was) if isinstance(was, Tensor) else x._version == was)
-        for x, (same, was) in zip(tensors, stamps, strict=True)
-    )
-
-
-def check_tensor(x: Any) -> None:
-    """Refuse what is no tensor, such as a NumPy array.
-
-    Raises:
-        TypeError: if it is none.
-    """
-    if not isinstance(x, Tensor):
-        kind = f"{type(x).__module__}.{type(x).__name__}".removeprefix("builtins.")
-        raise TypeError(f"expected a torch.Tensor, got {kind}; use torch.as_tensor(samples)")
-
-
 def check_number(name: str, value: Any, *, least: float | None = None, whole: bool = False) -> None:
     """Refuse what is no number, is not positive or not at least ``least``, or is not whole.
 

@@ -13,7 +13,7 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
+from tactslip_torch.deploy.check import EXTREMES, extreme_bins
 
 SEED = int(os.environ.get("TACTSLIP_SEED", "1"))
 ORDINARY = ("plain", "integers", "ramp")  # drawn as often as all the others together

@@ -12,13 +12,13 @@ from small_set import SMALL_HAND
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.statistics import TrainingStatistics
-from tactslip_torch.model.abstention import (
-    KEY,
+from tactslip_torch.model.calibration import (
+    ABSTENTION,
     NON_SLIP,
     SLIP,
     Abstention,
+    Platt,
 )
-from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, answer_of
@@ -175,7 +175,7 @@ def test_thresholds_survive_the_file_and_decide_where_it_abstains(tmp_path):
     decisions = Decider(settings, 2000.0, 100, 25).decide(score, is_valid)
     assert Abstention.of(detector) is None
     assert answer_of(detector, decisions).tolist() == [0, 0, 1, 1, -1]  # by the sign
-    detector.info[KEY] = kept.to_dict()
+    detector.info[ABSTENTION] = kept.to_dict()
     assert answer_of(detector, decisions).tolist() == [0, -1, -1, 1, -1]
     detector.save(tmp_path / "a.pt")
     assert Abstention.of(SlipDetector.load(tmp_path / "a.pt")) == kept

@@ -18,8 +18,7 @@ from tactslip_torch.commands.entry import one_line
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.folder import RecordingFolder, write_manifest
 from tactslip_torch.deploy.export import export_detector
-from tactslip_torch.model.abstention import Abstention
-from tactslip_torch.model.calibration import Platt
+from tactslip_torch.model.calibration import Abstention, Platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.onset.decisions import KEY, AlarmSettings

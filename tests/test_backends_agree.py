@@ -10,10 +10,10 @@ from small_detector import HAND, alarming_detector, raw_bins
 from test_onnx_bins import run_on
 
 from tactslip_torch.analysis.certificate import certify
+from tactslip_torch.deploy.check import EXTREMES, extreme_bins
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 
 BROKEN = {"nan": torch.nan, "inf": torch.inf, "-inf": -torch.inf}
 ALL = (*EXTREMES, *KINDS, *BROKEN)

@@ -15,15 +15,15 @@ from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.training.baselines import (
-    KEY,
+from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.learner import (
+    BASELINES,
     Baselines,
     LogisticRegression,
     PooledNumber,
     RandomForest,
     SimpleStatistics,
 )
-from tactslip_torch.training.datamodule import SlipDataModule
 from tactslip_torch.training.recipe import best_threshold
 
 pytestmark = pytest.mark.filterwarnings(
@@ -184,7 +184,7 @@ def test_a_learner_evaluates_them_and_a_saved_detector_those_it_keeps(tmp_path):
     json.dumps(metrics["baselines"])
     learner.detector.save(tmp_path / "detector.pt")
     detector = SlipDetector.load(tmp_path / "detector.pt")
-    assert list(detector.info[KEY]) == NAMES[:1]
+    assert list(detector.info[BASELINES]) == NAMES[:1]
     maker = small_maker(source)
     judge = SlipLearner(maker.pool, maker.channel_filter, detector=detector)
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}

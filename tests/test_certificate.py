@@ -22,10 +22,10 @@ from tactslip_torch.analysis.certificate import (
     pipelines,
 )
 from tactslip_torch.analysis.raw_bins import draw_bins
+from tactslip_torch.deploy.check import EXTREMES, extreme_bins
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.rounding import rounding_bound
-from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 from tactslip_torch.training.datamodule import FeatureMaker
 
 # Comparison ------------------------------------------------------------------------------------

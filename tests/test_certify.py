@@ -14,8 +14,8 @@ from test_commands import TinyRecordings, composed
 from tactslip_torch.analysis.raw_bins import draw_bins
 from tactslip_torch.commands.certify import certify, main
 from tactslip_torch.data.labels import LabelRule, label_bins
+from tactslip_torch.deploy.check import EXTREMES
 from tactslip_torch.features.cache import cache_key
-from tactslip_torch.simulation.extremes import EXTREMES
 from tactslip_torch.training.datamodule import FeatureMaker
 
 TINY = (

@@ -16,8 +16,7 @@ from pathlib import Path
 import pytest
 
 from tactslip_torch.__main__ import COMMANDS, main
-from tactslip_torch.commands.configuration import Composed, conf_dir, help_text
-from tactslip_torch.commands.mistakes import checked, with_lists
+from tactslip_torch.commands.configuration import Composed, checked, conf_dir, help_text, with_lists
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "troubleshooting.md"

@@ -412,7 +412,7 @@ def assert_one_line(error, expected):
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
 def test_bad_input_is_refused_before_anything_is_simulated(overrides, line, tmp_path, monkeypatch):
-    monkeypatch.setattr("tactslip_torch.simulation.source.simulate", None)
+    monkeypatch.setattr("tactslip_torch.simulation.simulate.simulate", None)
     config = composed("num_workers=0", f"cache={tmp_path / 'cache'}", *overrides)
     with pytest.raises(BAD_INPUT) as caught:
         train(config, tmp_path / "run")

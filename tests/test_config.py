@@ -9,9 +9,8 @@ from omegaconf.errors import MissingMandatoryValue
 from torch.utils.data import DataLoader
 
 from tactslip_torch.commands import configuration
-from tactslip_torch.commands.configuration import conf_dir
+from tactslip_torch.commands.configuration import conf_dir, unknown_choice
 from tactslip_torch.commands.entry import entry_point, errors_in_one_line, one_line
-from tactslip_torch.commands.mistakes import unknown_choice
 
 # Where the configuration lives -----------------------------------------------------------------
 
@@ -95,7 +94,7 @@ class Picky:
             raise ValueError(f"cycles must be at least 1, got {cycles}")
 
 
-SIMULATED = "tactslip_torch.simulation.source.SimulatedRecordings"
+SIMULATED = "tactslip_torch.simulation.SimulatedRecordings"
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.data.splits import ROLES
-from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.experiment import feature_maker
 
 RECORDED = {"biotacsp_dos"}

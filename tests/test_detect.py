@@ -16,8 +16,7 @@ from tactslip_torch.commands import detect as module
 from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.detect import detect, main
 from tactslip_torch.data.formats import FORMATS, Samples
-from tactslip_torch.model.abstention import Abstention
-from tactslip_torch.model.calibration import Platt
+from tactslip_torch.model.calibration import Abstention, Platt
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, score_stream
 from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.report.onset import COLUMNS

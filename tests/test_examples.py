@@ -12,7 +12,7 @@ from small_detector import HAND, alarming_detector
 from tactslip_torch import AlarmSettings
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.rules import KOfN
-from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.onset import OnsetTraining
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

@@ -18,13 +18,13 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from tactslip_torch import FeaturePool, HandLayout
 from tactslip_torch.deploy.bins import described
+from tactslip_torch.deploy.check import EXTREMES, extreme_bins
 from tactslip_torch.deploy.value import Graph
 from tactslip_torch.features.descriptors import DESCRIPTORS
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 
 PAPER = oracles.pool_names()
 HAND = HandLayout.from_rows(

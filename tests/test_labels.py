@@ -21,8 +21,7 @@ from tactslip_torch.data.labels import (
 )
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
-from tactslip_torch.signals.binning import bins_at
-from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.signals.filtering import ChannelFilter, bins_at
 
 RATE = 2000.0
 ONSETS = (2.0, 9.0, 13.5)  # REFERENCE.md section 1, with slides of 100 mm at 20, 40, 60 mm/s

@@ -5,10 +5,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tactslip_torch.model import leave_one_group_out
-from tactslip_torch.model.fit import TrainingBins
+from tactslip_torch.model import fit
+from tactslip_torch.model.fit import HeldOut, TrainingBins, held_out_scores
 from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, RadialBasis
-from tactslip_torch.model.leave_one_group_out import HeldOut, held_out_scores
 
 CUBIC, RADIAL, LINE = Polynomial(3), RadialBasis(0.4), Polynomial(1, 0.7)
 GROUPS = ("bins", "cycles", "materials", "mixed")
@@ -87,7 +86,7 @@ def assert_refits(
 def test_scores_are_those_of_refits(
     kernel, num_bins, num_features, kind, weighted, chunk, rng, monkeypatch
 ):
-    monkeypatch.setattr(leave_one_group_out, "_CHUNK", chunk)
+    monkeypatch.setattr(fit, "_CHUNK", chunk)
     bins = draw(rng, num_bins, num_features, weighted)
     assert_refits(bins, grouped(rng, num_bins, kind), 1e3, kernel)
 

@@ -8,7 +8,7 @@ import torch
 from tactslip_torch.features.bank import LinearMaps
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.signals.spectrum import SpectrumMethod
+from tactslip_torch.signals.wavelet import SpectrumMethod
 
 CASES = [(100, 4, "reference"), (100, 4, "clean"), (101, 4, "reference"), (50, 3, "clean")]
 

@@ -12,7 +12,7 @@ from streams import onset_of
 from test_dead_streams import alarming_with_gaussians
 from torch.nn.functional import pad
 
-from tactslip_torch.deploy.bins import RawBin, bin_graph
+from tactslip_torch.deploy.bins import RawBin, Timing, bin_graph
 from tactslip_torch.deploy.check import (
     DEGENERATE,
     check_bins,
@@ -22,7 +22,7 @@ from tactslip_torch.deploy.check import (
     session_of,
     simulated_stream,
 )
-from tactslip_torch.deploy.stream import Timing, stream_graph
+from tactslip_torch.deploy.stream import stream_graph
 from tactslip_torch.deploy.value import F64, Graph
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.calibration import probability

@@ -12,13 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from streams import detector_of, onset_of, signal
 
+from tactslip_torch.deploy.bins import Timing, memory_size
 from tactslip_torch.deploy.check import runner, session_of
-from tactslip_torch.deploy.stream import (
-    Timing,
-    memory_size,
-    onset_scores,
-    stream_graph,
-)
+from tactslip_torch.deploy.stream import onset_scores, stream_graph
 from tactslip_torch.deploy.value import F32, F64, I64, Graph
 from tactslip_torch.model.calibration import LARGEST_LLR, Isotonic, Platt, probability
 from tactslip_torch.onset.decisions import AlarmSettings, score_stream

@@ -7,9 +7,9 @@ import torch
 from small_detector import HAND, raw_bins, small_detector
 from test_detector import noise, random_detector
 
+from tactslip_torch.deploy.check import EXTREMES, extreme_bins
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import ClassGaussians, expected_score
-from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 
 BAD = [float("nan"), float("inf"), -float("inf"), 1e308]
 

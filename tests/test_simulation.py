@@ -16,6 +16,7 @@ from scene_files import (
     scene_on,
 )
 
+from tactslip_torch.deploy.check import extreme_bins
 from tactslip_torch.simulation import (
     SEEN_MATERIALS,
     UNSEEN_MATERIALS,
@@ -34,8 +35,7 @@ from tactslip_torch.simulation import (
     timeline,
 )
 from tactslip_torch.simulation._contact import draw_grasp
-from tactslip_torch.simulation.extremes import extreme_bins
-from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.simulation.simulate import SimulatedRecordings
 
 SHORT = (Stroke(40.0, 20.0, 0.6), Stroke(60.0, 20.0, 0.4))
 """Two short strokes: 1.9 s instead of 15.4."""

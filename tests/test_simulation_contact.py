@@ -29,7 +29,7 @@ from tactslip_torch.simulation._contact import (
 from tactslip_torch.simulation._sensors import (
     highpass_response,
 )
-from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.simulation.simulate import SimulatedRecordings
 
 BRISTLES = ("one", "many")
 SHORT = (Stroke(40.0, 20.0, 0.6), Stroke(60.0, 20.0, 0.4))

@@ -21,16 +21,16 @@ from scipy.signal import butter, sosfiltfilt
 
 from tactslip_torch.simulation import Handling, Imperfections, Scene, Stroke, timeline
 from tactslip_torch.simulation._contact import Grasp, draw_grasp
-from tactslip_torch.simulation._disturbances import (
+from tactslip_torch.simulation._sensors import (
     Handled,
     _quiet,
+    draw_front,
     losses,
     machine_runs,
     mains_bursts,
     partial_intervals,
     rotation_hz,
 )
-from tactslip_torch.simulation._sensors import draw_front
 
 SLOW, FAST = slice(0, 14), slice(14, 24)  # the paper's SG and PVDF channels
 SURE = {**CALM, "lifted_fraction": 0.0}

@@ -8,9 +8,9 @@ import pytest
 import scipy.signal
 import torch
 
-from tactslip_torch.signals.binning import bins_at
+from tactslip_torch.signals.filtering import bins_at
 from tactslip_torch.signals.resampling import resample
-from tactslip_torch.signals.spectrum import (
+from tactslip_torch.signals.wavelet import (
     amplitude_spectrum,
     frequency_axis_hz,
     spectrum_matrix,

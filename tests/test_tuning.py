@@ -14,9 +14,8 @@ from tactslip_torch.commands.train import train
 from tactslip_torch.data.splits import unseen4
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.fit import TrainingBins, fit_machine, held_out_scores
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.model.leave_one_group_out import held_out_scores
 from tactslip_torch.training.plan import plan_detector
 from tactslip_torch.training.recipe import Recipe, sample_weight
 from tactslip_torch.training.tuning import (

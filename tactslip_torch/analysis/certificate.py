@@ -19,14 +19,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tactslip_torch.deploy.check import EXTREMES, extreme_bins
 from tactslip_torch.features.groups import JUMPING
 from tactslip_torch.features.pool import VALIDITY
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.rounding import error_facts, gradient_facts, head_facts, score_sd
 from tactslip_torch.runtime import bar
-from tactslip_torch.signals.binning import refuse_nonfinite
-from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
+from tactslip_torch.signals.filtering import refuse_nonfinite
 
 _COVERED = ("low_v", "high_v", "span_v", "relative_span")
 

@@ -22,9 +22,8 @@ from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.selection import rank_distinct, rank_features
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.fit import TrainingBins
+from tactslip_torch.model.fit import HeldOut, TrainingBins
 from tactslip_torch.model.kernels import Kernel
-from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import bar, in_parts
 

@@ -12,7 +12,7 @@ from tactslip_torch.data.labels import LabelledBins
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
 from tactslip_torch.runtime import bar
-from tactslip_torch.signals.binning import refuse_nonfinite
+from tactslip_torch.signals.filtering import refuse_nonfinite
 from tactslip_torch.training.datamodule import FeatureMaker
 
 _BINS_OF_RECORDING = 40

@@ -19,8 +19,13 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from tactslip_torch.commands.configuration import conf_dir
-from tactslip_torch.commands.mistakes import Mistake, checked, folder_problem, with_lists
+from tactslip_torch.commands.configuration import (
+    Mistake,
+    checked,
+    conf_dir,
+    folder_problem,
+    with_lists,
+)
 from tactslip_torch.commands.stopping import Stopped, stopping
 from tactslip_torch.report.sweep import sweep_table, write_sweep
 from tactslip_torch.runtime import is_first_process, process_number, write_json

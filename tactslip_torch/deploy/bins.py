@@ -1,4 +1,7 @@
-"""From raw bins to scores, as a graph: what ``SlipDetector.predict_raw`` does, and no more."""
+"""From raw bins to scores, as a graph: what ``SlipDetector.predict_raw`` does, and no more.
+
+``RawBin`` and ``Timing`` say which samples a bin is scored by, and when a stream decides.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,9 @@ from tactslip_torch.features.ops import TINY
 from tactslip_torch.features.pool import LARGEST_SAMPLE
 from tactslip_torch.model.calibration import Calibration, probability, widened_llr
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decisions import calibration_of
+from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
+from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetEvidence
+from tactslip_torch.onset.rules import NOTHING_YET, KOfN, Rule
 from tactslip_torch.signals.filtering import overlap_matrix
 
 Precision = Literal["float32", "float64"]
@@ -61,6 +66,72 @@ class RawBin:
     def length(self) -> int:
         """Of all samples."""
         return self.before + self.bin + self.after
+
+
+SAID_OF_BIN = ("score", "probability", "statistic", "valid", "onset_s")
+"""What is kept of the last bin for decisions with an onset classifier."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When decisions are made, and how much is kept until then; lengths in samples.
+
+    Attributes:
+        raw: the samples of a bin.
+        hop: distance of two decisions on bins.
+        first: samples that must have come before the first of these, but for long frames.
+        frame: samples that must have come before any of these.
+        tail: samples that are kept.
+        state_size: numbers that are kept.
+        onset_hop: distance of two decisions with an onset classifier.
+    """
+
+    raw: RawBin
+    hop: int
+    first: int
+    frame: int
+    tail: int
+    state_size: int
+    onset_hop: int | None = None
+
+    @classmethod
+    def of(cls, detector: SlipDetector, settings: AlarmSettings) -> Timing:
+        """That of a detector with these settings."""
+        raw = RawBin.of(detector)
+        frame = max(detector.channel_filter.window_lengths[i] for i in raw.channels)
+        size = 6 + len(rule_start(settings.rule))
+        times = settings.hop_samples, raw.bin + raw.after, frame
+        if settings.onset is None:
+            return cls(raw, *times, raw.length - 1, size)
+        evidence = settings.onset.evidence
+        tail = max(raw.length, evidence.context + evidence.hop_samples) - 1
+        size += len(SAID_OF_BIN) + memory_size(evidence)
+        return cls(raw, *times, tail, size, evidence.hop_samples)
+
+    def decisions(self, num: int) -> int:
+        """How many are made by the time that as many samples have come."""
+        if self.onset_hop is not None:
+            return num // self.onset_hop
+        return 0 if num < max(self.first, self.frame) else (num - self.first) // self.hop + 1
+
+
+def memory_size(evidence: OnsetEvidence) -> int:
+    """Numbers that are kept: scores of hops, half the log power and the means of blocks."""
+    return MEAN_HOPS - 1 + sum(rows * width for rows, width in memory_shapes(evidence))
+
+
+def memory_shapes(evidence: OnsetEvidence) -> list[tuple[int, int]]:
+    """Of fast and slow channels, a row a block."""
+    num_logs = len(evidence.hand.fast) * len(evidence.fast_knee)
+    return [
+        (evidence.memory - 1, num_logs),
+        (len(evidence.step_matrix) - 1, len(evidence.hand.slow)),
+    ]
+
+
+def rule_start(rule: Rule) -> list[float]:
+    """What is remembered before the first decision."""
+    return [NOTHING_YET] * (rule.n - 1) if isinstance(rule, KOfN) else [0.0]
 
 
 class Scored(NamedTuple):

@@ -20,10 +20,10 @@ from typing import Any, get_args
 import onnx
 from onnx import helper
 
-from tactslip_torch.deploy.bins import Precision, RawBin, bin_graph, dtype_of
+from tactslip_torch.deploy.bins import Precision, RawBin, Timing, bin_graph, dtype_of
 from tactslip_torch.deploy.check import GraphKind, check_model
-from tactslip_torch.deploy.stream import Timing, stream_graph
-from tactslip_torch.model.abstention import Abstention
+from tactslip_torch.deploy.stream import stream_graph
+from tactslip_torch.model.calibration import Abstention
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import KEY, AlarmSettings, calibration_of
 from tactslip_torch.own_files import SIDECAR as FORMAT

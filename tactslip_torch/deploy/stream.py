@@ -9,7 +9,7 @@ With an onset classifier decisions are its hop apart; its scores are those of ``
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,65 +17,29 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor
 
-from tactslip_torch.deploy.bins import Precision, RawBin, Scored, dtype_of, score_bins
+from tactslip_torch.deploy.bins import (
+    SAID_OF_BIN,
+    Precision,
+    RawBin,
+    Scored,
+    Timing,
+    dtype_of,
+    memory_shapes,
+    memory_size,
+    rule_start,
+    score_bins,
+)
 from tactslip_torch.deploy.head import machine, scaled
 from tactslip_torch.deploy.value import BOOL, END, F64, I64, Graph, Value
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetClassifier, OnsetEvidence
-from tactslip_torch.onset.rules import NEUTRAL, NOTHING_YET, Cusum, KOfN, Rule
+from tactslip_torch.onset.rules import NEUTRAL, NOTHING_YET, Cusum, Rule
 from tactslip_torch.signals.filtering import past_matrix
 
 LATCH_START = (0.0, 0.0, 2.0**52)
 """Armed, with no alarm before; the last number counts on exactly in float64."""
-
-
-_SAID_OF_BIN = ("score", "probability", "statistic", "valid", "onset_s")
-"""What is kept of the last bin for decisions with an onset classifier."""
-
-
-@dataclass(frozen=True)
-class Timing:
-    """When decisions are made, and how much is kept until then; lengths in samples.
-
-    Attributes:
-        raw: the samples of a bin.
-        hop: distance of two decisions on bins.
-        first: samples that must have come before the first of these, but for long frames.
-        frame: samples that must have come before any of these.
-        tail: samples that are kept.
-        state_size: numbers that are kept.
-        onset_hop: distance of two decisions with an onset classifier.
-    """
-
-    raw: RawBin
-    hop: int
-    first: int
-    frame: int
-    tail: int
-    state_size: int
-    onset_hop: int | None = None
-
-    @classmethod
-    def of(cls, detector: SlipDetector, settings: AlarmSettings) -> Timing:
-        """That of a detector with these settings."""
-        raw = RawBin.of(detector)
-        frame = max(detector.channel_filter.window_lengths[i] for i in raw.channels)
-        size = 6 + len(rule_start(settings.rule))
-        times = settings.hop_samples, raw.bin + raw.after, frame
-        if settings.onset is None:
-            return cls(raw, *times, raw.length - 1, size)
-        evidence = settings.onset.evidence
-        tail = max(raw.length, evidence.context + evidence.hop_samples) - 1
-        size += len(_SAID_OF_BIN) + memory_size(evidence)
-        return cls(raw, *times, tail, size, evidence.hop_samples)
-
-    def decisions(self, num: int) -> int:
-        """How many are made by the time that as many samples have come."""
-        if self.onset_hop is not None:
-            return num // self.onset_hop
-        return 0 if num < max(self.first, self.frame) else (num - self.first) // self.hop + 1
 
 
 def stream_graph(
@@ -95,7 +59,7 @@ def stream_graph(
 
     With an onset classifier there are ``onset_score``, float64, and ``by_onset`` too, the threshold
     is the classifier's, and behind the memory of the rule the state has what is said of the last
-    bin (``_SAID_OF_BIN``) and the memory of blocks (``onset_scores``).
+    bin (``SAID_OF_BIN``) and the memory of blocks (``onset_scores``).
 
     Args:
         detector: that scores the bins.
@@ -181,7 +145,7 @@ def stream_graph(
 
     def join(onset: OnsetClassifier) -> list[Value]:
         """Decisions a hop of the classifier apart, from its scores and the last bin by then."""
-        num_said = len(_SAID_OF_BIN)
+        num_said = len(SAID_OF_BIN)
         sizes = graph.axes(1, 1, 1, 3, small - 6 - num_said, num_said)
         parts = graph.ops("Split", state, sizes, dtypes=[F64] * 6, axis=0)
         before, made, run, of_latch, of_rule, said = parts
@@ -344,20 +308,6 @@ def _times_s(
 # Onset scores ----------------------------------------------------------------------------------
 
 
-def memory_size(evidence: OnsetEvidence) -> int:
-    """Numbers that are kept: scores of hops, half the log power and the means of blocks."""
-    return MEAN_HOPS - 1 + sum(rows * width for rows, width in _memory_shapes(evidence))
-
-
-def _memory_shapes(evidence: OnsetEvidence) -> list[tuple[int, int]]:
-    """Of fast and slow channels, a row a block."""
-    num_logs = len(evidence.hand.fast) * len(evidence.fast_knee)
-    return [
-        (evidence.memory - 1, num_logs),
-        (len(evidence.step_matrix) - 1, len(evidence.hand.slow)),
-    ]
-
-
 def memory_start(graph: Graph, evidence: OnsetEvidence) -> Value:
     """What is kept before the first block: NaN, on which no score rests."""
     nothing = numpy_helper.from_array(np.array([np.nan]))
@@ -399,7 +349,7 @@ def onset_scores(
     if slow:
         block = windows(samples.take(slow, 1), first * hop, range(context, context + hop))
         made.append(block.cast(F64).mean(1))
-    shapes = _memory_shapes(evidence)[: len(made)]
+    shapes = memory_shapes(evidence)[: len(made)]
     sizes = graph.axes(MEAN_HOPS - 1, *(num * width for num, width in shapes))
     dtypes = [F64] * (1 + len(made))
     of_hops, *kept = graph.ops("Split", memory, sizes, dtypes=dtypes, axis=0)
@@ -443,11 +393,6 @@ def onset_scores(
 
 
 # Rules and alarms ------------------------------------------------------------------------------
-
-
-def rule_start(rule: Rule) -> list[float]:
-    """What is remembered before the first decision."""
-    return [NOTHING_YET] * (rule.n - 1) if isinstance(rule, KOfN) else [0.0]
 
 
 def statistic_of(rule: Rule, llr: Value, memory: Value) -> tuple[Value, Value]:

@@ -44,8 +44,14 @@ from tactslip_torch.features.ops import (
     taken,
 )
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
-from tactslip_torch.signals.wavelet import Wavelet, branch_matrix, branch_names
+from tactslip_torch.signals.wavelet import (
+    SpectrumMethod,
+    Wavelet,
+    branch_matrix,
+    branch_names,
+    frequency_axis_hz,
+    spectrum_matrix,
+)
 
 RowKind = Literal["gauge", "time", "freq"]
 ROW_KINDS: tuple[RowKind, ...] = ("gauge", "time", "freq")

@@ -8,14 +8,13 @@ whether it has a tensor before it, or a value of a graph.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-
-from tactslip_torch.runtime import check_tensor
 
 TINY = 1e-300
 """Instead of 0 in a divisor, where a quotient of 0 is to be 0."""
@@ -56,19 +55,20 @@ def is_concrete(x: Tensor) -> bool:
         return False
 
 
-def check_samples(x: Tensor, what: str = "samples") -> None:
-    """Refuse what is no tensor, and one of whole numbers or of half precision.
+def stamps_of(tensors: Iterable[Tensor]) -> list[tuple[Tensor, int | Tensor]]:
+    """What ``are_unchanged`` compares: tensors, and how often each was changed in place.
 
-    Raises:
-        TypeError: if it is no tensor.
-        ValueError: for another dtype.
+    Inference tensors do not count that: of those a copy.
     """
-    check_tensor(x)
-    if x.dtype not in (torch.float32, torch.float64):
-        raise ValueError(
-            f"expected float32 or float64 {what} in volts, got {x.dtype}; "
-            "convert with .float() or .double()"
-        )
+    return [(x, x.clone() if x.is_inference() else x._version) for x in tensors]
+
+
+def are_unchanged(tensors: Sequence[Tensor], stamps: Sequence[tuple[Tensor, int | Tensor]]) -> bool:
+    """Whether tensors are those of the stamps, none of them replaced or changed since."""
+    return len(tensors) == len(stamps) and all(
+        x is same and (torch.equal(x, was) if isinstance(was, Tensor) else x._version == was)
+        for x, (same, was) in zip(tensors, stamps, strict=True)
+    )
 
 
 def full_precision(x: Tensor) -> AbstractContextManager[object]:

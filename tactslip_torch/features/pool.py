@@ -34,7 +34,6 @@ from tactslip_torch.features.bank import (
 from tactslip_torch.features.descriptors import DESCRIPTORS
 from tactslip_torch.features.ops import (
     bounded_gradient,
-    check_samples,
     full_precision,
     is_concrete,
     is_traced,
@@ -44,11 +43,13 @@ from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.native import BackendName
 from tactslip_torch.own_files import MOST_BIN_SAMPLES
 from tactslip_torch.runtime import for_each
-from tactslip_torch.signals.spectrum import SpectrumMethod, spectrum_matrix
+from tactslip_torch.signals.filtering import check_samples
 from tactslip_torch.signals.wavelet import (
+    SpectrumMethod,
     Wavelet,
     WaveletFilters,
     as_wavelet,
+    spectrum_matrix,
     wavelet_steps,
 )
 

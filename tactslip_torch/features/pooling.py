@@ -24,9 +24,17 @@ from torch import Tensor, nn
 
 from tactslip_torch import native
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.ops import ascending, is_concrete, like, root, signed_log
+from tactslip_torch.features.ops import (
+    are_unchanged,
+    ascending,
+    is_concrete,
+    like,
+    root,
+    signed_log,
+    stamps_of,
+)
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.runtime import are_unchanged, for_each, stamps_of
+from tactslip_torch.runtime import for_each
 
 STATISTICS = ("mean", "std", "min", "max", "median")
 SORTED = "sorted"

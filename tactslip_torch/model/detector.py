@@ -16,11 +16,12 @@ from torch import Tensor, nn
 
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import (
-    check_samples,
+    are_unchanged,
     full_precision,
     is_concrete,
     is_nowhere,
     saturating,
+    stamps_of,
 )
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
@@ -42,8 +43,8 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName, Filters, Machine, Scores, backend_of
 from tactslip_torch.own_files import DETECTOR as FORMAT
 from tactslip_torch.own_files import FORGED, load_table, save_table
-from tactslip_torch.runtime import PACKAGE, are_unchanged, stamps_of
-from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.runtime import PACKAGE
+from tactslip_torch.signals.filtering import ChannelFilter, check_samples
 
 MOST_BYTES = 2**30
 """Of a file."""

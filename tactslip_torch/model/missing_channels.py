@@ -23,10 +23,17 @@ from typing import Literal, NamedTuple, TypeVar, get_args
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.ops import full_precision, has_values, is_concrete, saturating
+from tactslip_torch.features.ops import (
+    are_unchanged,
+    full_precision,
+    has_values,
+    is_concrete,
+    saturating,
+    stamps_of,
+)
 from tactslip_torch.model.kernels import Head, QuadraticForm
-from tactslip_torch.runtime import are_unchanged, in_parts, stamps_of
-from tactslip_torch.signals.binning import refuse_nonfinite
+from tactslip_torch.runtime import in_parts
+from tactslip_torch.signals.filtering import refuse_nonfinite
 
 ChannelMask = Sequence[str] | Tensor
 """Channels that are not to be listened to: their names, or a mask ``[C]``, bool."""

@@ -21,8 +21,12 @@ from tactslip_torch.features.ops import is_nowhere, power_of_two_below
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.missing_channels import Prediction
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
-from tactslip_torch.signals.wavelet import Wavelet, branch_matrix
+from tactslip_torch.signals.wavelet import (
+    Wavelet,
+    branch_matrix,
+    frequency_axis_hz,
+    spectrum_matrix,
+)
 
 BaselineName = Literal["film_band_power", "largest_detail"]
 VIBRATION_HZ = (5.0, 400.0)

@@ -20,8 +20,9 @@ from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.abstention import ABSTAIN, Abstention
 from tactslip_torch.model.calibration import (
+    ABSTAIN,
+    Abstention,
     Calibration,
     calibration_from_dict,
     probability,

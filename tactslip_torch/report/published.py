@@ -7,10 +7,9 @@ both sides of its train/test split; and its features were ranked on all bins.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
 
 PAPER = "He et al. 2026, arXiv:2603.18370"
 
@@ -40,19 +39,6 @@ SPLITS: Mapping[str, PublishedSplit] = MappingProxyType(
 )
 
 
-def beside(metrics: Mapping[str, Any], split: str) -> PublishedSplit | None:
-    """The paper's scores beside ours: none of a split it lacks, of another hand or other scenes.
-
-    Args:
-        metrics: the content of ``metrics.json``; without ``is_papers_hand`` they are of the
-            paper's hand, and scores without ``per_scene`` of the paper's scene.
-        split: name of the split.
-    """
-    scenes = set(metrics["splits"][split].get("per_scene", {}))
-    is_papers = metrics.get("is_papers_hand", True) and scenes <= {PAPER_SCENE}
-    return SPLITS.get(split) if is_papers else None
-
-
 LARGER_CLASS = 0.753
 """Share of slip among the bins of figure 6: what calling all of them slip would score."""
 
@@ -73,17 +59,6 @@ SELECTED_BY_FINGER: Mapping[str, Mapping[str, int]] = MappingProxyType(
     }
 )
 """Figure 7(c), by sensor kind."""
-
-
-def is_of_papers_hand(selected: Sequence[Mapping[str, str]]) -> bool:
-    """Whether all these features are of kinds of channels and fingers that the paper's hand has.
-
-    Args:
-        selected: one mapping per feature with ``kind`` and ``finger``.
-    """
-    return all(
-        feature["finger"] in SELECTED_BY_FINGER.get(feature["kind"], {}) for feature in selected
-    )
 
 
 DESCRIPTORS_RANKED: tuple[str, ...] = (

@@ -56,7 +56,7 @@ BASELINES = {
     "logistic_regression_simple": "logistic regression on mean, std, rms",
     "random_forest_simple": "random forest on mean, std, rms",
 }
-"""What baselines (``tactslip_torch.training.baselines``) are called in tables."""
+"""What baselines (``tactslip_torch.training.learner``) are called in tables."""
 _SCORES = {
     "accuracy": "accuracy %",
     "balanced_accuracy": "balanced %",
@@ -147,7 +147,7 @@ def splits_table(metrics: _Metrics) -> str:
             if name in result["splits"]:
                 cells = _score_cells(result["splits"][name]) | {"bins": None}
                 rows.append({"split": f"  {BASELINES.get(baseline, baseline)}"} | cells)
-        if paper := published.beside(metrics, name):
+        if paper := _beside(metrics, name):
             rows.append({"split": "  paper"} | _score_cells(vars(paper)))
     source = [PAPER_LINE] if metrics.get("is_papers_hand", True) else []
     return marked(metrics["simulated"], table(rows), *source)
@@ -234,7 +234,7 @@ def confusion_figure(metrics: _Metrics, path: str | Path) -> None:
     figure = new_figure(*size, "Contact status per bin", simulated=metrics["simulated"])
     panels = figure.subplots(num_rows, num_columns, squeeze=False).ravel()
     for axes, (name, scores) in zip(panels, splits.items(), strict=False):
-        _confusion_panel(axes, name, scores, published.beside(metrics, name))
+        _confusion_panel(axes, name, scores, _beside(metrics, name))
     for axes in panels[len(splits) :]:
         axes.set_axis_off()
     save(figure, path, dpi=180)
@@ -290,7 +290,7 @@ def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
         selected: one mapping per feature with ``channel``, ``component``, ``domain``,
             ``descriptor``, ``kind`` and ``finger``.
     """
-    is_papers = published.is_of_papers_hand(selected)
+    is_papers = _is_of_papers_hand(selected)
     by_finger: Counter[str] = Counter()
     for counts in published.SELECTED_BY_FINGER.values():
         by_finger.update(counts)
@@ -346,7 +346,7 @@ def selected_features_figure(
     grid = figure.add_gridspec(3, 2, width_ratios=[1.15, 1], height_ratios=[0.5, 1.1, 1])
     kind, component, finger = (figure.add_subplot(grid[row, 0]) for row in range(3))
     descriptor = figure.add_subplot(grid[:, 1])
-    is_papers = published.is_of_papers_hand(selected)
+    is_papers = _is_of_papers_hand(selected)
     by_kind = published.SELECTED_BY_KIND if is_papers else {}
     by_finger = published.SELECTED_BY_FINGER if is_papers else {}
     kinds = [feature["kind"] for feature in selected]
@@ -1203,3 +1203,31 @@ def _draw_rates(
             low, value, high = (max(rate[end], _LEAST_RATE) for end in ("low", "value", "high"))
             axes.plot([low, high], [lane + aside] * 2, color=colour, linewidth=1.6, zorder=2)
             axes.plot(value, lane + aside, "o", color=colour, markersize=6, zorder=3)
+
+
+# Beside the paper -----
+
+
+def _beside(metrics: Mapping[str, Any], split: str) -> published.PublishedSplit | None:
+    """The paper's scores beside ours: none of a split it lacks, of another hand or other scenes.
+
+    Args:
+        metrics: the content of ``metrics.json``; without ``is_papers_hand`` they are of the
+            paper's hand, and scores without ``per_scene`` of the paper's scene.
+        split: name of the split.
+    """
+    scenes = set(metrics["splits"][split].get("per_scene", {}))
+    is_papers = metrics.get("is_papers_hand", True) and scenes <= {published.PAPER_SCENE}
+    return published.SPLITS.get(split) if is_papers else None
+
+
+def _is_of_papers_hand(selected: Sequence[Mapping[str, str]]) -> bool:
+    """Whether all these features are of kinds of channels and fingers that the paper's hand has.
+
+    Args:
+        selected: one mapping per feature with ``kind`` and ``finger``.
+    """
+    return all(
+        feature["finger"] in published.SELECTED_BY_FINGER.get(feature["kind"], {})
+        for feature in selected
+    )

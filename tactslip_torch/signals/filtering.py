@@ -11,6 +11,8 @@ but half a frame late.
 
 ``savgol_filter`` is the filter of one frame; ``ChannelFilter`` has a frame of its own for every
 channel, of whole recordings and of bins, with Savitzky-Golay's weights or others.
+
+Cutting recordings into bins, the paper's 50 ms analysis unit (REFERENCE.md section 2).
 """
 
 from __future__ import annotations
@@ -21,8 +23,6 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
-
-from tactslip_torch.runtime import check_tensor
 
 Align = Literal["centred", "causal", "trailing"]
 """Which part of its frame's polynomial a sample takes, and where the frame lies.
@@ -516,3 +516,74 @@ def past_of(
         x = samples[..., channel, :length]
         past[..., channel, num - len(matrix) :] = x[..., :1] + (x - x[..., :1]) @ matrix.T
     return past
+
+
+def check_tensor(x: Any) -> None:
+    """Refuse what is no tensor, such as a NumPy array.
+
+    Raises:
+        TypeError: if it is none.
+    """
+    if not isinstance(x, Tensor):
+        kind = f"{type(x).__module__}.{type(x).__name__}".removeprefix("builtins.")
+        raise TypeError(f"expected a torch.Tensor, got {kind}; use torch.as_tensor(samples)")
+
+
+def check_samples(x: Tensor, what: str = "samples") -> None:
+    """Refuse what is no tensor, and one of whole numbers or of half precision.
+
+    Raises:
+        TypeError: if it is no tensor.
+        ValueError: for another dtype.
+    """
+    check_tensor(x)
+    if x.dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"expected float32 or float64 {what} in volts, got {x.dtype}; "
+            "convert with .float() or .double()"
+        )
+
+
+def bins_at(x: Tensor, starts: Tensor, bin_samples: int) -> Tensor:
+    """The bins that begin at given samples.
+
+    Shape:
+        - x: ``[C, T]``
+        - starts: ``[N]``, integers
+        - output: ``[N, C, bin_samples]``
+
+    Raises:
+        ValueError: if a bin reaches outside the recording, named with its start.
+    """
+    num_samples = x.shape[-1]
+    outside = (starts < 0) | (starts + bin_samples > num_samples)
+    if bool(outside.any()):
+        raise ValueError(
+            f"a bin of {bin_samples} samples at sample {int(starts[outside][0])} reaches outside "
+            f"the recording's {num_samples} samples"
+        )
+    index = starts[:, None] + torch.arange(bin_samples, device=starts.device)  # [N, n]
+    return x[:, index].movedim(0, 1)
+
+
+def refuse_nonfinite(samples: Tensor, names: Sequence[str], advice: str) -> None:
+    """Raise if a sample is NaN or Inf.
+
+    Args:
+        samples: in any unit.
+        names: of the channels, for the message.
+        advice: what to do about it, the end of the message.
+
+    Shape:
+        - samples: ``[*, C, n]``
+
+    Raises:
+        ValueError: naming bin, channel and sample of the first one.
+    """
+    is_bad = ~samples.isfinite()
+    if not bool(is_bad.any()):
+        return
+    *bins, channel, sample = is_bad.nonzero()[0].tolist()
+    value = float(samples[(*bins, channel, sample)])
+    place = f"bin {', '.join(map(str, bins))}, " if bins else ""
+    raise ValueError(f"{place}channel {names[channel]}, sample {sample} is {value}; {advice}")

@@ -18,7 +18,13 @@ from tactslip_torch.simulation.scene import (
     Stroke,
     paper_scenes,
 )
-from tactslip_torch.simulation.simulate import Timeline, simulate, simulate_many, timeline
+from tactslip_torch.simulation.simulate import (
+    SimulatedRecordings,
+    Timeline,
+    simulate,
+    simulate_many,
+    timeline,
+)
 
 __all__ = [
     "FIDELITIES",
@@ -35,6 +41,7 @@ __all__ = [
     "Material",
     "Scene",
     "Sensors",
+    "SimulatedRecordings",
     "Stroke",
     "Timeline",
     "paper_scenes",

@@ -8,6 +8,24 @@ at speed over wavelength, which run with the arm's position. Then a burst where 
 An SG channel follows force slowly and stays: preload, shear, creep, offset, drift. A PVDF channel
 gives the rate of strain: nothing of what stays passes its high-pass. Both end in white noise and a
 converter with rails. Last links of the chain in PHYSICS.md.
+
+What is in a recording and is no slip of the hand: disturbances, handling, imperfections, faults.
+
+*Disturbances* reach every channel: arm, motor, mains, knocks, a machine beside the hand, pick-up.
+Each is a common signal (or a few) times one coupling per channel.
+
+*Handling* loads the contact without sliding: a carried object's inertia, taps, changes of grip. It
+comes on top of what the contact says, and only where nothing slides: at rest and in strokes that
+move ``"both"``, a tenth of a second away from any stroke that slides. One thing reaches further: a
+carried object's shear outlasts its stroke by 30 ms, into a slide that begins sooner, where it is
+sensed and moves no onset. Taps and grips press harder and never less, and carried shear stays below
+half of static friction, so a contact that sticks goes on sticking: no slip begins or ends by them.
+
+*Imperfections* are noise, wander and partial slip of single elements; *faults* are what is broken
+between the sensors and the file. Neither moves what slides and when.
+
+Everything is a function of absolute time and of keys of its own, so any interval can be computed
+alone, and nothing moves by what is switched on beside it.
 """
 
 from __future__ import annotations
@@ -15,22 +33,26 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactslip_torch.simulation._blocks import (
     Array,
     Flags,
     Grid,
+    Interval,
     Key,
     Spectrum,
     causal_response,
     generator,
+    log_uniform,
     lognormal,
+    smooth_step,
 )
 from tactslip_torch.simulation._contact import ElementContact, Grasp
-from tactslip_torch.simulation.scene import Motion, Scene
+from tactslip_torch.simulation.scene import ArmStroke, Motion, Scene
 
 _REFERENCE_MM_S = 40.0  # the speed at which levels are given
 _LOW_BAND_HZ = 25.0  # where the low part of friction noise ends
@@ -304,3 +326,544 @@ def converted(scene: Scene, front: Front, index: int, grid: Grid, volts: Array) 
     rail_v = scene.sensors.rail_v
     step_v = 2.0 * rail_v / 2.0**scene.sensors.num_bits
     return np.asarray(np.clip(np.round(total / step_v) * step_v, -rail_v, rail_v - step_v))
+
+
+# --- disturbances of every channel ----------------------------------------------------------------
+
+_ARM_MODES_HZ = (6.0, 6.5, 15.0, 56.0, 87.0, 277.0)
+"""Modes of a light arm with payload (Wu 2021, Intell. Robot. 1(2):99), proxy for the UR5e."""
+
+_ARM_MODE_WEIGHTS = (0.25, 0.15, 0.25, 0.2, 0.1, 0.05)  # of a transient's first swing (prior, ours)
+_MAINS_ORDERS = np.array([1, 2, 3, 5, 7, 9])  # up to 450 Hz
+_MAINS_BURST_S = (0.1, 1.0)  # how long the mains is stronger; log-uniform (prior, ours)
+_MAINS_RAMP_S = 0.02  # of a burst, at both ends
+_MOTOR_PITCH_MM = (0.37, 0.61)  # arm travel per turn of two gears that are heard (prior, ours)
+_MACHINE_ORDERS = np.array([1, 2, 3, 4, 6, 8])  # harmonics of the rotation
+_MACHINE_RUN_S = (1.0, 4.0)  # how long a run lasts; log-uniform (ours)
+_MACHINE_BREAK_S = (0.5, 2.0)  # how long it stands between runs; log-uniform (ours)
+_MACHINE_RAMP_S = 0.3  # how long it runs up and down, at both ends of a run (ours)
+_PICKUP_COUPLING_SPREAD = 0.7  # of the channels (ours)
+_SG_PICKUP = 0.1  # coupling of a strain gauge's bridge, of low resistance, over a film's (ours)
+_LEVEL_SPREAD = 0.5  # of levels of pick-up and local noise over time, and between elements (ours)
+_WANDER_HZ = (0.1, 2.0)  # where levels wander
+_WANDER_NODES = 16  # per block
+
+
+def common_volts(scene: Scene, grid: Grid, channels: list[int]) -> Array:
+    """Mains, motor, arm, machine, knocks and pick-up of some channels, ``[len(channels), K, B]``.
+
+    Raises:
+        ValueError: if the machine's rotation would be folded at the converter.
+    """
+    of, num, modes = scene.disturbances, len(scene.hand), len(_ARM_MODES_HZ)
+    driven = Motion(tuple(stroke for stroke in scene.arm if stroke.drives), grid)
+    volts = np.zeros((len(channels), *grid.time_s.shape))
+
+    def add(coupling_v: Array, wave: Array, rows: slice = slice(None)) -> None:
+        for channel_volts, size_v in zip(volts, coupling_v[channels], strict=True):
+            channel_volts[rows] += size_v * wave
+
+    session = generator(*scene.session_key("couplings"))
+    mains_v = 1e-3 * of.mains_mv * lognormal(session, of.mains_session_spread)
+    couplings = lognormal(session, 0.4, num)
+    motor_mv = _motor_level_mv(scene)
+    motor_v = 1e-3 * motor_mv * lognormal(session, 0.3, num)
+    signs = np.where(session.random((num, modes)) < 0.5, -1.0, 1.0)
+    arm_v = 1e-3 * of.arm_transient_mv * signs * lognormal(session, 0.4, (num, modes))
+
+    bursts = mains_bursts(scene)
+    if of.mains_mv > 0 or bursts:
+        mains = _mains(scene, grid)
+        add(mains_v * couplings, mains)
+        for start_s, end_s in bursts:
+            rows, envelope = grid.pulse(start_s, end_s, _MAINS_RAMP_S)
+            add(1e-3 * of.mains_burst_mv * couplings, envelope * mains[rows], rows)
+    if driven.strokes and motor_mv > 0:
+        rows, wave = _motor(scene, driven)
+        add(motor_v, wave, rows)
+    if driven.strokes and of.arm_transient_mv > 0:
+        rows, ringing = _arm_ringing(scene, driven)
+        for mode_v, wave in zip(arm_v.T, ringing, strict=True):
+            add(mode_v, wave, rows)
+    if of.machine_mv > 0:
+        machine = lognormal(generator(*scene.session_key("machine couplings")), 0.4, num)
+        add(1e-3 * of.machine_mv * machine, _machine_wave(scene, grid))
+    for coupling_v, time_s, omega, decay in _draw_knocks(scene):
+        rows, wave = grid.ringing(time_s, 12.0 / decay, omega, decay)
+        add(coupling_v, wave, rows)
+    if scene.imperfections.pickup_mv > 0:
+        session = generator(*scene.session_key("pick-up"))
+        signs = np.where(session.random(num) < 0.5, -1.0, 1.0)
+        signs *= np.where(is_slow(scene), _SG_PICKUP, 1.0)
+        add(signs * lognormal(session, _PICKUP_COUPLING_SPREAD, num), _pickup_v(scene, grid))
+    return volts
+
+
+def _mains(scene: Scene, grid: Grid) -> Array:
+    """Fundamental of amplitude 1 with its harmonics, one phase for all channels."""
+    session = generator(*scene.session_key("mains"))
+    num = len(_MAINS_ORDERS)
+    levels = 0.3 * lognormal(session, 0.5, num) / _MAINS_ORDERS
+    phases = 2 * np.pi * session.random(num)
+    levels[0], phases[0] = 1.0, 0.0
+    rng = generator(*scene.key("mains"))
+    hertz = scene.disturbances.mains_hz + 0.02 * rng.standard_normal()
+    angle = 2 * np.pi * (hertz * grid.time_s + rng.random())
+    wave = grid.zeros()
+    for order, level, phase in zip(_MAINS_ORDERS, levels, phases, strict=True):
+        if order == 1 or order * hertz < 0.5 * scene.sample_rate_hz:
+            wave += level * np.sin(order * angle + phase)
+    return wave
+
+
+def mains_bursts(scene: Scene) -> list[Interval]:
+    """When the mains is stronger; bursts may overlap, and then add."""
+    per_s = scene.disturbances.mains_bursts_per_s
+    return _at_random(scene, scene.key("mains bursts"), per_s, _MAINS_BURST_S)
+
+
+def _motor_level_mv(scene: Scene) -> float:
+    """The recording's motor vibration: the scene's, or a draw of its own from the scene's range."""
+    level = scene.disturbances.motor_vibration_mv
+    if isinstance(level, tuple):
+        return float(log_uniform(generator(*scene.key("motor level")), level))
+    return level
+
+
+def _motor(scene: Scene, driven: Motion) -> tuple[slice, Array]:
+    """Vibration of unit rms at 40 mm/s while the arm moves: two gear lines and broad noise."""
+    grid, strokes = driven.grid, driven.strokes
+    rows = grid.overlapping(strokes[0].start_s, strokes[-1].stop_s)
+    part, f = grid.only(rows), grid.frequency_hz
+    response = causal_response(f**2 / (f**2 + 20.0**2) / (1 + (f / 200.0) ** 2))
+    noise = part.coloured_noise(scene.key("motor"), response)
+    for pitch in _MOTOR_PITCH_MM:
+        noise += np.sin(2 * np.pi / pitch * driven.position_mm[rows])
+    return rows, np.sqrt(driven.speed_mm_s[rows] / 40.0) * noise / np.sqrt(2.0)
+
+
+def _arm_ringing(scene: Scene, driven: Motion) -> tuple[slice, list[Array]]:
+    """The arm's modes, struck at every start and stop, one ``[k, B]`` per mode.
+
+    Between two strikes a mode is one decaying phasor, the sum of all strikes before.
+    """
+    rng, session = generator(*scene.key("arm")), generator(*scene.session_key("arm"))
+    strikes_s = np.sort([t for stroke in driven.strokes for t in (stroke.start_s, stroke.stop_s)])
+    sizes = lognormal(rng, 0.3, len(strikes_s)) * np.tile([1.0, -1.0], len(driven.strokes))
+    hertz = np.asarray(_ARM_MODES_HZ) * lognormal(session, 0.03, len(_ARM_MODES_HZ))
+    damping = 0.03 + 0.03 * session.random(len(_ARM_MODES_HZ))
+    rows = driven.grid.overlapping(strikes_s[0], driven.grid.time_s[-1, -1])
+    t = driven.grid.time_s[rows]
+    last = np.searchsorted(strikes_s, t, side="right") - 1  # strike before each sample, or -1
+    elapsed = np.maximum(t - strikes_s[np.maximum(last, 0)], 0.0)
+    modes = []
+    for frequency, ratio, weight in zip(hertz, damping, _ARM_MODE_WEIGHTS, strict=True):
+        rate = 2 * np.pi * frequency * complex(-ratio, 1.0)
+        phasors = [0j]  # before the first strike
+        for gap_s, size in zip(np.diff(strikes_s, prepend=strikes_s[0]), sizes, strict=True):
+            phasors.append(phasors[-1] * np.exp(rate * gap_s) + weight * size)
+        modes.append((np.asarray(phasors)[last + 1] * np.exp(rate * elapsed)).imag)
+    return rows, modes
+
+
+def _draw_knocks(scene: Scene) -> list[tuple[Array, float, float, float]]:
+    """Knocks at random times, each in about half of the channels, weakly in SG channels (ours).
+
+    Volts of every channel, time, angular frequency and decay of each.
+    """
+    of, num_channels = scene.disturbances, len(scene.hand)
+    rng = generator(*scene.key("bursts"))
+    num = int(rng.poisson(of.burst_rate_hz * scene.end_s))
+    times_s = scene.end_s * rng.random(num)
+    omegas = 2 * np.pi * log_uniform(rng, (15.0, 150.0), num)
+    decays = 1.0 / log_uniform(rng, (0.005, 0.05), num)
+    reached = rng.random((num, num_channels)) < 0.5
+    sizes_v = 1e-3 * of.burst_mv * lognormal(rng, 0.5, (num, 1))
+    sizes_v = sizes_v * lognormal(rng, 0.5, (num, num_channels)) * reached
+    sizes_v *= np.where(is_slow(scene), 0.3, 1.0)
+    return list(zip(sizes_v, times_s.tolist(), omegas.tolist(), decays.tolist(), strict=True))
+
+
+def machine_runs(scene: Scene) -> list[Interval]:
+    """When the neighbouring machine turns, runs up or runs down; the last run may go on."""
+    if scene.disturbances.machine_mv == 0:
+        return []
+    rng = generator(*scene.key("machine"))
+    runs, now_s = [], _MACHINE_BREAK_S[1] * rng.random()
+    while now_s < scene.end_s:
+        stop_s = float(now_s + log_uniform(rng, _MACHINE_RUN_S))
+        runs.append((now_s, stop_s))
+        now_s = float(stop_s + log_uniform(rng, _MACHINE_BREAK_S))
+    return runs
+
+
+def rotation_hz(scene: Scene) -> float:
+    """The machine's rotation at full speed; the session's."""
+    rng = generator(*scene.session_key("machine"))
+    return float(log_uniform(rng, scene.disturbances.machine_hz))
+
+
+def _machine_wave(scene: Scene, grid: Grid) -> Array:
+    """The machine's vibration, of unit rms at full speed and zero where it stands, ``[K, B]``.
+
+    In a run the rotation's phase is the integral of a speed that rises and falls linearly, and
+    each harmonic's size goes with the square of that speed. Orders that would be folded at the
+    converter are left out.
+
+    Raises:
+        ValueError: if the rotation itself would be folded.
+    """
+    wave, hertz, highest_hz = grid.zeros(), rotation_hz(scene), 0.45 * scene.sample_rate_hz
+    if hertz >= highest_hz:
+        raise ValueError(
+            f"machine_hz must lie below {highest_hz:g} Hz at {scene.sample_rate_hz:g} samples a "
+            f"second, got {scene.disturbances.machine_hz}"
+        )
+    rng, num = generator(*scene.session_key("machine harmonics")), len(_MACHINE_ORDERS)
+    levels = lognormal(rng, 0.5, num) / _MACHINE_ORDERS
+    phases = 2 * np.pi * rng.random(num)
+    levels = np.where(_MACHINE_ORDERS * hertz < highest_hz, levels, 0.0)
+    levels *= np.sqrt(2.0 / np.sum(levels**2))
+    for start_s, stop_s in machine_runs(scene):
+        rows = grid.overlapping(start_s, stop_s)
+        since = np.clip(grid.time_s[rows] - start_s, 0.0, stop_s - start_s)
+        left = stop_s - start_s - since
+        speed = np.clip(np.minimum(since, left) / _MACHINE_RAMP_S, 0.0, 1.0)
+        up: Array = np.minimum(since, _MACHINE_RAMP_S)
+        down: Array = np.maximum(_MACHINE_RAMP_S - left, 0.0)
+        turns = hertz * (since - up + (up**2 - down**2) / (2 * _MACHINE_RAMP_S))
+        for order, level, phase in zip(_MACHINE_ORDERS, levels, phases, strict=True):
+            wave[rows] += level * speed**2 * np.sin(2 * np.pi * order * turns + phase)
+    return wave
+
+
+def _pickup_v(scene: Scene, grid: Grid) -> Array:
+    """Broadband pick-up at a film of coupling 1; its level wanders, ``[K, B]``."""
+    f = grid.frequency_hz
+    response = causal_response(f / (f + 20.0) / (1 + f / 200.0))
+    level = _wandering(_LEVEL_SPREAD, generator(*scene.key("pick-up level")), grid)
+    noise = grid.coloured_noise(scene.key("pick-up"), response)
+    return np.asarray(1e-3 * scene.imperfections.pickup_mv * level * noise)
+
+
+def _wandering(spread: float, rng: np.random.Generator, grid: Grid) -> Array:
+    """A factor whose logarithm wanders slowly, ``[K, B]``."""
+    return np.asarray(np.exp(spread * grid.wander(rng, _WANDER_HZ, _WANDER_NODES)))
+
+
+def _at_random(scene: Scene, key: Key, per_s: float, lengths_s: Interval) -> list[Interval]:
+    """Intervals at random times of a recording, which may overlap; lengths are log-uniform."""
+    rng = generator(*key)
+    starts_s = scene.end_s * rng.random(rng.poisson(per_s * scene.end_s))
+    return [(float(at), float(at + log_uniform(rng, lengths_s))) for at in starts_s]
+
+
+# --- handling -------------------------------------------------------------------------------------
+
+_MARGIN_S = 0.1  # between a tap or grip, with its settling, and a stroke that slides (ours)
+_SETTLE_S = 0.1  # how long a film still tells of a tap or grip that is over (ours)
+_EVENT_SPREAD = 0.3  # how unevenly elements take part in a tap or grip (ours)
+_RINGING_S = 0.3  # how long the arm's ringing counts as handling after a stroke (ours)
+_MOST_CARRIED = 0.5  # of static friction, what a carried object may take
+_KNOCK_V_PER_N = 0.05  # first swing of a knock's modes at a film, per newton of the peak (ours)
+_KNOCK_HZ = (60.0, 800.0)  # where a knock's modes lie
+_KNOCK_DECAY_S = (0.002, 0.008)
+_KNOCK_MODES = 8
+
+_JERK_S = 0.03
+"""How long the object takes to follow a change of the arm's acceleration: a raised cosine (ours).
+
+The skin of all elements and 0.2 kg resonate near 40 Hz.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Event:
+    """A tap or a change of grip.
+
+    Args:
+        start_s: when it begins.
+        end_s: when the load is what it was before.
+        size: of every element, newtons of a tap or a grip's rise over the load, ``[E]``.
+    """
+
+    start_s: float
+    end_s: float
+    size: Array
+
+
+def _quiet(scene: Scene) -> list[Interval]:
+    """Where nothing slides or is about to: all but the strokes that slide, and a margin."""
+    ends_s = [stroke.start_s - _MARGIN_S for stroke in scene.slides]
+    starts_s = [stroke.stop_s + _MARGIN_S for stroke in scene.slides]
+    gaps = zip([0.0, *starts_s], [*ends_s, scene.end_s], strict=True)
+    return [(start_s, end_s) for start_s, end_s in gaps if end_s > start_s]
+
+
+def _draw_events(
+    scene: Scene,
+    grasp: Grasp,
+    purpose: str,
+    rate_hz: float,
+    sizes: tuple[float, float],
+    lengths_s: tuple[float, float],
+) -> list[_Event]:
+    """Events at random times where nothing slides, in order of time."""
+    if rate_hz == 0:
+        return []
+    quiet = _quiet(scene)
+    if not any(end_s - start_s > lengths_s[1] + _SETTLE_S for start_s, end_s in quiet):
+        raise ValueError(
+            f"no rest long enough for {purpose} of up to {lengths_s[1]:g} s, {_SETTLE_S:g} s to "
+            f"settle and {_MARGIN_S:g} s before and after each slide: pause longer or add a tail_s"
+        )
+    rng, events = generator(*scene.key(purpose)), []
+    load = grasp.load_n / scene.contact.load_n if purpose == "taps" else 1.0
+    for _ in range(rng.poisson(rate_hz * sum(end_s - start_s for start_s, end_s in quiet))):
+        length_s, size = log_uniform(rng, lengths_s), log_uniform(rng, sizes)
+        factor = lognormal(rng, _EVENT_SPREAD, len(grasp.load_n)) * load
+        needed_s = length_s + _SETTLE_S
+        starts, latest = np.array([(a, b - needed_s) for a, b in quiet if b - a > needed_s]).T
+        reached = np.cumsum(latest - starts)  # of the time in which the event may begin
+        place_s = rng.random() * reached[-1]
+        gap = min(int(np.searchsorted(reached, place_s, side="right")), len(reached) - 1)
+        start_s = float(latest[gap] - (reached[gap] - place_s))
+        events.append(_Event(start_s, float(start_s + length_s), size * factor))
+    return sorted(events, key=lambda event: event.start_s)
+
+
+class Handled:
+    """What hands do to the object in one recording.
+
+    Args:
+        scene: whose handling.
+        grasp: how the hand touches.
+
+    Attributes:
+        taps: in order of time.
+        grips: the same.
+        carried: strokes in which an object of some mass moves with the hand.
+
+    Raises:
+        ValueError: if the carried object would take more than half of static friction, or more
+            than a slide before has left of it, or there is no rest long enough for a tap or grip
+            that is asked for.
+    """
+
+    def __init__(self, scene: Scene, grasp: Grasp) -> None:
+        self._scene, self._load_fraction = scene, grasp.load_n / grasp.load_n.sum()
+        of = scene.handling
+        has_mass = of.carried_kg > 0
+        self.carried = [stroke for stroke in scene.arm if has_mass and not stroke.slides]
+        _require_carriable(scene, grasp, self.carried)
+        tap_s = (1e-3 * of.tap_ms[0], 1e-3 * of.tap_ms[1])
+        self.taps = _draw_events(scene, grasp, "taps", of.taps_per_s, of.tap_n, tap_s)
+        self.grips = _draw_events(scene, grasp, "grips", of.grips_per_s, of.grip_share, of.grip_s)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing is done."""
+        return not (self.taps or self.grips or self.carried)
+
+    def intervals_s(self, duration_s: float) -> tuple[Interval, ...]:
+        """Where the hand is handled: ascending, apart, within the recording, never in a slide.
+
+        The whole of a recording without strokes: there is nothing else to tell slip from.
+        """
+        arm = self._scene.arm
+        if not arm:
+            return ((0.0, duration_s),)
+        handled = [(event.start_s, event.end_s + _SETTLE_S) for event in (*self.taps, *self.grips)]
+        for number, stroke in enumerate(arm):
+            later_s = [other.start_s for other in arm[number + 1 :] if other.slides]
+            if not stroke.slides:
+                handled.append((stroke.start_s, min([stroke.stop_s + _RINGING_S, *later_s])))
+        union: list[Interval] = []
+        for start_s, end_s in sorted(handled):
+            end_s = min(end_s, duration_s)
+            if union and start_s <= union[-1][1]:
+                union[-1] = (union[-1][0], max(union[-1][1], end_s))
+            elif end_s > start_s:
+                union.append((start_s, end_s))
+        return tuple(union)
+
+    def shear_n(self, element: int, time_s: Array) -> Array:
+        """Newtons of the carried object's inertia on an element; signed like a slide's friction."""
+        total = np.zeros(time_s.shape)
+        for stroke in self.carried:
+            stop_s = stroke.stop_s - stroke.start_s
+            corners_s = (0.0, stroke.ramp_s, stop_s - stroke.ramp_s, stop_s)
+            since = time_s - stroke.start_s
+            up, even, down, rest = (smooth_step((since - at) / _JERK_S) for at in corners_s)
+            total += 1e-3 * stroke.acceleration_mm_s2 * (up - even - down + rest)
+        return self._scene.handling.carried_kg * float(self._load_fraction[element]) * total
+
+    def press_n(self, element: int, before_n: Array, grid: Grid) -> Array:
+        """Newtons that taps and grips add to an element's load.
+
+        Args:
+            element: which.
+            before_n: its load without them, on ``grid``.
+            grid: where.
+
+        Shape:
+            - before_n, output: ``[K, B]``
+        """
+        extra = grid.zeros()
+        for tap in self.taps:
+            rows = grid.overlapping(tap.start_s, tap.end_s)
+            phase = (grid.time_s[rows] - tap.start_s) / (tap.end_s - tap.start_s)
+            extra[rows] += tap.size[element] * np.sin(np.pi * np.clip(phase, 0.0, 1.0))
+        for grip in self.grips:
+            ramp_s = (grip.end_s - grip.start_s) / 4
+            rows, rise = grid.pulse(grip.start_s, grip.end_s, ramp_s)
+            extra[rows] += grip.size[element] * rise * before_n[rows]
+        return extra
+
+    def knock_v(self, element: int, grid: Grid) -> Array:
+        """What a film of unit gain hears of the taps beyond their force: many modes, soon gone.
+
+        Shape:
+            - output: ``[K, B]``
+        """
+        volts, rng = grid.zeros(), generator(*self._scene.key("knocks"), element)
+        for tap in self.taps:
+            hertz = log_uniform(rng, _KNOCK_HZ, _KNOCK_MODES)
+            decays = 1.0 / log_uniform(rng, _KNOCK_DECAY_S, _KNOCK_MODES)
+            swings = rng.standard_normal(_KNOCK_MODES) * _KNOCK_V_PER_N * tap.size[element]
+            length_s = 12.0 * _KNOCK_DECAY_S[1]
+            for f, decay, swing in zip(hertz, decays, swings, strict=True):
+                if f < 0.4 * self._scene.sample_rate_hz:
+                    rows, wave = grid.ringing(tap.start_s, length_s, 2 * np.pi * f, decay)
+                    volts[rows] += swing * wave
+        return volts
+
+
+def _require_carriable(scene: Scene, grasp: Grasp, carried: list[ArmStroke]) -> None:
+    """Refuse an object whose inertia comes near to making the contact slide."""
+    if not carried:
+        return
+    force_n = scene.handling.carried_kg * scene.acceleration_m_s2
+    friction_n = (1.0 - scene.contact.runout) * float(grasp.friction_n.sum())
+    what = f"carrying {scene.handling.carried_kg:g} kg at {scene.acceleration_m_s2:g} m/s2 takes"
+    if force_n > _MOST_CARRIED * friction_n:
+        raise ValueError(
+            f"{what} {force_n:.3g} N, more than half of the {friction_n:.3g} N of static friction: "
+            "lower carried_kg or acceleration_m_s2, or raise load_n"
+        )
+    fraction = force_n / friction_n
+    for number, stroke in enumerate(scene.arm, 1):
+        stops_s = [slide.stop_s for slide in scene.slides if slide.stop_s <= stroke.start_s]
+        if stroke.slides or not stops_s:
+            continue
+        left = float(grasp.relaxed(stroke.start_s - stops_s[-1])[grasp.touching].max())
+        if left + fraction > 1.0:
+            raise ValueError(
+                f"{what} {fraction:.3g} of static friction in stroke {number}, and up to {left:.3g}"
+                " may be left of the slide before: pause longer or lower carried_kg"
+            )
+
+
+# --- imperfections --------------------------------------------------------------------------------
+
+_PARTIAL_S = (0.05, 0.3)
+"""How long a finger slips or sticks on its own; log-uniform. With the speed: .5 to 3 mm (ours)."""
+
+_PARTIAL_MM_S = 10.0  # speed of a partial slip (ours)
+_PARTIAL_RAMP_S = 0.01
+
+
+def drift_factor(scene: Scene, what: Literal["share", "gain"], number: int, grid: Grid) -> Any:
+    """What an element's load share or a channel's gain drifts by, ``[K, B]``; 1 without a drift."""
+    of = scene.imperfections
+    spread = of.share_wander if what == "share" else of.gain_drift
+    return _wandering(spread, generator(*scene.key(what), number), grid) if spread > 0 else 1.0
+
+
+def add_imperfections(
+    scene: Scene,
+    grasp: Grasp,
+    contact: ElementContact,
+    element: int,
+    grid: Grid,
+    vibration: Vibration,
+) -> None:
+    """Change one touching element's vibration, in place: partial slip or sticking, local noise."""
+    of = scene.imperfections
+    index = int(np.flatnonzero(grasp.element_of_channel == element)[0])
+    finger = scene.hand.channels[index].finger
+    for start_s, end_s in partial_intervals(scene, finger):
+        rows, envelope = grid.pulse(start_s, end_s, _PARTIAL_RAMP_S)
+        holds = contact.slide[rows] == 0
+        slip_v = np.where(holds, envelope, 0.0)
+        slip_v *= steady_vibration_v(scene, grasp, element, _PARTIAL_MM_S)
+        sticks = np.where(holds, 1.0, 1.0 - envelope)
+        noises = _bands(scene, grasp, element, grid.only(rows), "partial slip")
+        for band, noise in zip((vibration.high, vibration.low), noises, strict=True):
+            band[rows] = sticks * band[rows] + slip_v * noise
+    if of.local_noise_mv > 0:
+        rng = generator(*scene.key("local noise"), element)
+        size_v = 1e-3 * of.local_noise_mv * lognormal(rng, _LEVEL_SPREAD)
+        level = np.sqrt(grasp.load_n[element]) * size_v * _wandering(_LEVEL_SPREAD, rng, grid)
+        noises = _bands(scene, grasp, element, grid, "local noise")
+        for band, noise in zip((vibration.high, vibration.low), noises, strict=True):
+            band += level * noise
+
+
+def partial_intervals(scene: Scene, finger: str) -> list[Interval]:
+    """When a finger slips or sticks on its own; intervals may overlap."""
+    per_s = scene.imperfections.partial_slips_per_s
+    return _at_random(scene, (*scene.key("partial slips"), finger), per_s, _PARTIAL_S)
+
+
+def _bands(scene: Scene, grasp: Grasp, element: int, grid: Grid, purpose: str) -> list[Array]:
+    """Noise with the high and the low band's fraction of friction's power, of unit rms in all."""
+    low_fraction = scene.contact.friction_noise_low_share
+    keys = ((*scene.key(purpose), element, band) for band in ("high", "low"))
+    high, low = band_noises(grasp, element, grid, keys)
+    return [np.sqrt(1.0 - low_fraction) * high, np.sqrt(low_fraction) * low]
+
+
+# --- faults ---------------------------------------------------------------------------------------
+
+
+def recorded_channels(scene: Scene) -> list[int]:
+    """Whose signal stands in every row of the file: its own, unless cables are swapped."""
+    rows = {name: index for index, name in enumerate(scene.hand.names)}
+    recorded = list(range(len(rows)))
+    for one, other in scene.faults.swapped:
+        recorded[rows[one]], recorded[rows[other]] = rows[other], rows[one]
+    return recorded
+
+
+def stuck_volts(scene: Scene) -> dict[int, float]:
+    """The rows that hold one value, and which: the converter's zero or its highest step."""
+    sensors, names = scene.sensors, scene.hand.names
+    highest_v = sensors.rail_v - 2.0 * sensors.rail_v / 2.0**sensors.num_bits
+    dead = {names.index(name): 0.0 for name in scene.faults.dead}
+    return dead | {names.index(name): highest_v for name in scene.faults.saturated}
+
+
+def losses(scene: Scene, num_samples: int) -> list[tuple[int, int]]:
+    """The first sample of every loss and the first behind it, in order; they may overlap.
+
+    The recording's first sample is never lost, so that each loss has one to repeat.
+    """
+    duration_s, rate_hz = num_samples / scene.sample_rate_hz, scene.sample_rate_hz
+    rng, lost = generator(*scene.key("losses")), []
+    for _ in range(rng.poisson(scene.faults.drops_per_s * duration_s)):
+        start_s = duration_s * rng.random()
+        end_s = start_s + 1e-3 * log_uniform(rng, scene.faults.drop_ms)
+        lost.append([max(round(start_s * rate_hz), 1), min(round(end_s * rate_hz), num_samples)])
+    return [(first, end) for first, end in sorted(lost) if first < end]
+
+
+def held_samples(scene: Scene, num_samples: int) -> NDArray[np.int64]:
+    """Which sample of the sensors stands at every sample of the file, ``[T]``.
+
+    Itself, or in a loss the last one before it.
+    """
+    held = np.arange(num_samples)
+    for first, end in losses(scene, num_samples):
+        held[first:end] = held[first - 1]
+    return held

@@ -33,13 +33,11 @@ from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
 from tactslip_torch.features.cache import cache_key
-from tactslip_torch.model.abstention import KEY as ABSTAIN
-from tactslip_torch.model.abstention import Abstention
-from tactslip_torch.model.calibration import fit_platt
+from tactslip_torch.model.calibration import ABSTENTION as ABSTAIN
+from tactslip_torch.model.calibration import Abstention, fit_platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.fit import TrainingBins
+from tactslip_torch.model.fit import MOST_CONDITION, HeldOut, TrainingBins, residuals_without
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
-from tactslip_torch.model.leave_one_group_out import MOST_CONDITION, HeldOut, residuals_without
 from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.onset.decisions import KEY as ALARM

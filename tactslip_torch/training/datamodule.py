@@ -32,8 +32,7 @@ from tactslip_torch.features.cache import FeatureCache, cache_key, source_digest
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import num_processes
-from tactslip_torch.signals.binning import bins_at
-from tactslip_torch.signals.filtering import ChannelFilter, extended
+from tactslip_torch.signals.filtering import ChannelFilter, bins_at, extended
 
 
 class RecordingFeatures(NamedTuple):

@@ -39,8 +39,7 @@ from tactslip_torch.native import BackendName, backend_of
 from tactslip_torch.report.metrics import merged_answers, merged_metrics, summed_metrics
 from tactslip_torch.runtime import LEAD, Progress, __version__, whole_file
 from tactslip_torch.signals.filtering import Align, ChannelFilter
-from tactslip_torch.signals.spectrum import SpectrumMethod
-from tactslip_torch.signals.wavelet import highest_level
+from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.learner import event_numbers
 

@@ -39,12 +39,10 @@ from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.statistics import TrainingStatistics
-from tactslip_torch.model.abstention import Abstention, check_coverage
-from tactslip_torch.model.calibration import fit_platt
+from tactslip_torch.model.calibration import Abstention, check_coverage, fit_platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Head, Kernel, Polynomial, kernel_from_dict
-from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.scaling import FeatureScaler

@@ -24,9 +24,8 @@ from tactslip_torch.data.splits import Split
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
 from tactslip_torch.features.ops import signed_log
 from tactslip_torch.model.calibration import Platt, fit_platt
-from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine, held_out_scores
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.model.leave_one_group_out import HeldOut, held_out_scores
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import bar, check_number
 from tactslip_torch.training.plan import Plan

@@ -19,8 +19,7 @@ from tactslip_torch import (
     SufficientStats,
     simulate,
 )
-from tactslip_torch.model.fit import fit_quadratic
-from tactslip_torch.model.leave_one_group_out import held_out_scores
+from tactslip_torch.model.fit import fit_quadratic, held_out_scores
 
 PACKAGE = "tactslip_torch"
 REPLACED_NEXT = ("features/", "deploy/")
