@@ -38,6 +38,7 @@ from tactslip_torch.data.formats import (
     Opened,
     Reading,
     Samples,
+    file_of,
     open_file,
     pieces,
 )
@@ -86,6 +87,8 @@ _MOST_SHOWN = 5
 def file_digest(path: Path) -> str:
     """SHA-256 of a file's content, or of all files of a folder with their names.
 
+    Of an episode: of the table that it is in, and its name.
+
     A file is read once by a process, as long as its size and the time of its last change stay.
 
     Raises:
@@ -97,6 +100,8 @@ def file_digest(path: Path) -> str:
             name = inner.relative_to(path).as_posix()
             whole.update(f"{name}\0{file_digest(inner)}\n".encode())
         return whole.hexdigest()
+    if (table := file_of(path)) != path:
+        return hashlib.sha256(f"{path.name}\0{file_digest(table)}".encode()).hexdigest()
     found = path.stat()
     return _digest(str(path.absolute()), found.st_mtime_ns, found.st_size)
 

@@ -13,6 +13,7 @@ from tactslip_torch.data.formats import (
     Archived,
     Format,
     endings,
+    episodes_of,
     find_format,
     format_of,
     named_format,
@@ -24,7 +25,7 @@ MANIFEST = NAMES[0]
 
 
 def recording_files(place: Path, *, in_folders: bool = False) -> list[Path]:
-    """The file or bag, or those of a folder that are of a known format, by name.
+    """The file, bag or episode, or those of a folder that are of a known format, by name.
 
     Args:
         place: a recording, or a folder.
@@ -40,7 +41,11 @@ def recording_files(place: Path, *, in_folders: bool = False) -> list[Path]:
     found: list[Path] = []
     folders = [place]
     while folders:
-        for path in sorted(folders.pop().iterdir()):
+        folder = folders.pop()
+        if (episodes := episodes_of(folder)) is not None:
+            found += episodes
+            continue
+        for path in sorted(folder.iterdir()):
             if path.name.startswith(".") or path.name in NAMES:
                 continue
             if find_format(path) is not None:

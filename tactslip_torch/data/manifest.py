@@ -22,6 +22,7 @@ from typing import Any, Literal, NamedTuple, cast
 
 import yaml  # type: ignore[import-untyped]
 
+from tactslip_torch.data.formats import is_there
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.runtime import whole_file
 
@@ -528,7 +529,7 @@ def _file_problem(root: Path, file: str) -> str | None:
     place = root.joinpath(*path.parts)
     try:
         real = place.resolve()
-        exists = place.exists()
+        exists = is_there(place)
     except (OSError, RuntimeError) as error:  # of a name too long, or a loop of links
         return f"file {file[:60]!r}... cannot be opened: {getattr(error, 'strerror', error)}"
     if not real.is_relative_to(root.resolve()):

@@ -1,5 +1,7 @@
 """Recordings in files: NumPy, text, HDF5, MAT, Parquet, MCAP and rosbag2, through one door.
 
+Episodes of LeRobot datasets are read as well, each as if it were a file (``_lerobot``).
+
 Whatever a library raises of a file becomes one line that names it; nothing in a file is executed;
 what it claims is held against its size before anything is allocated; files are written to a
 temporary name and renamed. ``reading.isolate`` reads in a process of its own, with a limit of
@@ -26,6 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from tactslip_torch.data.formats import _lerobot
 from tactslip_torch.data.formats._reading import (
     MOST_WHOLE,
     Archived,
@@ -51,8 +54,11 @@ __all__ = [
     "Reading",
     "Samples",
     "endings",
+    "episodes_of",
+    "file_of",
     "find_format",
     "format_of",
+    "is_there",
     "named_format",
     "open_file",
     "pieces",
@@ -153,6 +159,8 @@ class Format:
 
     def _check(self, path: Path) -> None:
         """Refuse what is no plain file or folder: reading a pipe would wait for ever."""
+        if self is _EPISODE:
+            return
         if not path.exists():
             raise FileNotFoundError(path)
         if not (path.is_dir() if self.is_folder else path.is_file()):
@@ -171,7 +179,33 @@ FORMATS = {
         Format("rosbag2", ("bag2",), "_rosbag2", is_folder=True),
     )
 }
-"""By name."""
+"""By name; all can be written."""
+_EPISODE = Format("LeRobot", (_lerobot.ENDING[1:],), "_lerobot")
+
+
+def episodes_of(folder: Path) -> list[Path] | None:
+    """The recordings of a LeRobot dataset, which are no files; ``None`` of another folder.
+
+    Raises:
+        ValueError: if it is a damaged one.
+    """
+    with guarded(folder):
+        return _lerobot.episodes_of(folder) if _lerobot.is_dataset(folder) else None
+
+
+def is_there(path: Path) -> bool:
+    """Whether there is such a file or folder, or the dataset that an episode is named of."""
+    return path.exists() or find_format(path) is _EPISODE
+
+
+def file_of(path: Path) -> Path:
+    """The file or folder that holds a recording: itself, or the table that an episode is in.
+
+    Raises:
+        ValueError: if there is no such episode.
+    """
+    with guarded(path):
+        return _lerobot.table_of(path) if find_format(path) is _EPISODE else path
 
 
 def endings() -> tuple[str, ...]:
@@ -183,6 +217,8 @@ def find_format(path: Path) -> Format | None:
     """The format of a file, or of a folder that is a bag; None if there is none."""
     if path.is_dir():
         return FORMATS["rosbag2"] if (path / "metadata.yaml").is_file() else None
+    if path.suffix == _lerobot.ENDING and _lerobot.is_dataset(path.parent):
+        return _EPISODE
     ending = "" if path.name.startswith(".") else path.suffix[1:].lower()
     return next((f for f in FORMATS.values() if ending in f.endings and not f.is_folder), None)
 
@@ -194,7 +230,7 @@ def format_of(path: Path) -> Format:
         FileNotFoundError: if there is nothing.
         ValueError: if it is of no format that is known.
     """
-    if not path.exists():
+    if not is_there(path):
         raise FileNotFoundError(f"no file or folder at {path}")
     found = find_format(path)
     if found is None:

@@ -128,7 +128,8 @@ class Reading:
             without names the first column, unless the rate is given. ``None``: there is none.
         time_unit: of those times.
         channels: columns by name or number, in the order of the hand; ``None``: all but the times.
-        samples: the dataset, variable or topic that holds samples; ``None``: the only one that can.
+        samples: the dataset, variable, topic or feature (of LeRobot) that holds samples; ``None``:
+            the only one that can.
         time_first: whether arrays are ``[T, C]``; ``None``: the longer axis is time.
         delimiter: between columns of text; ``None``: found from the first lines.
         speed: the column or array of the speed of slip, which is no channel; ``None``: there is
