@@ -53,7 +53,7 @@ def run(command: str, arguments: list[str]) -> None:
     from tactslip_torch.commands.configuration import conf_dir
     from tactslip_torch.commands.stopping import stopping
 
-    name = {"data": "data_tool"}.get(command, command.replace("-", "_"))
+    name = command.replace("-", "_")
     is_ours = (conf_dir() / f"{name}.yaml").is_file()
     with stopping():
         if is_ours and {"-h", "--help"} & set(arguments):
@@ -69,8 +69,7 @@ def run(command: str, arguments: list[str]) -> None:
             return
         sys.argv = [f"tactslip {command}", *arguments]
         # as __main__, so that Lightning finds what to start again in further processes
-        module = f"tactslip_torch.commands.{command.replace('-', '_')}"
-        runpy.run_module(module, run_name="__main__", alter_sys=True)
+        runpy.run_module(f"tactslip_torch.commands.{name}", run_name="__main__", alter_sys=True)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from tactslip_torch.commands.configuration import Composed, checked, conf_dir, h
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "troubleshooting.md"
 MARKERS = "<!-- mistakes: written by tests/test_command_line.py -->", "<!-- end of mistakes -->"
-FILES = {name: "data_tool" if name == "data" else name.replace("-", "_") for name in COMMANDS}
+FILES = {name: name.replace("-", "_") for name in COMMANDS}
 CONFIGURED = [name for name in COMMANDS if (conf_dir() / f"{FILES[name]}.yaml").is_file()]
 
 MISTAKES = {

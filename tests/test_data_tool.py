@@ -17,7 +17,7 @@ from tactslip_torch.data.folder import guessed, write_template
 def run(action, root, *overrides):
     """What an action returns."""
     config = composed(
-        f"action={action}", f"root={root}", "num_workers=0", *overrides, name="data_tool"
+        f"action={action}", f"root={root}", "num_workers=0", *overrides, name="data"
     )
     return data_tool.ACTIONS[action](config)
 

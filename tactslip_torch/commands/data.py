@@ -247,7 +247,7 @@ def _act(config: DictConfig, _: Path) -> None:
         fail(f"{found} problems in {config.root}, listed above")
 
 
-main = entry_point("data_tool", _act)
+main = entry_point("data", _act)
 
 if __name__ == "__main__":
     main()

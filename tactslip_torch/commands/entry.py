@@ -33,8 +33,6 @@ from tactslip_torch.runtime import is_first_process, process_number, write_json
 log = logging.getLogger(__name__)
 
 NOTHING_SAVED = "no result is written (features made so far stay in the cache); start it again"
-COMMAND_OF = {"data_tool": "data"}
-"""Commands whose file in ``conf`` has another name."""
 
 EXIT_BAD_INPUT = 2
 BAD_INPUT = (
@@ -69,7 +67,7 @@ def entry_point(
         saved: what is there of a run that is stopped, and how to go on; given the configuration,
             the folder and the command line.
     """
-    command = COMMAND_OF.get(name, name).replace("_", "-")
+    command = name.replace("_", "-")
 
     def main() -> None:
         with stopping(), errors_in_one_line():
