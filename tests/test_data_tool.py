@@ -9,17 +9,15 @@ from PIL import Image
 from test_commands import composed
 from test_datasets import HAND, broken, manifest, ours, samples, table
 
-from tactslip_torch.commands import data as data_tool
+from tactslip_torch.commands import data
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.folder import guessed, write_template
 
 
 def run(action, root, *overrides):
     """What an action returns."""
-    config = composed(
-        f"action={action}", f"root={root}", "num_workers=0", *overrides, name="data"
-    )
-    return data_tool.ACTIONS[action](config)
+    config = composed(f"action={action}", f"root={root}", "num_workers=0", *overrides, name="data")
+    return data.ACTIONS[action](config)
 
 
 @pytest.fixture
