@@ -255,13 +255,15 @@ def recounted(detector, settings, scene):
     """False alarms and quiet hours of what calibrates, one by one, by the rules of events."""
     alarms, hours, source = 0, 0.0, Streams()
     latency = LatencyParts(detector.look_ahead / RATE_HZ, 0.05)
-    for recording in stage().roles(detector)["calibrate"]:
+    roles = stage().roles(detector)
+    _, left_out, _ = LEARNED(source, roles["learn"], 0)
+    for recording in roles["calibrate"]:
         if recording.scene == scene:
             samples = source.load(recording).samples
             scores = score_stream(detector, samples, settings.hop_samples)
             decider = Decider(settings, RATE_HZ, 100, detector.look_ahead)
             bins = decider.decide(scores.score, scores.is_valid)
-            made = decider.join(bins, settings.onset.score_recording(samples))
+            made = decider.join(bins, left_out[recording.material].score_recording(samples))
             none = torch.empty(0)
             stream = Stream(recording, source.timeline(recording), none, none, none, none)
             found = recording_events(watched(stream, made), EventRules(), latency)

@@ -34,7 +34,7 @@ def onset_run(tmp_path_factory):
     """A folder as ``+exp=onset`` leaves it, of a small detector with a quickly fitted alarm."""
     detector, folder = alarming_detector(), tmp_path_factory.mktemp("run")
     source = SimulatedRecordings(cycles=1, materials=["M1", "M6"], channels=HAND.to_rows())
-    onset, _ = OnsetTraining()(source, source.ids, 0)
+    onset, _, _ = OnsetTraining()(source, source.ids, 0)
     bins = AlarmSettings.of(detector)
     score = onset.score_recording(source.load(source.ids[0]).samples)
     joint = replace(bins, onset=replace(onset, threshold=float(score.quantile(0.995))))

@@ -154,7 +154,7 @@ def score_streams(
     recordings: Sequence[RecordingId],
     scorers: Mapping[str, Scorer],
     hops: Mapping[str, int],
-    onset: OnsetClassifier | None = None,
+    onset: OnsetClassifier | Mapping[str, OnsetClassifier] | None = None,
     num_workers: int | None = None,
 ) -> dict[str, list[Stream]]:
     """The recordings, in order, as each detector scores them; made by workers.
@@ -164,7 +164,7 @@ def score_streams(
         recordings: which of them.
         scorers: detectors by name.
         hops: distance of two decisions of each, in samples.
-        onset: scores hops beside the detector ``OURS``.
+        onset: scores hops beside the detector ``OURS``; one, or one for each material.
         num_workers: processes; ``None`` for as many as there are processors, at most 8.
 
     Raises:
@@ -184,10 +184,12 @@ def _scored(
     source: RecordingSource,
     scorers: Mapping[str, Scorer],
     hops: Mapping[str, int],
-    onset: OnsetClassifier | None,
+    onset: OnsetClassifier | Mapping[str, OnsetClassifier] | None,
     recording: RecordingId,
 ) -> dict[str, list[NDArray[Any]]]:
     samples = source.load(recording).samples
+    if isinstance(onset, Mapping):
+        onset = onset[recording.material]
     streams = dict[str, list[NDArray[Any]]]()
     for name, scorer in scorers.items():
         found = score_stream(scorer, samples, hops[name])
@@ -389,8 +391,9 @@ class CalibratedAlarm:
 
     A classifier of bins raises an alarm where its rule reaches a threshold at which it uses at most
     half of every budget; the onset classifier gets the lowest threshold at which both together keep
-    all of them. Baselines are thresholds on a score, at the onset classifier's hop and under the
-    same budgets.
+    all of them. Recordings that calibrate are scored by an onset classifier that was fitted without
+    their material, so that budgets hold for new materials. Baselines are thresholds on a score, at
+    the onset classifier's hop and under the same budgets.
 
     Args:
         streams: recordings, those trained on included or not; of the paper's scene, without
@@ -557,14 +560,18 @@ class CalibratedAlarm:
         """
         roles = self.roles(detector)
         learn = roles.pop("learn")
-        onset, chosen = self.classifier(self.streams, learn, num_workers)
+        onset, left_out, chosen = self.classifier(self.streams, learn, num_workers)
         recordings = [recording for own in roles.values() for recording in own]
         scorers: dict[str, Scorer] = {OURS: detector, **(baselines or {})}
         hop = onset.evidence.hop_samples
         hops = {name: getattr(own, "hop_samples", hop) for name, own in scorers.items()}
         hops[OURS] = self.hop_samples
-        scored = score_streams(self.streams, recordings, scorers, hops, onset, num_workers)
         rate, num_calibrate = self.streams.sample_rate_hz, len(roles["calibrate"])
+        others = {one.material: left_out.get(one.material, onset) for one in roles["calibrate"]}
+        score = partial(score_streams, self.streams, scorers=scorers, hops=hops)
+        scored = score(roles["calibrate"], onset=others, num_workers=num_workers)
+        rest = score(recordings[num_calibrate:], onset=onset, num_workers=num_workers)
+        scored = {name: own + rest[name] for name, own in scored.items()}
         timings = {
             name: Timing(rate, hops[name], scorer.pool.bin_samples, scorer.look_ahead)
             for name, scorer in scorers.items()

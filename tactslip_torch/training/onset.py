@@ -65,8 +65,8 @@ class OnsetTraining:
         source: RecordingSource,
         recordings: Sequence[RecordingId],
         num_workers: int | None = None,
-    ) -> tuple[OnsetClassifier, dict[str, int]]:
-        """Fit on some recordings; the threshold is left at infinity.
+    ) -> tuple[OnsetClassifier, dict[str, OnsetClassifier], dict[str, int]]:
+        """Fit on some recordings; thresholds are left at infinity.
 
         Args:
             source: of the recordings.
@@ -74,7 +74,8 @@ class OnsetTraining:
             num_workers: processes.
 
         Returns:
-            The classifier, and how many hops of each kind it was fitted on.
+            The classifier; for each material, one that was fitted without it, on the hops that were
+            chosen with it; and how many hops of each kind the first was fitted on.
 
         Raises:
             ValueError: if there is no recording, or no slip begins in them.
@@ -101,18 +102,30 @@ class OnsetTraining:
             read = partial(_hops, source, evidence, first)
             made = list(in_processes(read, own, "onsets, evidence", "recording", num_workers))
             columns = torch.from_numpy(np.concatenate([found for found, _ in made]))
-            kinds = [kind for _, of_recording in made for kind in of_recording]
-            is_onset = np.array([kind.startswith(_ONSET) for kind in kinds], bool)
-            if not is_onset.any():
-                raise ValueError("no slip begins in the recordings that onsets are learned from")
-            scaler = FeatureScaler.fit(columns, tail=_TAIL)
-            weights = _weights(kinds, is_onset)
-            bins = TrainingBins(scaler(columns), torch.from_numpy(is_onset), weights)
-            head = fit_machine(bins, self.penalty / len(kinds), _KERNEL)
-            assert isinstance(head, QuadraticForm)
-            first = OnsetClassifier(evidence, scaler, head, float("inf"))
+            kinds = np.array([kind for _, of_recording in made for kind in of_recording])
+            first = self._fit(evidence, columns, kinds)
         assert first is not None
-        return first, {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)}
+        of = np.repeat([one.material for one in own], [len(found) for found, _ in made])
+        materials = np.unique(of)
+        left_out = {
+            str(material): self._fit(evidence, columns[of != material], kinds[of != material])
+            for material in (materials if len(materials) > 1 else ())
+        }
+        names, counts = np.unique(kinds, return_counts=True)
+        return first, left_out, dict(zip(names.tolist(), counts.tolist(), strict=True))
+
+    def _fit(
+        self, evidence: OnsetEvidence, columns: Tensor, kinds: NDArray[np.str_]
+    ) -> OnsetClassifier:
+        is_onset = np.char.startswith(kinds, _ONSET)
+        if not is_onset.any():
+            raise ValueError("no slip begins in the recordings that onsets are learned from")
+        scaler = FeatureScaler.fit(columns, tail=_TAIL)
+        weights = _weights(kinds, is_onset)
+        bins = TrainingBins(scaler(columns), torch.from_numpy(is_onset), weights)
+        head = fit_machine(bins, self.penalty / len(kinds), _KERNEL)
+        assert isinstance(head, QuadraticForm)
+        return OnsetClassifier(evidence, scaler, head, float("inf"))
 
 
 def _some(recordings: Sequence[RecordingId], number: int) -> Sequence[RecordingId]:
@@ -202,7 +215,7 @@ def kinds_of(
     }
 
 
-def _weights(kinds: Sequence[str], is_onset: NDArray[np.bool_]) -> Tensor:
+def _weights(kinds: NDArray[np.str_], is_onset: NDArray[np.bool_]) -> Tensor:
     """Of each hop: kinds alike, onsets and the others alike; 1 in the mean."""
     _, index = np.unique(kinds, return_inverse=True)
     each = 1.0 / np.bincount(index)[index]
