@@ -72,10 +72,11 @@ QUICK_TRAINING = (
     "split.seen=[M1,M6]",
     "split.unseen=[iron]",
     "split.train_fraction=0.5",
-    *(f"extra_scenes.{scene}.cycles=2" for scene in ("held", "knocked", *_SCENES)),
-    *(f"extra_scenes.{scene}.tail_s=2" for scene in ("held", "knocked", *_SCENES[1:])),
-    "recipe.num_features=20",
+    *(f"extra_scenes.{scene}.cycles=2" for scene in ("knocked", "pulled", *_SCENES)),
+    *(f"~extra_scenes.{scene}" for scene in ("paper_loud", "motor_off")),
+    *(f"~recipe.scene_weights.{scene}" for scene in ("paper_loud", "motor_off")),
     "recipe.penalties=[0.003]",
+    "recipe.sample_bins=20",
 )
 QUICK_STREAMS = (
     "onset.streams.cycles=6",
@@ -116,8 +117,8 @@ class Sizes:
     overrides: tuple[str, ...] = (
         "baselines=false",
         "export=false",
-        "onset.check_slip_free_hours=4",
-        "onset.check_hours=0.4",
+        "onset.check_slip_free_hours=2",
+        "onset.check_hours=0.2",
     )
     pulses_v: tuple[float, ...] = PULSES_V
     knocks_mv: tuple[float, ...] = KNOCKS_MV
