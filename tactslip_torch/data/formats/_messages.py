@@ -245,41 +245,43 @@ def _clock(part: Any) -> int | None:
 # A topic as samples ------------------------------------------------------------------------------
 
 
-class _TopicSamples:
-    """The samples of a topic in the order of the file, and when they were taken.
+class TopicColumns:
+    """Which numbers of the messages on a topic are samples: what its first message shows.
 
     Args:
         first: message; all others must hold the same channels.
         types: that its messages are of; ``None`` for JSON.
-        how: what a person says of the file.
-        stack: closes what is kept.
+        how: what a person says of the topic.
+
+    Attributes:
+        names: of the channels, if messages have names.
+        is_timed: whether one of the numbers is the time, since nothing else is.
+        time_name: of that number.
+        is_small: whether float32 holds all numbers.
 
     Raises:
         Refused: if the messages hold no samples.
     """
 
-    def __init__(self, first: Message, types: Types | None, how: Reading, stack: ExitStack) -> None:
-        self.topic, self._types, self._how, self._stack = first.topic.name, types, how, stack
+    def __init__(self, first: Message, types: Types | None, how: Reading) -> None:
+        self.topic, self._types = first.topic.name, types
         self._kind = types.known_name(first.topic) if types is not None else ""
         self._is_array = _ARRAY.fullmatch(self._kind) is not None
-        self.checksum = 0
         rows, names, stamp = self._decoded(first.content)
-        num_columns, self._is_stamped = rows.shape[1], stamp is not None
-        self._alike = names, num_columns, self._is_stamped  # in all messages
+        num_columns, is_stamped = rows.shape[1], stamp is not None
+        self._alike = names, num_columns, is_stamped  # in all messages
         if not 0 < num_columns <= _MOST_NUMBERS:
             what = f"{num_columns}" if num_columns <= _MOST_NUMBERS else f"over {_MOST_NUMBERS}"
             raise Refused(f"{what} numbers an instant, 1 to {_MOST_NUMBERS} are read")
         if names is not None and len(set(names)) < num_columns:
             raise Refused("two numbers of one name")
-        if how.time == _LOG_TIME or (how.time == "auto" and (self._is_stamped or names is None)):
+        if how.time == _LOG_TIME or (how.time == "auto" and (is_stamped or names is None)):
             how = replace(how, time=None)
         self._time, self._columns = chosen_columns(names, num_columns, how)
         self.names = None if names is None else tuple(names[place] for place in self._columns)
-        self._time_name = names[self._time] if names and self._time is not None else None
-        is_small = self._is_array and np.can_cast(rows.dtype, np.float32)
-        self._spool = Spool(len(self._columns), "f4" if is_small else "f8", stack)
-        self._logged, self._stamps, self._counts = (array("q") for _ in range(3))
-        self._named: list[Any] = []  # the times that ``how`` names
+        self.time_name = names[self._time] if names and self._time is not None else None
+        self.is_timed = self._time is not None
+        self.is_small = self._is_array and np.can_cast(rows.dtype, np.float32)
 
     def _decoded(self, message: bytes) -> tuple[NDArray[Any], tuple[str, ...] | None, int | None]:
         """Rows ``[n, C]``, the names of their columns and the stamp, where there are any."""
@@ -301,26 +303,54 @@ class _TopicSamples:
                 names.append(name)
         return np.array([values], object), tuple(names), _stamp(content)
 
+    def rows(self, content: bytes) -> tuple[NDArray[Any], int | None, Any]:
+        """The samples ``[n, C]`` of a message, its stamp and the time that is one of its numbers.
+
+        Raises:
+            Refused: if it holds other channels than the first.
+        """
+        rows, names, stamp = self._decoded(content)
+        if (names, rows.shape[1], stamp is not None) != self._alike:
+            raise Refused(
+                f"holds a message on {self.topic} with other channels than the first: "
+                f"{rows.shape[1]} numbers, or other names"
+            )
+        named = None if self._time is None else rows[0, self._time]
+        return rows[:, self._columns], stamp, named
+
+
+class _TopicSamples:
+    """The samples of a topic in the order of the file, and when they were taken.
+
+    Args:
+        first: as of ``TopicColumns``, whose errors it raises; like ``types`` and ``how``.
+        stack: closes what is kept.
+    """
+
+    def __init__(self, first: Message, types: Types | None, how: Reading, stack: ExitStack) -> None:
+        self._of, self._how, self._stack = TopicColumns(first, types, how), how, stack
+        self.topic, self.names = self._of.topic, self._of.names
+        self.checksum = 0
+        num_columns = self._of.rows(first.content)[0].shape[1]
+        self._spool = Spool(num_columns, "f4" if self._of.is_small else "f8", stack)
+        self._logged, self._stamps, self._counts = (array("q") for _ in range(3))
+        self._named: list[Any] = []  # the times that ``how`` names
+
     def add(self, message: Message) -> None:
         """Keep a message.
 
         Raises:
             Refused: if it is damaged or holds other channels than the first.
         """
-        rows, names, stamp = self._decoded(message.content)
-        if (names, rows.shape[1], stamp is not None) != self._alike:
-            raise Refused(
-                f"holds a message on {self.topic} with other channels than the first: "
-                f"{rows.shape[1]} numbers, or other names"
-            )
-        self._spool.add(rows[:, self._columns])
+        rows, stamp, named = self._of.rows(message.content)
+        self._spool.add(rows)
         self.checksum = zlib.crc32(message.content, self.checksum)
         self._logged.append(message.log_time)
         self._counts.append(len(rows))
         if stamp is not None:
             self._stamps.append(stamp)
-        if self._time is not None:
-            self._named.append(rows[0, self._time])
+        if self._of.is_timed:
+            self._named.append(named)
 
     def rows(self) -> NDArray[Any]:
         """All samples ``[T, C]`` in the order of the file."""
@@ -366,8 +396,8 @@ class _TopicSamples:
 
     def _message_times(self) -> NDArray[np.int64]:
         """In nanoseconds."""
-        if self._time is not None:
-            unit = unit_of_time(self._time_name, self._how)
+        if self._of.is_timed:
+            unit = unit_of_time(self._of.time_name, self._how)
             return _nanoseconds(np.array(self._named), SECONDS[unit])
         is_stamped = self._how.time == "auto" and any(self._stamps)
         return np.array(self._stamps if is_stamped else self._logged, np.int64)
