@@ -2,14 +2,19 @@
 
 import json
 import os
+import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+import torch
 from hosts import (
     EXPORT,
+    RATE,
     Ran,
     alarming_detector,
     altered,
@@ -24,7 +29,11 @@ from hosts import (
     truth,
 )
 
+from tactslip_torch import sample_recording
+from tactslip_torch.data.formats import named_format
+from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.decisions import KEY
+from tactslip_torch.pretrained import RECORDING
 
 WEB = EXPORT / "web"
 BROWSER = Path(os.environ.get("CHROMIUM", "/usr/bin/chromium"))
@@ -40,6 +49,17 @@ def broken_stream() -> np.ndarray:
     broken = slipping_stream()[:2000].copy()
     broken[700:740] = np.nan
     return broken
+
+
+def recordings_in(folder: Path) -> dict[str, Path]:
+    """The stream in files as the package writes them, channels in another order."""
+    hand = HandLayout(alarming_detector().pool.hand.channels[::-1])
+    samples = torch.from_numpy(slipping_stream().T.copy()).flip(0)
+    recording = replace(sample_recording(), samples=samples)
+    paths = {ending: folder / f"own.{ending}" for ending in ("npz", "csv")}
+    for path in paths.values():
+        named_format(path.suffix[1:]).save(path, recording, hand, {})
+    return paths
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +99,9 @@ def seen(script, model, recording, tmp_path_factory):
     (folder / "notes.npy").write_text("volts\n")
     seven = saved(folder / "seven.npy", slipping_stream()[:600, :7].copy())
     broken = saved(folder / "broken.npy", broken_stream())
+    good = recordings_in(folder)
+    cut = folder / "cut.npz"
+    cut.write_bytes(good["npz"].read_bytes()[:50_000])
     changed = []
     for name, change in {
         "altered": altered,
@@ -90,7 +113,9 @@ def seen(script, model, recording, tmp_path_factory):
         changed.append(copied(model, tmp_path_factory.mktemp(name)))
         change(changed[-1])
     files = ["--simulated", "--model", model, "--recording", recording]
-    dropped = [f"--drop={path}" for path in (folder / "notes.npy", seven, broken)]
+    dropped = [
+        f"--drop={path}" for path in (folder / "notes.npy", seven, cut, *good.values(), broken)
+    ]
     done = script("check.mjs", *files, *dropped, *[f"--altered={path}" for path in changed])
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -108,6 +133,7 @@ def test_the_page_decides_what_the_package_decides_and_sends_nothing_out(seen):
     assert_same(ran(seen["lines"]), truth(slipping_stream()))
     assert seen["errors"] == []
     assert "recording" in seen["simulated"]
+    assert [fault for fault in seen["accessibility"] if fault[1] in ("serious", "critical")] == []
     assert any(url.endswith("/model") for url in seen["requests"])
     assert {urlsplit(url).hostname for url in seen["requests"]} == {"127.0.0.1"}
 
@@ -126,12 +152,28 @@ def test_an_onset_classifier_is_drawn_and_named(script, recording, tmp_path_fact
 
 @pytest.mark.onnx
 @pytest.mark.slow
-def test_it_is_used_by_keyboard_alone(seen):
+def test_it_plays_at_load_and_is_used_by_keyboard_alone(seen):
     assert seen["keyboard"]["playing"] == "Pause"
     assert seen["keyboard"]["paused"] == seen["keyboard"]["after"] > 0
     controls = {each["id"]: each for each in seen["tabbed"]}
-    assert set(controls) == {"play", "restart", "speed", "rate", "file", "threshold", "reset"}
+    alarms = [row for row in truth(slipping_stream()) if row["alarm"]]
+    assert {"play", "restart", "speed", "file", "seek", "threshold", "reset"} < set(controls)
+    assert len(controls) == 7 + len(alarms)
     assert all(each["label"] and each["isRinged"] for each in controls.values())
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_moments_are_sought_by_keys_mouse_and_the_list_of_alarms(seen):
+    sought, seconds = seen["seeking"], len(slipping_stream()) / RATE
+    alarms = [row["time_s"] for row in truth(slipping_stream()) if row["alarm"]]
+    assert sought["alarms"] == [f"{alarm_s:.3f} s" for alarm_s in reversed(alarms)]
+    expected = {"end": seconds, "Home": 0, "ArrowRight": 0.1, "PageUp": 1.1, "ArrowLeft": 1.0}
+    expected["alarm"] = min(alarms[0] + 1.0, seconds)
+    for name, at_s in expected.items():
+        assert sought[name] == pytest.approx(at_s, abs=2 / RATE), name
+    assert sought["middle"] == pytest.approx(seconds / 2, rel=0.02)
+    assert f"{sought['alarm']:.1f} of {seconds:.1f} s" in sought["value"]
 
 
 @pytest.mark.onnx
@@ -153,7 +195,8 @@ def test_the_slider_judges_again_by_another_threshold(seen):
 @pytest.mark.onnx
 @pytest.mark.slow
 def test_a_file_that_is_no_recording_is_one_line_and_the_page_goes_on(seen):
-    for name, words in {"notes.npy": ("no .npy",), "seven.npy": ("7", "24")}.items():
+    wrong = {"notes.npy": ("no .npy",), "seven.npy": ("7", "24"), "cut.npz": ("damaged",)}
+    for name, words in wrong.items():
         told = seen[name]
         assert name in told["said"]
         assert all(word in told["said"] for word in words)
@@ -175,11 +218,87 @@ def test_missing_samples_are_flagged_and_the_page_goes_on(seen):
 
 @pytest.mark.onnx
 @pytest.mark.slow
-def test_a_recording_of_another_rate_is_not_played(seen):
-    assert all(rate in seen["rate"]["said"] for rate in ("1000", "2000"))
-    assert seen["rate"]["label"] != "Pause"
-    assert seen["rate"]["saidAfter"] == ""
-    assert seen["rate"]["lines"] == seen["broken.npy"]["lines"]  # what was dropped last
+@pytest.mark.parametrize("ending", ["npz", "csv"])
+def test_files_of_the_package_are_played_with_what_they_say_of_themselves(seen, ending):
+    told = seen[f"own.{ending}"]
+    assert told["said"] == ""
+    assert "recording" in told["simulated"]
+    assert_same(ran(told["lines"]), truth(slipping_stream()))
+
+
+READ = """
+import { readFile } from "node:fs/promises";
+import { readRecording } from "./files.mjs";
+const { buffer } = new Uint8Array(await readFile(process.argv[1]));
+const read = readRecording(buffer, process.argv[1].split("/").at(-1), JSON.parse(process.argv[2]));
+const { volts, ...more } = await read.catch((error) => ({ volts: [], error: error.message }));
+console.log(JSON.stringify({ volts: Array.from(volts), ...more }));
+"""
+
+
+def read_by_the_page(path: Path, **facts: object) -> dict[str, Any]:
+    """What the page reads, of the packaged detector's hand; ``error`` where it refuses."""
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed: apt-get install nodejs npm")
+    names = list(alarming_detector().pool.hand.names)
+    wanted = json.dumps({"channels": names, "sample_rate_hz": RATE, "unit": "V"} | facts)
+    command = ["node", "--input-type=module", "-e", READ, str(path), wanted]
+    done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("ending", ["npz", "csv"])
+def test_the_page_reads_what_the_package_writes(tmp_path, ending):
+    told = read_by_the_page(recordings_in(tmp_path)[ending])
+    found = np.array(told["volts"], np.float32).reshape(-1, 24)
+    np.testing.assert_array_equal(found, slipping_stream())  # in the detector's order
+    assert (told["rate"], told["isSimulated"], told["onsetsS"]) == (
+        RATE,
+        True,
+        list(sample_recording().onsets_s),
+    )
+
+
+def test_the_page_reads_the_packed_sample_recording():
+    told = read_by_the_page(RECORDING)
+    found = np.array(told["volts"], np.float32).reshape(-1, 24)
+    np.testing.assert_array_equal(found, sample_recording().samples.T)
+
+
+def _flipped(path: Path) -> None:
+    altered(path)
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:200_000])
+
+
+def _with_a_word(path: Path) -> None:
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:5], lines[5].replace(",", ",volts", 1), *lines[6:]]))
+
+
+@pytest.mark.parametrize(
+    ("ending", "spoil", "facts", "words"),
+    [
+        ("npz", _flipped, {}, "damaged check sum"),
+        ("npz", _cut, {}, "damaged end is missing"),
+        ("csv", _cut, {}, "line cells 25"),
+        ("csv", _with_a_word, {}, "line 6 volts no number"),
+        ("csv", None, {"sample_rate_hz": 1000}, "2000 1000 resample"),
+        ("npz", None, {"channels": ["a", "b"]}, "24 channels wants 2 a to b"),
+        ("npz", None, {"channels": [f"e{i}" for i in range(24)]}, "no channel e0 PVDF10"),
+        ("npz", None, {"unit": "N"}, "in V wants N"),
+    ],
+)
+def test_a_file_that_is_not_to_be_played_is_one_line(tmp_path, ending, spoil, facts, words):
+    path = recordings_in(tmp_path)[ending]
+    if spoil:
+        spoil(path)
+    said = read_by_the_page(path, **facts)["error"]
+    assert path.name in said
+    assert [word for word in words.split() if word not in said] == []
+    assert len(said.splitlines()) == 1
 
 
 @pytest.mark.onnx
@@ -196,7 +315,7 @@ def test_a_model_that_is_not_what_it_should_be_is_one_line(seen):
 
 
 SCALE = """
-import { thresholdScale } from "./threshold.mjs";
+import { thresholdScale } from "./alarm.mjs";
 const scale = thresholdScale(JSON.parse(process.argv[1]));
 const shares = Array.from({ length: 101 }, (_, i) => i / 100);
 const own = scale.toThreshold(scale.own);

@@ -1,55 +1,84 @@
 #!/usr/bin/env node
 // What a user of the page would see, as one JSON object; the tests hold it against Python:
-// node check.mjs --model stream.onnx --recording recording.npy --drop other.npy --altered bad.onnx
+// node check.mjs --model stream.onnx --recording recording.npz --drop other.npy --altered bad.onnx
+// or, of a stream that is served: node check.mjs --live http://127.0.0.1:8000/?token=... --seconds 120
 
 import { readFile } from "node:fs/promises";
+import { createRequire } from "node:module";
 import { basename } from "node:path";
 
-import { decisionLines, playAll, ready, withPage } from "./browser.mjs";
+import { decisionLines, held, ready, toEnd, withPage } from "./shot.mjs";
 import { given, run, serve } from "./serve.mjs";
 
 const OPTIONS = {
   drop: { type: "string", multiple: true, default: [] },
   altered: { type: "string", multiple: true, default: [] },
+  live: { type: "string" },
+  seconds: { type: "string", default: "10" },
 };
+const AXE = createRequire(import.meta.url).resolve("axe-core/axe.min.js");
 
 const text = (page, id) => page.locator(`#${id}`).textContent();
 const count = async (page, id) => Number((await text(page, id)).replaceAll(",", ""));
-const alert = (page) => text(page, "alert");
-const position = (page) => page.evaluate(() => document.getElementById("progress").value);
-const shows = (page, id, wanted) =>
-  page.waitForFunction(([i, t]) => document.getElementById(i).textContent === t, [id, wanted]);
+const position = (page) => page.evaluate(() => document.getElementById("seek").valueAsNumber);
+const frames = (page) =>
+  page.evaluate(async () => {
+    for (let i = 0; i < 5; i += 1) await new Promise(requestAnimationFrame);
+  });
+const labelIs = (page, wanted) =>
+  page.waitForFunction((t) => document.getElementById("play-label").textContent === t, wanted);
 
 /** Everything that can be reached with the tabulator, in order, and whether it shows the focus. */
 async function tabbed(page) {
+  await page.locator("h1").click(); // from the top
   const seen = [];
   for (;;) {
     await page.keyboard.press("Tab");
     const at = await page.evaluate(() => {
       const { id, name, labels, nextElementSibling: next } = document.activeElement;
       const ring = (each) => each !== null && getComputedStyle(each).outlineStyle === "solid";
-      const label = labels?.[0]?.textContent ?? document.activeElement.textContent;
+      const own = document.activeElement.ariaLabel ?? document.activeElement.textContent;
+      const label = labels?.[0]?.textContent ?? own;
       const isRinged = ring(document.activeElement) || ring(next);
-      return { id: id || name, label: label.trim(), isRinged };
+      return { id: id || name || document.activeElement.dataset.timeS, label: label.trim(), isRinged };
     });
     if (!at.id || seen.some(({ id }) => id === at.id)) return seen;
     seen.push(at);
   }
 }
 
-/** Space plays, pauses and plays on. */
+/** It plays when it is loaded; space pauses and plays on. */
 async function keyboard(page) {
-  await page.locator("h1").click(); // the focus on nothing in particular
-  await page.keyboard.press("Space");
-  await page.waitForFunction(() => document.getElementById("progress").value > 0.01);
+  await page.waitForFunction(() => document.getElementById("seek").valueAsNumber > 0);
   const playing = await text(page, "play-label");
   await page.keyboard.press("Space");
-  await shows(page, "play-label", "Play");
+  await labelIs(page, "Play");
   const paused = await position(page);
-  await page.evaluate(async () => {
-    for (let i = 0; i < 5; i += 1) await new Promise(requestAnimationFrame);
-  });
+  await frames(page);
   return { playing, paused, after: await position(page) };
+}
+
+/** Moments that keys, the mouse and the list of alarms lead to, and how many pixels show slip. */
+async function seeking(page) {
+  const seek = page.locator("#seek");
+  await seek.press("End");
+  const moments = { end: await position(page) };
+  for (const key of ["Home", "ArrowRight", "PageUp", "ArrowLeft"]) {
+    await seek.press(key);
+    await frames(page);
+    moments[key] = await position(page);
+  }
+  const box = await seek.boundingBox();
+  await page.mouse.click(box.x + box.width / 2, box.y + box.height / 2);
+  await frames(page);
+  moments.middle = await position(page);
+  const before = await slipPixels(page);
+  const alarms = page.locator("#list button");
+  moments.alarms = await alarms.allTextContents();
+  await alarms.last().click();
+  await frames(page);
+  moments.alarm = await position(page);
+  return { ...moments, value: await seek.getAttribute("aria-valuetext"), before, after: await slipPixels(page) };
 }
 
 /** Pixels of the picture in the colour of slip. */
@@ -73,7 +102,8 @@ async function slider(page) {
   const threshold = page.locator("#threshold");
   const move = async (act) => {
     await act();
-    await page.waitForFunction(() => document.body.ariaBusy === "false"); // all is scored again
+    await page.waitForFunction(() => !document.body.dataset.busy); // all is scored again
+    await frames(page);
     const step = Number(await threshold.inputValue());
     return { step, pixels: await slipPixels(page), lines: await decisionLines(page) };
   };
@@ -85,7 +115,7 @@ async function slider(page) {
   return { least, most, stepped, own };
 }
 
-/** What the page says of a dropped file, and whether it still plays, which recording. */
+/** What the page says of a dropped file, and what it plays then. */
 async function dropped(page, path) {
   const content = (await readFile(path)).toString("base64");
   await page.evaluate(
@@ -103,22 +133,30 @@ async function dropped(page, path) {
       document.getElementById("position").textContent.startsWith(name),
     basename(path),
   );
-  const said = await alert(page);
-  await playAll(page);
-  return { said, lines: await decisionLines(page), invalid: await count(page, "invalid") };
+  const said = await text(page, "alert");
+  await toEnd(page);
+  return {
+    said,
+    position: await text(page, "position"),
+    simulated: await text(page, "simulated"),
+    lines: await decisionLines(page),
+    invalid: await count(page, "invalid"),
+  };
 }
 
-/** A recording of another rate is not played, and is when the rate is right again. */
-async function wrongRate(page) {
-  const rate = page.locator("#rate");
-  const own = await rate.inputValue();
-  await rate.fill("1000");
-  await page.locator("#play").click();
-  const [said, label] = [await alert(page), await text(page, "play-label")];
-  await rate.fill(own);
-  const saidAfter = await alert(page);
-  await playAll(page);
-  return { said, label, saidAfter, lines: await decisionLines(page) };
+/** Faults that axe-core finds, light and dark: how bad, which, where. */
+async function accessibility(page) {
+  const faults = [];
+  const axe = await readFile(AXE, "utf8");
+  for (const colorScheme of ["dark", "light"]) {
+    await page.emulateMedia({ colorScheme });
+    await frames(page);
+    const { violations } = await page.evaluate(`${axe}; axe.run()`);
+    for (const { impact, id, nodes } of violations) {
+      faults.push([colorScheme, impact, id, ...nodes.map(({ target }) => target.join(" "))]);
+    }
+  }
+  return faults;
 }
 
 /** What the page says of models that are not what they should be. */
@@ -127,35 +165,65 @@ async function altered(page, servers) {
   for (const { address } of servers) {
     await page.goto(address);
     await page.waitForFunction(() => !document.getElementById("alert").hidden);
-    said.push(await alert(page));
+    said.push(await text(page, "alert"));
   }
   return said;
 }
 
+/** A served stream for so many seconds: what the page holds then, and how busy its thread was. */
+async function live(page, address, seconds) {
+  const client = await page.context().newCDPSession(page);
+  const metrics = async () => {
+    const { metrics: all } = await client.send("Performance.getMetrics");
+    return Object.fromEntries(all.map(({ name, value }) => [name, value]));
+  };
+  await client.send("Performance.enable");
+  await page.goto(address);
+  await ready(page);
+  const start = await metrics();
+  await page.waitForTimeout(1000 * seconds);
+  const end = await metrics();
+  const busy = (end.TaskDuration - start.TaskDuration) / (end.Timestamp - start.Timestamp);
+  const heap = [start.JSHeapUsedSize, end.JSHeapUsedSize];
+  const { decisions, ...more } = await held(page);
+  const told = ["stream-state", "received", "dropped", "dropped_to_page", "position", "simulated"];
+  const shown = Object.fromEntries(await Promise.all(told.map(async (id) => [id, await text(page, id)])));
+  return { busy, heap, ...more, shown, slip: await slipPixels(page), decisions };
+}
+
 await run(async () => {
-  const asked = given(process.argv.slice(2), OPTIONS);
-  const servers = [await serve(asked)];
+  const words = process.argv.slice(2);
+  const isLive = words.some((word) => word.startsWith("--live"));
+  const asked = given(isLive ? ["--model=none", ...words] : words, OPTIONS);
+  const servers = asked.live ? [] : [await serve(asked)];
   for (const model of asked.altered) servers.push(await serve({ ...asked, model }));
   const seen = { requests: [], errors: [] };
   try {
     await withPage({}, async (page) => {
       page.on("request", (request) => seen.requests.push(request.url()));
       page.on("pageerror", (error) => seen.errors.push(error.message));
-      await page.goto(servers[0].address);
-      await ready(page);
       const step = async (name, work) => {
         seen[name] = await work(page).catch((error) => {
           throw new Error(`${name}: ${error.message}`);
         });
       };
+      if (asked.live) {
+        await step("live", () => live(page, asked.live, Number(asked.seconds)));
+        await step("accessibility", accessibility);
+        return;
+      }
+      await page.goto(servers[0].address);
+      await ready(page);
       await step("simulated", () => text(page, "simulated"));
-      await step("tabbed", tabbed);
       await step("keyboard", keyboard);
-      await step("played", playAll);
+      await step("played", toEnd);
       await step("lines", decisionLines);
+      await step("tabbed", tabbed);
+      await step("accessibility", accessibility);
+      await step("seeking", seeking);
+      await toEnd(page);
       await step("slider", slider);
       for (const path of asked.drop) await step(basename(path), () => dropped(page, path));
-      await step("rate", wrongRate);
       await step("altered", () => altered(page, servers.slice(1)));
     });
   } finally {

@@ -1,59 +1,96 @@
-// What the stream has decided so far, and how long its pushes took.
+// Samples and decisions, in rings: a stream without an end needs no more memory than its last minutes.
 
-const PUSHES = 512; // of which latencies are remembered
+/** Samples row by row, from index `first` to before `end`; row i begins at `i % capacity * width`. */
+export class Samples {
+  first = 0;
+  end = 0;
+  numMissing = 0; // rows that never came between others
 
-/** Decisions of one recording, in typed arrays that are as long as it can make them. */
-export class History {
   /**
-   * @param {number} capacity most decisions there can be
-   * @param {object} facts of the sidecar
+   * @param {number} width channels of a row
+   * @param {number} capacity rows that are kept
+   * @param {Float32Array|Float64Array} values of a recording, all of it; else it begins empty
    */
-  constructor(capacity, facts = {}) {
-    this.hasOnset = facts.onset_hop_samples !== undefined;
-    const first = Math.max(facts.first_samples, facts.frame_samples);
-    this.firstBinS = first / facts.sample_rate_hz; // nothing is known before
-    const numbers = () => new Float64Array(capacity);
-    this.columns = {
-      time_s: numbers(),
-      onset_s: numbers(),
-      score: numbers(),
-      probability: numbers(),
-      statistic: numbers(),
-      ...(this.hasOnset && { onset_score: numbers() }),
-    };
-    this.flags = new Uint8Array(capacity); // 1 valid, 2 alarm, 4 on, 8 raised by the onset score
-    this.clear();
+  constructor(width, capacity, values = null) {
+    this.width = width;
+    this.capacity = capacity;
+    this.values = values ?? new Float32Array(width * capacity);
+    if (values) this.end = capacity;
   }
 
-  /** Forget all; `take` is another one from now on. */
-  clear() {
-    this.take = {};
-    this.count = 0;
-    this.numInvalid = 0;
-    this.alarms = []; // which decisions raised one
+  /** Take rows that begin at an index; what is missing before them is NaN. */
+  add(index, rows) {
+    const { width, capacity, values } = this;
+    if (this.end === 0) this.first = this.end = index;
+    this.numMissing += index - this.end;
+    for (let i = Math.max(this.end, index - capacity); i < index; i += 1) {
+      values.fill(NaN, (i % capacity) * width, ((i % capacity) + 1) * width);
+    }
+    const num = rows.length / width;
+    for (let done = 0; done < num;) {
+      const place = (index + done) % capacity;
+      const some = Math.min(num - done, capacity - place);
+      values.set(rows.subarray(done * width, (done + some) * width), place * width);
+      done += some;
+    }
+    this.end = index + num;
+    this.first = Math.max(this.first, this.end - capacity);
+  }
+}
+
+/** Decisions from index `first` to before `count`. */
+export class History {
+  first = 0;
+  count = 0;
+  numAlarms = 0;
+  numInvalid = 0;
+  alarms = []; // which of the decisions that are kept raised one
+
+  /**
+   * @param {number} capacity decisions that are kept
+   * @param {object} facts of the detector
+   */
+  constructor(capacity, facts) {
+    this.capacity = capacity;
+    this.hasOnset = facts.onset_hop_samples !== undefined;
+    const first = Math.max(facts.first_samples ?? 0, facts.frame_samples ?? 0);
+    this.firstBinS = first / facts.sample_rate_hz; // nothing is known before
+    const names = ["time_s", "onset_s", "score", "probability", "statistic"];
+    if (this.hasOnset) names.push("onset_score");
+    this.columns = Object.fromEntries(names.map((name) => [name, new Float64Array(capacity)]));
+    this.flags = new Uint8Array(capacity); // 1 valid, 2 alarm, 4 on, 8 raised by the onset score
   }
 
   /** @param {object[]} decisions as `StreamGraph.push` gives them */
   add(decisions) {
     for (const decision of decisions) {
       const i = this.count;
-      for (const name in this.columns) this.columns[name][i] = decision[name];
-      this.flags[i] = decision.valid + 2 * decision.alarm + 4 * decision.on;
-      if (decision.raised_by === "onset") this.flags[i] += 8;
+      const place = i % this.capacity;
+      for (const name in this.columns) this.columns[name][place] = decision[name] ?? NaN;
+      this.flags[place] = decision.valid + 2 * decision.alarm + 4 * decision.on;
+      if (decision.raised_by === "onset") this.flags[place] += 8;
       if (this.isDoubtful(i)) this.numInvalid += 1;
-      if (decision.alarm) this.alarms.push(i);
       this.count += 1;
+      this.first = Math.max(0, this.count - this.capacity);
+      if (!decision.alarm) continue;
+      this.numAlarms += 1;
+      this.alarms.push(i);
     }
+    while (this.alarms[0] < this.first) this.alarms.shift();
   }
 
-  /** The last decision made by then; -1 before the first. */
+  /** A number of a decision: time_s, onset_s, score, probability, statistic or onset_score. */
+  get(name, i) {
+    return this.columns[name][i % this.capacity];
+  }
+
+  /** The last decision made by then; less than `first` if there is none. */
   before(timeS) {
-    const times = this.columns.time_s;
-    let low = 0;
+    let low = this.first;
     let high = this.count;
     while (low < high) {
       const middle = (low + high) >> 1;
-      if (times[middle] <= timeS) low = middle + 1;
+      if (this.get("time_s", middle) <= timeS) low = middle + 1;
       else high = middle;
     }
     return low - 1;
@@ -61,43 +98,23 @@ export class History {
 
   /** Whether it speaks of a bin that is not valid. */
   isDoubtful(i) {
-    return (this.flags[i] & 1) === 0 && !(this.columns.time_s[i] < this.firstBinS);
+    return !this.#has(i, 1) && !(this.get("time_s", i) < this.firstBinS);
   }
 
   isOn(i) {
-    return (this.flags[i] & 4) !== 0;
+    return this.#has(i, 4);
   }
 
-  /** A decision as `StreamGraph.push` gave it. */
+  /** A decision as `add` took it. */
   decision(i) {
-    const has = (flag) => (this.flags[i] & flag) !== 0;
-    const decision = { valid: has(1), alarm: has(2), on: has(4) };
-    for (const name in this.columns) decision[name] = this.columns[name][i];
+    const decision = { valid: this.#has(i, 1), alarm: this.#has(i, 2), on: this.isOn(i) };
+    for (const name in this.columns) decision[name] = this.get(name, i);
     if (!this.hasOnset) return decision;
-    return { ...decision, raised_by: has(2) ? (has(8) ? "onset" : "status") : null };
-  }
-}
-
-/** Milliseconds of the last pushes. */
-export class Latencies {
-  #ring = new Float64Array(PUSHES);
-  #count = 0;
-
-  add(ms) {
-    this.#ring[this.#count % PUSHES] = ms;
-    this.#count += 1;
+    const by = this.#has(i, 8) ? "onset" : "status";
+    return { ...decision, raised_by: decision.alarm ? by : null };
   }
 
-  clear() {
-    this.#count = 0;
-  }
-
-  /** Last, median and 99th percentile; null before the first. */
-  summary() {
-    const held = Math.min(this.#count, PUSHES);
-    if (held === 0) return null;
-    const sorted = this.#ring.slice(0, held).sort();
-    const at = (share) => sorted[Math.min(held - 1, Math.floor(share * held))];
-    return { last: this.#ring[(this.#count - 1) % PUSHES], median: at(0.5), p99: at(0.99), held };
+  #has(i, flag) {
+    return (this.flags[i % this.capacity] & flag) !== 0;
   }
 }

@@ -1,18 +1,15 @@
-// The page: loads the detector, then a frame at a time plays, draws and reports.
+// The page: a recording played through the detector in this browser, or a live stream of a server;
+// with every frame of the screen it draws and reports.
 
-import * as ort from "./ort/ort.mjs";
-
-import { StreamGraph } from "../node/graph.mjs";
-import { decisionLine, summaryLine } from "../node/lines.mjs";
-import { readRecording } from "./files.mjs";
-import { Player } from "./player.mjs";
-import { describe, describeSimulated, report } from "./readout.mjs";
+import { explain, thresholdScale } from "./alarm.mjs";
+import { Live } from "./live.mjs";
+import { Overview } from "./overview.mjs";
 import { Scope } from "./scope.mjs";
-import { thresholdScale } from "./threshold.mjs";
 
 const AGAIN_MS = 150; // the slider rests for so long before all is scored again
+const SHOWN_S = 1; // of what follows an alarm that is looked up
 const element = (id) => document.getElementById(id);
-let player = null;
+let source = null;
 
 /** One line about what went wrong, or none. */
 function say(problem) {
@@ -21,88 +18,90 @@ function say(problem) {
   element("alert").hidden = !line;
 }
 
-async function fetched(path, what) {
-  const response = await fetch(path);
-  if (!response.ok) throw new Error(`the server cannot read ${what}: is it still there?`);
-  return response;
+/** Only what changed is written. */
+function write(id, text) {
+  const target = element(id);
+  if (target.textContent !== text) target.textContent = text;
 }
 
-async function loadStream(given) {
-  ort.env.wasm.numThreads = 1;
-  ort.env.wasm.wasmPaths = { wasm: new URL("./ort/ort.wasm", import.meta.url).href };
-  const model = await fetched("/model", given.model);
-  const sidecar = await fetched("/model.json", `${given.model}.json`);
-  const bytes = new Uint8Array(await model.arrayBuffer());
-  const stream = await StreamGraph.load(ort, bytes, await sidecar.text(), given.model);
-  await stream.push(new Float32Array(stream.facts.channels.length * 400)); // warm
-  await stream.reset();
-  return stream;
-}
+// Loading -----------------------------------------------------------------------------------------
 
-/** Take a recording; the one before stays where this one is none. */
-async function take(content, name, isSimulated, scope) {
-  const { facts } = player.stream;
-  const recording = await readRecording(content, name, facts);
-  await player.load(recording);
-  scope.show(player.recording);
-  describeSimulated(facts, isSimulated || recording.isSimulated);
-  element("rate").value = facts.sample_rate_hz;
-  for (const id of ["play", "restart"]) element(id).disabled = false;
-  say(null);
-}
-
-async function takeGiven({ recording, simulated }, scope) {
-  const response = await fetched("/recording", recording);
-  await take(await response.arrayBuffer(), recording, simulated, scope);
-}
-
-function isRateRight() {
-  return Number(element("rate").value) === player.stream.facts.sample_rate_hz;
-}
-
-/** Play where the rate is the detector's, else say so. */
-function play() {
-  player.isPlaying = isRateRight();
-  const wanted = player.stream.facts.sample_rate_hz;
-  const problem =
-    `the recording has ${element("rate").value || "no"} samples a second, the detector wants ` +
-    `${wanted}: resample it, or train a detector for that rate`;
-  say(player.isPlaying ? null : problem);
-}
-
-async function toggle() {
-  if (player.recording === null) return;
-  if (player.isPlaying) {
-    player.isPlaying = false;
-    return;
+/** What the server has: a live stream, or a detector and perhaps a recording. */
+async function opened() {
+  const answer = await fetch(`live.json${location.search}`);
+  if (answer.ok) {
+    const told = await answer.json();
+    if (told.token_needed && !new URLSearchParams(location.search).has("token")) {
+      throw new Error("this page needs a token: open the address that tactslip stream prints");
+    }
+    write("model", "waiting for tactslip stream");
+    return Live.open(told);
   }
-  if (player.isAtEnd) await player.restart();
-  play();
+  if (answer.status !== 404) {
+    throw new Error(`the server refuses (${answer.status}): open the address that it prints`);
+  }
+  // onnxruntime-web is loaded by this alone
+  const { Recorded, fetched } = await import("./recorded.mjs");
+  const given = await (await fetched("given.json", "what was given")).json();
+  const recorded = await Recorded.open(given);
+  if (given.recording) {
+    const response = await fetched("recording", given.recording);
+    await recorded
+      .take(await response.arrayBuffer(), given.recording)
+      .then(() => (recorded.recording.isSimulated ||= given.simulated))
+      .catch(say);
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches) recorded.isPlaying = false;
+  }
+  return recorded;
 }
+
+/** Facts of the detector, once. */
+function describe({ facts, isLive }) {
+  const hop = facts.onset_hop_samples ?? facts.hop_samples;
+  const perSecond = Math.round(facts.sample_rate_hz / hop);
+  const aheadMs = (1000 * facts.context_after_samples) / facts.sample_rate_hz;
+  const parts = [
+    facts.file ? `${facts.file}, ${Math.round(facts.onnx_bytes / 1000)} kB, ${facts.precision}` : null,
+    `${facts.channels.length} channels at ${facts.sample_rate_hz} Hz`,
+    `${perSecond} decisions a second, ${Number(aheadMs.toPrecision(3))} ms look-ahead`,
+    facts.train_materials?.length ? `trained on ${facts.train_materials.join(", ")}` : null,
+  ];
+  write("model", parts.filter(Boolean).join(" · "));
+  write("explanation", explain(facts));
+  element("by").hidden = facts.onset_hop_samples === undefined;
+  for (const each of document.querySelectorAll(".of-recorded")) each.hidden = isLive;
+  for (const each of document.querySelectorAll(".of-live")) each.hidden = !isLive;
+  for (const id of ["play", "restart", "file", "seek"]) element(id).disabled = false;
+}
+
+// Controls ----------------------------------------------------------------------------------------
 
 function connectPlayback() {
-  element("play").addEventListener("click", toggle);
-  element("restart").addEventListener("click", () => player.restart());
+  element("play").addEventListener("click", () => source.toggle());
+  element("restart").addEventListener("click", () => source.seek(0));
   for (const radio of document.getElementsByName("speed")) {
-    radio.addEventListener("change", () => (player.speed = Number(radio.value)));
+    radio.addEventListener("change", () => (source.speed = Number(radio.value)));
   }
-  element("rate").addEventListener("input", () => {
-    if (isRateRight()) say(null);
-    else if (player.isPlaying) play();
-  });
   document.addEventListener("keydown", (event) => {
     const isTaken = event.target.closest("button, input:not([type=range])");
     if (event.key !== " " || isTaken) return;
     event.preventDefault(); // a space would scroll
-    toggle();
+    source.toggle();
+  });
+  element("list").addEventListener("click", ({ target }) => {
+    const timeS = Number(target.dataset.timeS);
+    if (!target.dataset.timeS) return;
+    source.isPlaying = false;
+    source.seek(Math.min(source.samples.end - 1, (timeS + SHOWN_S) * source.facts.sample_rate_hz));
   });
 }
 
-function connectFiles(scope) {
+function connectFiles() {
   const open = async (file) => {
     if (!file) return;
     try {
-      await take(await file.arrayBuffer(), file.name, false, scope);
+      await source.take(await file.arrayBuffer(), file.name);
+      say(null);
     } catch (error) {
       say(error);
     }
@@ -118,12 +117,11 @@ function connectFiles(scope) {
     mark(false);
     open(dataTransfer.files[0]);
   });
-  element("file").disabled = false;
 }
 
 /** Returns whether the slider has moved and nothing was scored with it yet. */
-function connectThreshold(facts) {
-  const scale = thresholdScale(facts);
+function connectThreshold() {
+  const scale = thresholdScale(source.facts);
   const slider = element("threshold");
   const own = Math.round(scale.own * slider.max);
   let waiting = 0;
@@ -134,14 +132,13 @@ function connectThreshold(facts) {
     slider.setAttribute("aria-valuetext", text);
   };
   const move = () => {
-    const isOwn = Number(slider.value) === own;
-    player.stream.threshold = isOwn ? null : scale.toThreshold(slider.value / slider.max);
     show();
-    document.body.ariaBusy = "true"; // until frames have caught up
+    document.body.dataset.busy = "true"; // for tests: until all is scored again
     clearTimeout(waiting);
     waiting = setTimeout(() => {
       waiting = 0;
-      player.scoreAgain();
+      const isOwn = Number(slider.value) === own;
+      source.setThreshold(isOwn ? null : scale.toThreshold(slider.value / slider.max));
     }, AGAIN_MS);
   };
   element("threshold-title").textContent = scale.title;
@@ -160,36 +157,130 @@ function connectThreshold(facts) {
   return () => waiting !== 0;
 }
 
-/** Play, draw and report with every frame of the screen. */
-function run(scope, isWaiting) {
-  const { facts } = player.stream;
+// Numbers -----------------------------------------------------------------------------------------
+
+/** The status at the position, and counts of all that was decided. */
+function report() {
+  const { facts, history, position, recording, isPlaying, isLive } = source;
+  const now = history.before(position / facts.sample_rate_hz);
+  const isKnown = now >= history.first;
+  const status = !isKnown ? "waiting" : history.isOn(now) ? "slip" : "no slip";
+  const box = element("status");
+  if (box.dataset.status !== status) box.dataset.status = status;
+  box.classList.toggle("doubtful", isKnown && history.isDoubtful(now));
+  write("status-word", status);
+  write("probability", isKnown ? history.get("probability", now).toFixed(2) : "–");
+  write("alarms", history.numAlarms.toLocaleString("en"));
+  write("decisions", history.count.toLocaleString("en"));
+  write("invalid", history.numInvalid.toLocaleString("en"));
+  write("position", positionText());
+  const paused = isLive ? "Follow" : source.isAtEnd ? "Play again" : "Play";
+  write("play-label", isPlaying ? "Pause" : paused);
+  const simulated = [
+    recording?.isSimulated ? (isLive ? "samples" : "recording") : null,
+    facts.simulated ? "training data" : null,
+  ].filter(Boolean);
+  write("simulated", simulated.length ? `simulated: ${simulated.join(" and ")}` : "");
+  element("simulated").hidden = simulated.length === 0;
+  element("truth").hidden = !recording?.onsetsS.length;
+  if (isLive) reportStream(source.status);
+  else reportLatencies(source.latencies);
+  listAlarms(history);
+  return status;
+}
+
+function positionText() {
+  const { recording, facts, position, samples, progress, isLive } = source;
+  if (recording === null) return "no recording";
+  const [now, end] = [position, samples.end].map((row) => (row / facts.sample_rate_hz).toFixed(1));
+  const rate = isLive || recording.rate ? "" : ` (no rate in the file: taken as ${facts.sample_rate_hz} Hz)`;
+  const scored = progress < 1 ? `, ${Math.floor(100 * progress)} % scored` : "";
+  return `${recording.name}: ${now} of ${end} s${scored}${rate}`;
+}
+
+function reportLatencies(latencies) {
+  const sorted = [...latencies].sort((a, b) => a - b);
+  const at = (share) => sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))];
+  const shown = { last: latencies.at(-1), median: at(0.5), p99: at(0.99) };
+  for (const [name, ms] of Object.entries(shown)) write(`latency-${name}`, ms?.toFixed(1) ?? "–");
+}
+
+function reportStream({ state, text, ...counts }) {
+  const box = element("stream");
+  if (box.dataset.state !== state) box.dataset.state = state;
+  write("stream-state", state);
+  write("stream-text", text ?? "");
+  for (const name of ["received", "dropped", "dropped_to_page"]) {
+    write(name, (counts[name] ?? 0).toLocaleString("en"));
+  }
+}
+
+/** A row for each alarm, each with a button that shows it; the newest first. */
+function listAlarms(history) {
+  const list = element("list");
+  const { alarms } = history;
+  if (list.history !== history) {
+    list.replaceChildren();
+    list.history = history;
+    list.next = 0;
+  }
+  const rows = element("rows");
+  const isAtTop = rows.scrollTop === 0;
+  while (alarms.length && list.lastChild && Number(list.lastChild.dataset.index) < alarms[0]) {
+    list.lastChild.remove(); // it is kept no longer
+  }
+  const fresh = alarms.filter((i) => i >= list.next);
+  if (fresh.length === 0) return;
+  list.next = fresh.at(-1) + 1;
+  list.prepend(...fresh.reverse().map((i) => alarmRow(history.decision(i), i)));
+  if (isAtTop) rows.scrollTop = 0;
+}
+
+function alarmRow({ time_s: alarmS, onset_s: onsetS, probability, valid, raised_by: by }, index) {
+  const row = document.createElement("tr");
+  row.dataset.index = index;
+  const button = document.createElement("button");
+  button.textContent = `${alarmS.toFixed(3)} s`;
+  button.setAttribute("aria-label", `show the alarm at ${alarmS.toFixed(3)} s`);
+  button.dataset.timeS = alarmS;
+  row.insertCell().append(button);
+  for (const text of [`${onsetS.toFixed(3)} s`, probability.toFixed(2), ...(by ? [by] : [])]) {
+    row.insertCell().textContent = text;
+  }
+  if (!valid) row.title = "not valid: a channel in use is dead or broken";
+  row.classList.toggle("doubtful", !valid);
+  return row;
+}
+
+// Running -----------------------------------------------------------------------------------------
+
+function run(scope, overview, isWaiting) {
   let last = performance.now();
   const frame = async (now) => {
     const seconds = Math.min(now - last, 100) / 1000; // a tab that slept goes on where it was
     last = now;
     try {
-      await player.advance(seconds);
+      await source.advance(seconds);
     } catch (error) {
-      player.isPlaying = false;
+      source.isPlaying = false;
       say(error);
     }
-    scope.draw(player, player.stream.threshold ?? facts.threshold ?? Infinity);
-    report(player, facts.sample_rate_hz);
-    document.body.ariaBusy = String(isWaiting() || player.isCatchingUp);
+    scope.draw();
+    overview.draw(report());
+    if (isWaiting() || source.progress < 1) document.body.dataset.busy = "true";
+    else delete document.body.dataset.busy;
     requestAnimationFrame(frame);
   };
   requestAnimationFrame(frame);
 }
 
-/** Everything decided so far, as the other hosts print it. */
-export function decisionLines() {
-  const { history, stream, fed } = player;
-  const { precision, sample_rate_hz: rate } = stream.facts;
-  const lines = [];
-  for (let i = 0; i < history.count; i += 1) {
-    lines.push(decisionLine(history.decision(i), precision, true));
-  }
-  return [...lines, summaryLine(history.count, history.alarms.length, fed / rate)];
+/** For tests: all that the page holds, decisions as `StreamGraph.push` gives them. */
+export function held() {
+  const { history, samples, facts } = source;
+  const decisions = [];
+  for (let i = history.first; i < history.count; i += 1) decisions.push(history.decision(i));
+  const { first, end, numMissing } = samples;
+  return { decisions, first, end, numMissing, facts };
 }
 
 for (const name of ["dragover", "drop"]) {
@@ -198,20 +289,20 @@ for (const name of ["dragover", "drop"]) {
 }
 
 try {
-  const given = await (await fetched("/given.json", "what was given")).json();
-  player = new Player(await loadStream(given));
-  const { facts } = player.stream;
-  const scope = new Scope(element("scope"), facts);
-  describe(facts, given);
-  describeSimulated(facts, given.simulated);
+  source = await opened();
+  describe(source);
+  const scope = new Scope(element("scope"), source);
+  const overview = new Overview(element("overview"), source);
   connectPlayback();
-  connectFiles(scope);
-  const isWaiting = connectThreshold(facts);
+  if (!source.isLive) connectFiles();
+  const isWaiting = source.isLive ? () => false : connectThreshold();
   new ResizeObserver(() => scope.resize()).observe(element("scope"));
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => scope.restyle());
-  if (given.recording) await takeGiven(given, scope).catch(say);
-  run(scope, isWaiting);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+    scope.restyle();
+    overview.restyle();
+  });
+  run(scope, overview, isWaiting);
 } catch (error) {
-  element("model").textContent = "no detector";
+  write("model", "no detector");
   say(error);
 }

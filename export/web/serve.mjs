@@ -12,11 +12,10 @@ const HERE = new URL("./", import.meta.url);
 const ORT = "node_modules/onnxruntime-web/dist/";
 const PAGE = {
   "/": "index.html",
-  ...own("style.css", "page.mjs", "player.mjs", "history.mjs", "files.mjs", "scope.mjs"),
-  ...own("lanes.mjs", "overlay.mjs", "readout.mjs", "threshold.mjs"),
+  ...own("style.css", "page.mjs", "recorded.mjs", "live.mjs", "history.mjs", "files.mjs"),
+  ...own("scope.mjs", "lanes.mjs", "overview.mjs", "alarm.mjs"),
   "/node/graph.mjs": "../node/graph.mjs",
   "/node/npy.mjs": "../node/npy.mjs",
-  "/node/lines.mjs": "../node/lines.mjs",
   "/ort/ort.mjs": `${ORT}ort.wasm.bundle.min.mjs`,
   "/ort/ort.wasm": `${ORT}ort-wasm-simd-threaded.wasm`,
 };

@@ -1,4 +1,36 @@
-// From a slider to a threshold: by false alarms an hour where the model says what they cost.
+// The alarm in words, and from a slider to its threshold: by false alarms an hour where the model says
+// what they cost.
+
+/** How an alarm comes about, for people: sentences. */
+export function explain({ rule, sample_rate_hz: rate, hop_samples: hop, onset_hop_samples: fast }) {
+  const every = (samples) => `every ${Number(((1000 * samples) / rate).toPrecision(3))} ms`;
+  const rules = {
+    k_of_n: () =>
+      `k_of_n is the ${ordinal(rule.k)}highest evidence of the last ${rule.n} decisions. So an alarm ` +
+      `comes when ${rule.k} of ${rule.n} decisions reach the threshold.`,
+    cusum: () =>
+      "cusum adds up the evidence of all decisions and never falls below 0" +
+      (rule.ceiling === null ? "" : ` or rises above ${rounded(rule.ceiling)}`) +
+      (rule.drift ? `; ${rounded(rule.drift)} is taken off each, so that weak evidence fades` : "") +
+      ". An alarm comes when the sum reaches the threshold.",
+  };
+  return [
+    `A decision is made ${every(hop)}. Its evidence says how much more likely its samples are with ` +
+      "slip than without: above 0 for slip, below 0 against it (the logarithm of the ratio).",
+    rules[rule?.name]?.() ?? "An alarm comes when the statistic reaches the threshold.",
+    fast
+      ? `A second classifier, of onsets, looks at fast changes ${every(fast)}: an alarm comes from ` +
+        "its score too, when that reaches its own threshold."
+      : "",
+    "An alarm sets the status to slip until the statistic has been low for a while.",
+  ]
+    .filter(Boolean)
+    .join(" ");
+}
+
+function ordinal(number) {
+  return number === 1 ? "" : `${number}${{ 2: "nd", 3: "rd" }[number] ?? "th"} `;
+}
 
 /**
  * The scale of the slider, from 0 (left) to 1.
