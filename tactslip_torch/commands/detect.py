@@ -26,7 +26,8 @@ from tactslip_torch.data.folder import file_facts, has_truth, recording_files
 from tactslip_torch.data.formats import Reading, open_file, pieces
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.live.mcap_log import McapLog
-from tactslip_torch.live.sinks import Block
+from tactslip_torch.live.rerun_log import RerunLog
+from tactslip_torch.live.sinks import Block, Sink
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import masked_names
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions, answer_of
@@ -100,10 +101,12 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
     said = config.reading
     said = OmegaConf.to_container(said, resolve=True) if OmegaConf.is_config(said) else said
     reading = Reading.of(said)
-    if type(config.mcap) is not bool:
-        raise ValueError(
-            f"mcap must be true or false, got {config.mcap!r}; files are called as their recordings"
-        )
+    for key in ("mcap", "rerun"):
+        if type(config[key]) is not bool:
+            raise ValueError(
+                f"{key} must be true or false, got {config[key]!r}; files are called as their "
+                "recordings"
+            )
     context = _DetectionContext(detector, _settings(config, detector), reading, config, folder)
     paths = recording_files(Path(str(config.input)))
     save_config(config, folder)
@@ -158,9 +161,9 @@ def _detect_in(
         traces = Traces(drawn, rate, stream.hop_s, view, context.units, kinds)
         truth = archived.recording if archived else None
         counts = DecisionCounts(first_releases(truth.onsets_s, truth.released_s) if truth else ())
-        log = None
+        logs: list[Sink] = []
         if config.mcap:
-            log = McapLog(
+            mcap = McapLog(
                 context.folder / f"{name}.mcap",
                 hand,
                 rate,
@@ -169,7 +172,11 @@ def _detect_in(
                 units=context.units,
                 dtype=samples.dtype,
             )
-            stack.enter_context(log)
+            logs.append(stack.enter_context(mcap))
+        if config.rerun:
+            place = context.folder / f"{name}.rrd"
+            rerun = RerunLog(place, detector, context.settings, recording=truth)
+            logs.append(stack.enter_context(rerun))
 
         def take(decisions: Decisions) -> None:
             columns = decisions._asdict() | {"answer": answer_of(detector, decisions)}
@@ -179,14 +186,14 @@ def _detect_in(
             score = np.where(of["onset_score"] > NOTHING_YET, of["onset_score"], math.nan)
             doubtful = of["answer"] < 0
             traces.add_decisions(times, of["probability"], is_on, is_valid, doubtful, score)
-            if log:
+            for log in logs if len(decisions.number) else ():
                 log.decisions(decisions)
             if write:
                 write(zip(*(values.tolist() for values in of.values()), strict=True))
 
         for first, piece in enumerate(pieces(samples, context.piece_samples)):
             traces.add_samples(piece.numpy())
-            if log:
+            for log in logs:
                 log.samples(first * context.piece_samples, Block(piece.T.double().numpy()))
             take(stream.push(piece.T))
             tick()

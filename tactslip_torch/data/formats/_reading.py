@@ -90,12 +90,13 @@ def check_plausible(what: str, claimed: int, stored: int, most: int | None = Non
         )
 
 
-def needs(module: str, what: str) -> ModuleType:
-    """A library that is there only if the extra ``formats`` was installed.
+def needs(module: str, what: str, extra: str = "formats") -> ModuleType:
+    """A library that is there only if an extra was installed.
 
     Args:
         module: to import.
         what: it is for, such as ``"reading .h5"``.
+        extra: that brings it.
 
     Raises:
         Refused: in one line, if it is absent.
@@ -103,7 +104,7 @@ def needs(module: str, what: str) -> ModuleType:
     name = module.partition(".")[0]
     if importlib.util.find_spec(name) is None:
         raise Refused(
-            f'{what} needs {name}, which is not installed; pip install "tactslip-torch[formats]"'
+            f'{what} needs {name}, which is not installed; pip install "tactslip-torch[{extra}]"'
         )
     return importlib.import_module(module)
 
