@@ -7,6 +7,7 @@ import { Overview } from "./overview.mjs";
 import { Scope } from "./scope.mjs";
 
 const AGAIN_MS = 150; // the slider rests for so long before all is scored again
+const LIVE_MS = 30; // a live stream is drawn no more often
 const SHOWN_S = 1; // of what follows an alarm that is looked up
 const element = (id) => document.getElementById(id);
 let source = null;
@@ -257,6 +258,7 @@ function alarmRow({ time_s: alarmS, onset_s: onsetS, probability, valid, raised_
 function run(scope, overview, isWaiting) {
   let last = performance.now();
   const frame = async (now) => {
+    if (source.isLive && now - last < LIVE_MS) return requestAnimationFrame(frame);
     const seconds = Math.min(now - last, 100) / 1000; // a tab that slept goes on where it was
     last = now;
     try {
@@ -269,7 +271,7 @@ function run(scope, overview, isWaiting) {
     overview.draw(report());
     if (isWaiting() || source.progress < 1) document.body.dataset.busy = "true";
     else delete document.body.dataset.busy;
-    requestAnimationFrame(frame);
+    return requestAnimationFrame(frame);
   };
   requestAnimationFrame(frame);
 }
