@@ -247,13 +247,6 @@ def kernel(a: np.ndarray, b: np.ndarray, degree: int = 2, offset: float = 0.5) -
     return np.array([[(np.dot(u, v) + offset) ** degree for v in b] for u in a])
 
 
-def kernel_elm(
-    gram: np.ndarray, targets: np.ndarray, penalty: float, weights: np.ndarray | None = None
-) -> np.ndarray:
-    weights = np.ones(len(gram)) if weights is None else weights
-    return np.linalg.solve(gram + np.diag(1 / (penalty * weights)), targets)
-
-
 # What the tests feed in ----------------------------------------------------------------------
 
 

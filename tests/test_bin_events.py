@@ -63,16 +63,6 @@ def events_of(batch, says_slip, latency=LATENCY, role="test"):
     return {name: own[0] for name, own in events_by_rule([part], latency).items()}
 
 
-def says(batch, *, right=True, wrong=()):
-    """The truth, or never slip, but for bins given as (stroke, position)."""
-    decisions = batch.is_slip.clone() if right else torch.zeros_like(batch.is_slip)
-    for stroke, position in wrong:
-        place = (batch.stroke == stroke) & (batch.position == position)
-        assert int(place.sum()) == 1
-        decisions[place] = ~decisions[place]
-    return decisions
-
-
 def seen(events):
     return [(onset.outcome, onset.num_alarms) for onset in events.onsets]
 

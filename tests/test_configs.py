@@ -22,7 +22,6 @@ OPTIONS = sorted(
     if path.parent.name != "exp"
 )
 SEEN = ["M1", "M2", "M3", "M4", "M5", "M6"]
-UNSEEN = ["iron", "cloth", "copper", "wood"]
 
 
 def composed(*overrides, name="train"):

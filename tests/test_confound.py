@@ -4,7 +4,6 @@ import contextlib
 import io
 import json
 
-import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -14,7 +13,6 @@ from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.report.metrics import bin_metrics
 from tactslip_torch.report.results import (
     confound_table,
 )
@@ -24,9 +22,6 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore:The '.*_dataloader' does not have many workers",
     "ignore:.*does not have many workers",
 )
-
-SCENES = ("carried", "paper", "tapped")  # in order of appearance
-KEYS = ("non_slip_recall", "slip_recall", "balanced_accuracy")
 
 
 class SmallScenes:
@@ -97,26 +92,6 @@ def ran(tmp_path_factory):
             composed("+exp=confound", *recipe, "recipe.sample_bins=100", "export=false"), folder
         )
     return folder, printed.getvalue(), returned
-
-
-def made(seed=0, *, simulated=True, scenes=SCENES, roles=("train", "test", "unseen")):
-    """Metrics of two folds, and the bins they are of."""
-    rng = np.random.default_rng(seed)
-    bins, folds = {}, {}
-    for fold, trained in (("protocol", ("paper",)), ("with_scenes", ("carried", "paper"))):
-        folds[fold] = {"splits": {}, "baselines": {}}
-        for role in roles:
-            own = [s for s in scenes if role != "train" or s in trained]
-            labels = [own[i % len(own)] for i in range(600)]
-            truth = torch.from_numpy(rng.random(600) < 0.7)
-            truth &= torch.tensor([label != "carried" for label in labels])
-            says = truth ^ torch.from_numpy(rng.random(600) < 0.15)
-            bins[fold, role] = labels, truth, says
-            scores = bin_metrics(truth, says, ["a"] * 600, [20.0] * 600, labels)
-            folds[fold]["splits"][role] = scores
-    splits = {f"{f}/{role}": s for f, of in folds.items() for role, s in of["splits"].items()}
-    metrics = {"simulated": simulated, "splits": splits, "folds": folds}
-    return metrics | {"baselines": {}}, bins
 
 
 # Table and figure --------------------------------------------------------------------------------

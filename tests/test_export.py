@@ -42,12 +42,6 @@ def exported(detector, tmp_path_factory):
     return paths
 
 
-def run(path, **inputs):
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    names = [output.name for output in session.get_outputs()]
-    return dict(zip(names, session.run(names, inputs), strict=True))
-
-
 def test_a_model_says_of_itself_what_its_sidecar_says(detector, exported):
     for path, kind in zip(exported, ("bin", "stream"), strict=True):
         session = onnxruntime.InferenceSession(path)

@@ -36,7 +36,6 @@ from tactslip_torch.model.kernels import PAPER_KERNEL
 from tactslip_torch.model.scaling import FeatureScaler
 
 OF_FEATURE = ["a", "a", "b", "b", "c", "c"]  # of each feature
-UNITS = {name: frozenset(name) for name in "abc"}
 PENALTIES = (0.01, 0.1, 1.0)
 
 

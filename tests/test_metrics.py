@@ -37,10 +37,6 @@ def labels(num_bins=500, scenes=("taps", "paper", "grips")):
     )
 
 
-def some(rows, *groups):
-    return [[group[row] for row in rows] for group in groups]
-
-
 def test_scores_equal_scikit_learn():
     truth, predicted = random_bins(0)
     confusion = confusion_matrix(truth, predicted)

@@ -28,7 +28,6 @@ from tactslip_torch.native import build
 HAND = some_hand("GFF")
 POOL = FeaturePool(HAND, backend="torch")
 NAMES = POOL.names
-DESCRIPTORS = sorted({name.descriptor for name in NAMES})
 LEVELS = ("v2", "v3", "v4") if not native.why_not() and native.instruction_set() != "v1" else ()
 needs_engine = pytest.mark.skipif(bool(native.why_not()), reason=native.why_not())
 

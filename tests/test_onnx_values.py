@@ -12,7 +12,6 @@ from tactslip_torch.deploy.value import BOOL, F32, F64, Graph
 from tactslip_torch.features.ops import ascending, counted, looked_up, root, taken
 
 X = np.array([-2.5, -1.0, 0.0, 0.5, 1.0, 3.0])
-Y = np.array([1.0, -2.0, 4.0, 0.5, 0.25, 3.0])
 
 
 def run(graph, **inputs):

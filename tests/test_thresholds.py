@@ -13,7 +13,7 @@ from scipy.stats import beta, chi2
 from test_rules import drawn_times, drawn_values
 
 from tactslip_torch.onset import thresholds
-from tactslip_torch.onset.rules import KOfN, latch
+from tactslip_torch.onset.rules import latch
 from tactslip_torch.onset.thresholds import (
     Budget,
     alarm_rate,
@@ -21,9 +21,6 @@ from tactslip_torch.onset.thresholds import (
     lowest_threshold,
     poisson_interval,
 )
-
-PLAIN = {"rearm": 1, "refractory": 0}
-RAW = KOfN(1, 1)  # the statistic is the ratio
 
 
 # ---------------------------------------------------------------------------- the Poisson interval

@@ -172,7 +172,6 @@ def _written(value: object) -> str:
 DETECTOR = "detector.pt"
 METRICS = "metrics.json"
 CHECKPOINT = "last.ckpt"
-STATISTICS = "statistics.pt"
 BIN_GRAPH = "model.onnx"
 STREAM_GRAPH = "stream.onnx"
 SIDECAR = "{}.json"

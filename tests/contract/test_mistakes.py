@@ -22,13 +22,8 @@ def files(**words):
     return [*of_set("{root}"), *split_of_set(), *settings(workers=0, **words)]
 
 
-MISTAKES = {
+MISTAKES = {  # beside those of tests/test_command_line.py, which a page lists
     # command, overrides, words of the line
-    "no experiment": ("train", settings(experiment="nope"), "nope unseen4"),
-    "no recipe": ("train", files(recipe="best"), "best general paper robust"),
-    "no data": ("train", settings(data="webcam"), "webcam simulated files"),
-    "no folder": ("train", settings(data="files", root="nowhere"), "nowhere"),
-    "no root": ("train", settings(data="files"), "data.root ..."),
     "unknown material": (
         "train",
         settings(materials=["M1", "Foo"], seen=["M1"], held_out=["Foo"]),
@@ -49,9 +44,6 @@ MISTAKES = {
         "recipe.num_features=9999 506",
     ),
     "no penalty": ("train", files(recipe="paper", penalties=[]), "recipe.penalties []"),
-    "coverage": ("train", files(coverage=95), "coverage 0 1 95"),
-    "seed": ("train", files(seed="first"), "seed 'first' whole"),
-    "resume from nothing": ("train", files(resume="nowhere"), "nowhere"),
     "statistics of the wrong recipe": (
         "train",
         files(recipe="general", statistics=True),
@@ -62,10 +54,7 @@ MISTAKES = {
         files(channels=[CHANNELS[0] | {"name": "Z1"}, *CHANNELS[1:]]),
         "Z1 SG1 csv",
     ),
-    "evaluate without a model": ("evaluate", [], "model ..."),
-    "evaluate nothing": ("evaluate", settings(model="missing.pt"), "no detector missing.pt"),
     "evaluate another hand": ("evaluate", settings(model="{model}", cycles=2), "4 24 SG1"),
-    "detect nothing": ("detect", settings(model="missing.pt", input="{root}"), "missing.pt"),
     "detect in nothing": ("detect", settings(model="{model}", input="nowhere"), "nowhere"),
     "detect without an alarm": (
         "detect",
@@ -77,7 +66,6 @@ MISTAKES = {
         settings(model="{model}", input="{root}", masked_channels=["SG9"]),
         "'SG9' SG1",
     ),
-    "export nothing": ("export", settings(model="missing.pt"), "no detector missing.pt"),
     "export in a precision": (
         "export",
         settings(model="{model}", precision="int8"),
@@ -94,7 +82,6 @@ MISTAKES = {
     "adapt by nothing": ("adapt", settings(model="{model}"), "recordings"),
     "adapt in another way": ("adapt", settings(model="{model}", action="learn"), "add 'learn'"),
     "undo nothing": ("adapt", settings(model="{model}", action="undo"), "undo"),
-    "importance of nothing": ("importance", settings(model="missing.pt"), "missing.pt"),
     "crossval of too many": (
         "crossval",
         [*of_set("{root}"), *settings(num_held_out=4, workers=0)],
@@ -106,13 +93,6 @@ MISTAKES = {
         settings(calibration_seeds=[3]),
         "seeds 1000 [3]",
     ),
-    "generate an unknown material": (
-        "generate",
-        settings(generated_materials=["gold"], workers=0),
-        "'gold' M1",
-    ),
-    "data action": ("data", settings(action="mend", root_of_data="{root}"), "'mend' check"),
-    "data of nothing": ("data", settings(action="check", root_of_data="nowhere"), "nowhere"),
     "convert to nothing": (
         "data",
         settings(action="convert", root_of_data="{root}", format="docx", output="to"),
