@@ -80,7 +80,7 @@ def export_detector(
                 check = check_model(model, detector, kind, precision)
             except ValueError as error:
                 raise ValueError(f"{path} was not written: {error}") from error
-            metadata = plain({**_metadata(detector, kind, precision), "check": check}) | origin
+            metadata = plain({**host_metadata(detector, kind, precision), "check": check}) | origin
             props = {name: json.dumps(value, allow_nan=False) for name, value in metadata.items()}
             helper.set_model_props(model, props)
             onnx.save(model, temporary)
@@ -92,7 +92,7 @@ def export_detector(
     return paths
 
 
-def _metadata(detector: SlipDetector, kind: GraphKind, precision: Precision) -> dict[str, Any]:
+def host_metadata(detector: SlipDetector, kind: GraphKind, precision: Precision) -> dict[str, Any]:
     """All that a host must know of a graph."""
     hand, info, raw = detector.pool.hand, detector.info, RawBin.of(detector)
     calibrated, abstain = calibration_of(detector), Abstention.of(detector)

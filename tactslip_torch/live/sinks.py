@@ -33,8 +33,8 @@ class Event(NamedTuple):
     """What happened to a stream beside its samples.
 
     Attributes:
-        kind: ``"connected"``, ``"waiting"``, ``"lost"``, ``"garbage"``, ``"dropped"``, ``"gap"`` or
-            ``"ended"``.
+        kind: ``"connected"``, ``"waiting"``, ``"lost"``, ``"garbage"``, ``"missing"``,
+            ``"dropped"``, ``"gap"`` or ``"ended"``.
         text: one line for people.
     """
 

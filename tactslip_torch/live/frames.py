@@ -1,0 +1,459 @@
+"""Samples in bytes: lines of text, or binary frames, as a device sends them.
+
+``Frames`` describes them; a ``FrameReader`` takes bytes as they come, in any pieces, finds the
+frames again behind what is none, and tells what it had to pass over.
+"""
+
+from __future__ import annotations
+
+import binascii
+import re
+import time
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from tactslip_torch.live.sinks import Array, Block, Event
+from tactslip_torch.runtime import check_number
+
+COUNTER = "counter"
+"""The column of a line of text that counts lines."""
+Counter = Literal["uint8", "uint16", "uint32"]
+Dtype = Literal[
+    "int8", "uint8", "int16", "uint16", "int24", "int32", "uint32", "float32", "float64"
+]
+_CHECKSUMS: Mapping[str, tuple[int, Callable[[bytes], int]]] = {
+    "sum8": (1, lambda content: sum(content) & 0xFF),
+    "xor8": (1, lambda content: int(np.bitwise_xor.reduce(np.frombuffer(content, np.uint8)))),
+    "crc16": (2, lambda content: binascii.crc_hqx(content, 0xFFFF)),
+    "crc32": (4, zlib.crc32),
+}
+_MOST_LINE = 1 << 16  # bytes of a line; what is longer is none
+_MOST_MISSING_S = 10.0  # by a counter; what lacks more is another stream
+_TOLD_EVERY_S, _TOLD_AT_LEAST_S = 1.0, 60.0
+
+
+@dataclass(frozen=True)
+class Frames:
+    """How a device writes samples.
+
+    A line of text is one instant: its values are the columns. A binary frame is ``header``,
+    ``counter``, ``skip`` bytes, ``samples`` instants of all columns, bytes up to ``length`` that
+    are passed over, ``checksum``.
+
+    Args:
+        format: ``"text"`` or ``"binary"``.
+        columns: names of the values of an instant, in order; other names than the detector's
+            channels are left out, ``"counter"`` counts lines of text. ``None``: the channels in the
+            order of the detector, or as the first line names them.
+        scale: from a value to the detector's unit, one for all or one for each of its channels.
+        offset: added to that.
+        separator: between the values of a line; ``None``: blanks, tabs, commas and semicolons.
+        header: bytes that begin a frame, in hexadecimal, such as ``"AA 55"``; ``None``: none, every
+            byte counts from the first.
+        counter: type of the number that each frame raises by 1, in bytes (also of text, where it
+            says when the counter begins anew at 0; ``None`` is ``"uint32"`` there).
+        skip: bytes between counter and values.
+        dtype: of a value.
+        byte_order: ``"little"`` or ``"big"``, of values, counter and checksum.
+        samples: instants in a frame.
+        checksum: ``"sum8"``, ``"xor8"``, ``"crc16"`` (CCITT, from 0xFFFF) or ``"crc32"`` of all
+            bytes between header and checksum.
+        length: bytes of a whole frame; ``None``: as many as its parts have.
+
+    Raises:
+        ValueError: for a value that cannot be.
+    """
+
+    format: Literal["text", "binary"] = "text"
+    columns: Sequence[str] | None = None
+    scale: float | Sequence[float] = 1.0
+    offset: float | Sequence[float] = 0.0
+    separator: str | None = None
+    header: str | None = None
+    counter: Counter | None = None
+    skip: int = 0
+    dtype: Dtype = "int16"
+    byte_order: Literal["little", "big"] = "little"
+    samples: int = 1
+    checksum: Literal["sum8", "xor8", "crc16", "crc32"] | None = None
+    length: int | None = None
+
+    def __post_init__(self) -> None:
+        check_number("frame.samples", self.samples, whole=True)
+        choices: dict[str, tuple[Any, ...]] = {
+            "format": ("text", "binary"),
+            "dtype": get_args(Dtype),
+            "byte_order": ("little", "big"),
+            "counter": (*get_args(Counter), None),
+            "checksum": (*_CHECKSUMS, None),
+        }
+        for key, known in choices.items():
+            if (value := getattr(self, key)) not in known:
+                wanted = ", ".join("null" if each is None else each for each in known)
+                raise ValueError(f"frame.{key} must be one of {wanted}, got {value!r}")
+        if type(self.skip) is not int or self.skip < 0:
+            raise ValueError(f"frame.skip must be a number of bytes, got {self.skip!r}")
+        if self.length is not None and (type(self.length) is not int or self.length < 1):
+            raise ValueError(f"frame.length must be a number of bytes, got {self.length!r}")
+        if self.header is not None and not self.start:
+            raise ValueError(
+                f"frame.header must be bytes in hexadecimal and in quotes, such as 'AA 55', "
+                f"got {self.header!r}"
+            )
+        names = self.columns
+        if names is not None and (isinstance(names, str) or len(set(names)) < len(names)):
+            raise ValueError(f"frame.columns must be a list of different names, got {names!r}")
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any] | None) -> Frames:
+        """From what a configuration says.
+
+        Raises:
+            ValueError: for a key or value that is none.
+        """
+        known = [each.name for each in fields(cls)]
+        if given is not None and not set(given) <= set(known):
+            raise ValueError(f"frame must be of {', '.join(known)}, got {given!r}")
+        return cls(**dict(given or {}))
+
+    @property
+    def start(self) -> bytes:
+        """The bytes that begin a frame."""
+        try:
+            return bytes.fromhex(self.header or "")
+        except (TypeError, ValueError):
+            return b""
+
+    def reader(
+        self,
+        channels: Sequence[str],
+        sample_rate_hz: float,
+        *,
+        begins_inside: bool = False,
+        now: Callable[[], float] = time.monotonic,
+    ) -> FrameReader:
+        """What finds the frames in bytes.
+
+        Args:
+            channels: of the detector, in its order.
+            sample_rate_hz: of the detector.
+            begins_inside: whether the first byte may be any of a frame, as of a serial port.
+            now: seconds of a clock, for how often something is told.
+
+        Raises:
+            ValueError: if the columns lack a channel, a frame has no place in its length, or one
+                that begins inside could not be found.
+        """
+        kind = _LineReader if self.format == "text" else _BinaryReader
+        return kind(self, channels, sample_rate_hz, begins_inside, now)
+
+
+class _Tally:
+    """Counts something, to be told in one line, again only after longer and longer times.
+
+    Args:
+        kind: of the event.
+        word: what is counted.
+        now: seconds of a clock.
+    """
+
+    def __init__(self, kind: str, word: str, now: Callable[[], float]) -> None:
+        self._kind, self._word, self._now = kind, word, now
+        self._num, self._why, self._since_s = 0, "", 0.0
+        self._told_s, self._every_s = -np.inf, _TOLD_EVERY_S
+
+    def add(self, num: int, why: str) -> None:
+        """So many more; the first reason is told."""
+        if not self._num:
+            self._why, self._since_s = why, self._now()
+        self._num += num
+
+    def events(self, is_over: bool, *, at_once: bool = False) -> Iterator[Event]:
+        """The line, if it is due: it is over, or has lasted."""
+        now = self._now()
+        is_due = now - self._told_s >= self._every_s
+        is_due &= is_over or now - self._since_s >= _TOLD_EVERY_S
+        if not self._num or not (is_due or at_once):
+            return
+        is_new = now - self._told_s > 4 * self._every_s
+        self._every_s = _TOLD_EVERY_S if is_new else min(2 * self._every_s, _TOLD_AT_LEAST_S)
+        self._told_s = now
+        yield Event(self._kind, f"{_counted(self._num, self._word)} {self._why}")
+        self._num = 0
+
+
+class FrameReader:
+    """Bytes in, samples and events out. Made by ``Frames.reader``."""
+
+    def __init__(
+        self,
+        frames: Frames,
+        channels: Sequence[str],
+        sample_rate_hz: float,
+        begins_inside: bool,
+        now: Callable[[], float],
+    ) -> None:
+        self._frames, self._channels, self._begins_inside = frames, tuple(channels), begins_inside
+        self._most_missing = round(_MOST_MISSING_S * sample_rate_hz)
+        self._scale, self._offset = (
+            _for_each(name, getattr(frames, name), channels) for name in ("scale", "offset")
+        )
+        self._modulus = 1 << (8 * np.dtype(frames.counter or "uint32").itemsize)
+        self._set_columns(frames.columns)
+        self._buffer = bytearray()
+        self._count: int | None = None  # of the last frame
+        self._rows: list[Array] = []
+        self._items: list[Block | Event] = []
+        self._garbage, self._lacking = (
+            _Tally("garbage", "byte", now),
+            _Tally("missing", "frame", now),
+        )
+        self._is_good = True  # what came last
+
+    def feed(self, data: bytes) -> list[Block | Event]:
+        """The samples and events that these bytes complete."""
+        self._buffer += data
+        self._find()
+        self._flush()
+        items, self._items = self._items, []
+        return [*items, *self._garbage.events(self._is_good), *self._lacking.events(True)]
+
+    def end(self) -> list[Event]:
+        """The stream ended or broke off: what is still to be told. Then as new."""
+        self._buffer.clear()
+        self.forget()
+        return [*(e for t in (self._garbage, self._lacking) for e in t.events(True, at_once=True))]
+
+    def forget(self) -> None:
+        """The counter may go on anywhere."""
+        self._count = None
+
+    def _find(self) -> None:
+        """Take what is whole off the buffer."""
+        raise NotImplementedError
+
+    def _set_columns(self, columns: Sequence[str] | None) -> None:
+        names = list(self._channels if columns is None else columns)
+        if missing := [name for name in self._channels if name not in names]:
+            raise ValueError(
+                f"frame.columns has no {', '.join(missing[:5])}; the detector has channels "
+                f"{self._channels[0]} to {self._channels[-1]}, got {', '.join(names[:8])}"
+            )
+        self._names = names
+        self._places = [names.index(name) for name in self._channels]
+
+    def _add(self, values: Array, count: int | None) -> None:
+        """Take instants ``[n, columns]`` of a frame, behind those that its counter lacks."""
+        if count is not None:
+            before, self._count = self._count, count
+            lacking = 0 if before is None else (count - before - 1) % self._modulus
+            if lacking * len(values) > self._most_missing:
+                self._flush()
+                text = f"the counter of frames went from {before} to {count}: the sender began anew"
+                self._items.append(Event("gap", text))
+            elif lacking:
+                self._missing(lacking * len(values))
+                self._lacking.add(lacking, "never came, as their counter shows; NaN in their place")
+        picked = values[:, self._places].astype(np.float64)
+        self._rows.append(picked * self._scale + self._offset)
+        self._is_good = True
+
+    def _missing(self, num: int) -> None:
+        self._rows.append(np.full((num, len(self._channels)), np.nan))
+
+    def _flush(self) -> None:
+        if self._rows:
+            self._items.append(Block(np.concatenate(self._rows)))
+            self._rows = []
+
+    def _pass_over(self, num_bytes: int, why: str) -> None:
+        """Bytes that are no frame."""
+        self._garbage.add(num_bytes, f"passed over: {why}")
+        self._is_good = False
+
+
+class _LineReader(FrameReader):
+    """Lines of text."""
+
+    _is_first = True
+
+    def end(self) -> list[Event]:
+        """As of all; the next line is the first."""
+        self._is_first = True
+        return super().end()
+
+    def _find(self) -> None:
+        *lines, rest = self._buffer.split(b"\n")
+        self._buffer = rest
+        if len(rest) > _MOST_LINE:
+            self._pass_over(len(rest), f"no end of line in {len(rest)} bytes")
+            rest.clear()
+        for line in lines:
+            text = line.strip()
+            if text and not text.startswith(b"#"):
+                self._take(bytes(text))
+
+    def _take(self, line: bytes) -> None:
+        is_first, self._is_first = self._is_first, False
+        if is_first and self._begins_inside:
+            return  # a part of a line may look like a whole one
+        separator = self._frames.separator
+        parts = re.split(rb"[\s,;]+", line) if separator is None else line.split(separator.encode())
+        try:
+            values = np.array([float(part.strip() or b"nan") for part in parts])
+        except ValueError:
+            if not is_first or not self._name(parts):
+                self._lose(line, "a line holds what is no number")
+            return
+        wanted, names = len(self._names), self._names
+        if len(values) != wanted:
+            what = f"a line has {_counted(len(values), 'value')}, expected {wanted}"
+            self._lose(line, f"{what}, {names[0]} to {names[-1]}; frame.columns says which")
+            return
+        if COUNTER not in names:
+            self._add(values[None], None)
+        elif np.isfinite(count := values[names.index(COUNTER)]):
+            self._add(values[None], int(count) % self._modulus)
+        else:
+            self._lose(line, "the counter of a line is no number")
+
+    def _name(self, parts: Sequence[bytes]) -> bool:
+        """Take the first line for names of columns; whether it is no line of numbers at all."""
+        names = [part.strip().decode("utf-8", "replace") for part in parts]
+        if self._frames.columns is None and set(self._channels) <= set(names):
+            self._set_columns(names)
+        return not any(re.match(r"[-+.\d]", name) for name in names)
+
+    def _lose(self, line: bytes, why: str) -> None:
+        self._pass_over(len(line) + 1, f"{why}: {line[:40].decode('ascii', 'replace')!r}")
+        if COUNTER not in self._names:
+            self._missing(1)  # a line is an instant
+
+
+class _BinaryReader(FrameReader):
+    """Frames of bytes.
+
+    Where frames follow one another a header at its place is enough. To begin, and behind what is no
+    frame, there must be a right checksum, or another header where the next frame begins.
+    """
+
+    def __init__(self, frames: Frames, *rest: Any) -> None:
+        super().__init__(frames, *rest)
+        self._start, self._order = frames.start, frames.byte_order
+        self._counter_bytes = np.dtype(frames.counter).itemsize if frames.counter else 0
+        self._sum_bytes, self._sum = _CHECKSUMS.get(frames.checksum or "", (0, zlib.crc32))
+        size = int(frames.dtype.lstrip("uintfloa")) // 8
+        self._values = len(self._start) + self._counter_bytes + frames.skip
+        self._values_end = self._values + size * len(self._names) * frames.samples
+        least = self._values_end + self._sum_bytes
+        self._length = least if frames.length is None else frames.length
+        if self._length < least:
+            raise ValueError(
+                f"frame.length is {self._length} bytes, its parts have {least}: header "
+                f"{len(self._start)}, counter {self._counter_bytes}, skip {frames.skip}, "
+                f"{frames.samples} times {len(self._names)} values of {size}, checksum "
+                f"{self._sum_bytes}"
+            )
+        if self._begins_inside and not self._start:
+            raise ValueError(
+                "binary frames of a serial port need frame.header, since reading begins anywhere; "
+                "let the device send one, such as 'AA 55'"
+            )
+        self._restart()
+
+    def end(self) -> list[Event]:
+        """As of all; frames are to be found anew."""
+        self._restart()
+        return super().end()
+
+    def _restart(self) -> None:
+        self._in_step, self._has_begun = not self._start, False
+        self._lost = self._apart = 0  # bytes since the last frame, and from a header to the next
+
+    def _find(self) -> None:
+        buffer, length, start = self._buffer, self._length, self._start
+        at = 0
+        while len(buffer) - at >= length + (0 if self._in_step or self._sum_bytes else len(start)):
+            following = buffer[at + length : at + length + len(start)]
+            is_followed = start.startswith(following)  # as far as that is there already
+            is_frame = self._has_right_sum(at) if self._sum_bytes else is_followed
+            is_frame &= buffer.startswith(start, at)
+            if is_frame:
+                self._in_step = True
+                self._take(bytes(buffer[at : at + length]))
+                at += length
+            elif self._in_step and is_followed and buffer.startswith(start, at):
+                self._lose(length, "a frame has a wrong checksum")
+                at += length
+            else:
+                self._in_step = False
+                found = buffer.find(start, at + 1)
+                if found < 0:
+                    found = max(len(buffer) - len(start) + 1, at + 1)
+                elif buffer.startswith(start, at):
+                    self._apart = found - at
+                self._lose(found - at, self._no_frame())
+                at = found
+        del buffer[:at]
+
+    def _no_frame(self) -> str:
+        said = f"no frame of {self._length} bytes that begins with {self._start.hex(' ')}"
+        return f"{said} (two such headers are {self._apart} apart)" if self._apart else said
+
+    def _has_right_sum(self, at: int) -> bool:
+        end = at + self._length - self._sum_bytes
+        told = self._buffer[end : end + self._sum_bytes]
+        content = bytes(self._buffer[at + len(self._start) : end])
+        return self._sum(content) == int.from_bytes(told, self._order)
+
+    def _take(self, frame: bytes) -> None:
+        if self._lost and self._has_begun and not self._counter_bytes:
+            # without a counter what was passed over is as many frames as have place in it
+            num = round(self._lost / self._length) * self._frames.samples
+            if 0 < num <= self._most_missing:
+                self._missing(num)
+        self._lost, self._has_begun, self._apart = 0, True, 0
+        count = None
+        if self._counter_bytes:
+            place = len(self._start)
+            count = int.from_bytes(frame[place : place + self._counter_bytes], self._order)
+        values = self._numbers(frame[self._values : self._values_end])
+        self._add(values.reshape(-1, len(self._names)), count)
+
+    def _lose(self, num_bytes: int, why: str) -> None:
+        before, self._lost = self._lost, self._lost + num_bytes
+        if self._has_begun:
+            self._pass_over(num_bytes, why)
+        elif self._lost > 2 * self._length:  # else the rest of a frame that began before
+            self._pass_over(num_bytes + (before if before <= 2 * self._length else 0), why)
+
+    def _numbers(self, content: bytes) -> Array:
+        order: Literal["<", ">"] = "<" if self._order == "little" else ">"
+        if self._frames.dtype != "int24":
+            return np.frombuffer(content, np.dtype(self._frames.dtype).newbyteorder(order))
+        three = np.frombuffer(content, np.uint8).reshape(-1, 3)
+        four = np.zeros((len(three), 4), np.uint8)
+        four[:, slice(1, 4) if order == "<" else slice(0, 3)] = three  # the sign is the highest bit
+        whole: Array = four.view(f"{order}i4")[:, 0] >> 8
+        return whole
+
+
+def _for_each(name: str, value: float | Sequence[float], channels: Sequence[str]) -> Array:
+    try:
+        found = np.atleast_1d(np.asarray(value, np.float64))
+    except (TypeError, ValueError):
+        found = np.empty(0)
+    if found.shape not in ((1,), (len(channels),)) or not np.isfinite(found).all():
+        raise ValueError(
+            f"frame.{name} must be a finite number, or one for each of {len(channels)} channels, "
+            f"got {value!r}"
+        )
+    return found
+
+
+def _counted(num: int, word: str) -> str:
+    return f"{num} {word}{'' if num == 1 else 's'}"

@@ -1,0 +1,262 @@
+"""From a source through a queue and a detector to sinks, without holding up whoever sends."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactslip_torch.live.sinks import Block, Event, Sink
+from tactslip_torch.live.sources import Source
+from tactslip_torch.onset.decisions import Decisions
+from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.runtime import one_thread
+
+_LONGER_THAN_GAP_S = 0.06  # begins a stream anew; StreamingDetector fills up to 0.05 s
+_PATIENCE_S = 10.0  # for sinks, when all is to end
+
+
+@dataclass
+class Counts:
+    """What came of a stream so far.
+
+    Attributes:
+        received: samples that came, those included that a source put NaN for.
+        dropped: of these, samples that the detector never saw, since it was behind.
+        alarms: that were raised.
+    """
+
+    received: int = 0
+    dropped: int = 0
+    alarms: int = 0
+
+
+def watch(
+    source: Source,
+    stream: StreamingDetector,
+    sinks: Sequence[Sink],
+    *,
+    queue_s: float = 2.0,
+    counts: Counts | None = None,
+) -> Counts:
+    """Watch a source until it ends: each sample through the detector, what it says to all sinks.
+
+    One thread reads, one decides and calls the sinks; this one waits. Where the source is live and
+    ``queue_s`` of samples wait to be decided on, all of them are dropped, counted and told
+    (``"dropped"``): decisions are late by no more than that. Behind samples that are lacking
+    (dropped, or a connection that was lost) times go on as the clock of this machine did, and a new
+    stream of decisions begins, if it is more than 0.05 s.
+
+    However it ends (a signal, or an exception of a sink), the last decisions are flushed and
+    all sinks are closed.
+
+    Args:
+        source: of samples.
+        stream: of a detector; nothing was pushed yet.
+        sinks: called in their order.
+        queue_s: most that waits.
+        counts: to be kept up to date, for others to see.
+
+    Returns:
+        The counts.
+
+    Raises:
+        Exception: what the source or a sink raised.
+        ValueError: if a block is not of this hand.
+    """
+    state = _State(source, stream, sinks, queue_s, counts or Counts())
+    reader = threading.Thread(target=state.read, name="tactslip-read", daemon=True)
+    decider = threading.Thread(target=state.decide, name="tactslip-decide", daemon=True)
+    decider.start()
+    reader.start()
+    try:
+        while decider.is_alive():
+            decider.join(0.2)  # signals come in between
+    except BaseException:
+        state.stop()
+        decider.join(_PATIENCE_S)
+        raise
+    if state.error is not None:
+        raise state.error
+    return state.counts
+
+
+class _State:
+    """What both threads share."""
+
+    def __init__(
+        self,
+        source: Source,
+        stream: StreamingDetector,
+        sinks: Sequence[Sink],
+        queue_s: float,
+        counts: Counts,
+    ) -> None:
+        self._source, self._stream, self._sinks, self.counts = source, stream, sinks, counts
+        self._rate = stream.detector.pool.sample_rate_hz
+        self._most = max(1, round(queue_s * self._rate))
+        self._queue: deque[tuple[int, Block] | Event] = deque()
+        self._waiting = 0  # samples in it
+        self._changed = threading.Condition()
+        self._is_over = False
+        self._next: int | None = None  # index of the sample that would go on
+        self.error: BaseException | None = None
+
+    def stop(self) -> None:
+        """End soon: what waits is still decided on."""
+        self._source.close()
+        with self._changed:
+            self._is_over = True
+            self._changed.notify_all()
+
+    # Reading --------------------------------------------------------------------------------------
+
+    def read(self) -> None:
+        """Blocks from the source into the queue, each with the index of its first sample."""
+        position, came_s, next_s = 0, time.monotonic(), 0.0
+        is_broken = False
+        try:
+            for item in self._source:
+                if isinstance(item, Event):
+                    is_broken |= item.kind in ("lost", "waiting", "gap")
+                    self._put(item)
+                    continue
+                num, now_s = len(item.samples), time.monotonic()
+                if item.time_s is not None and num:
+                    if position:
+                        position += max(0, round((item.time_s[0] - next_s) * self._rate))
+                    next_s = item.time_s[-1] + 1 / self._rate
+                elif is_broken and position:
+                    lacking = round((now_s - came_s) * self._rate) - num
+                    position += max(lacking, round(_LONGER_THAN_GAP_S * self._rate))
+                is_broken, came_s = False, now_s
+                self.counts.received += num
+                self._put((position, item))
+                position += num
+                if self._is_over:
+                    break
+        except BaseException as error:
+            self.error = self.error or error
+        with self._changed:
+            self._is_over = True
+            self._changed.notify_all()
+
+    def _put(self, item: tuple[int, Block] | Event) -> None:
+        with self._changed:
+            if isinstance(item, Event):
+                self._queue.append(item)
+                self._changed.notify_all()
+                return
+            num = len(item[1].samples)
+            while not self._source.is_live and self._waiting >= self._most and not self._is_over:
+                self._changed.wait(0.2)
+            if self._source.is_live and self._waiting and self._waiting + num > self._most:
+                lost, self._waiting = self._waiting, 0
+                self.counts.dropped += lost
+                events = [each for each in self._queue if isinstance(each, Event)]
+                self._queue = deque(events)
+                text = f"{lost} samples dropped: the detector was {lost / self._rate:.2f} s behind"
+                self._queue.append(Event("dropped", text))
+            self._queue.append(item)
+            self._waiting += num
+            self._changed.notify_all()
+
+    # Deciding -------------------------------------------------------------------------------------
+
+    def decide(self) -> None:
+        """All that waits, at once, until nothing more can come."""
+        with one_thread(), ExitStack() as closing:
+            for sink in reversed(self._sinks):
+                closing.callback(self._close, sink)
+            try:
+                while items := self._get():
+                    for item in _merged(items):
+                        if isinstance(item, Event):
+                            self._tell(item)
+                        else:
+                            self._push(*item)
+                self._hand_on(self._stream.flush())
+                self._tell(Event("ended", f"{self._source.name}: ended"))
+            except BaseException as error:
+                self.error = error
+                self.stop()
+
+    def _get(self) -> list[tuple[int, Block] | Event]:
+        with self._changed:
+            while not self._queue and not self._is_over:
+                self._changed.wait()
+            items = list(self._queue)
+            self._queue.clear()
+            self._waiting = 0
+            self._changed.notify_all()
+            return items
+
+    def _push(self, first: int, block: Block) -> None:
+        if not len(block.samples):
+            return
+        time_s = block.time_s
+        if time_s is None and first != self._next:
+            time_s = np.array(first / self._rate)
+        gaps = self._stream.num_gaps
+        try:
+            decisions = self._stream.push(block.samples, time_s)
+        except ValueError as error:
+            if block.time_s is None:
+                raise
+            self._tell(Event("garbage", f"{len(block.samples)} samples passed over: {error}"))
+            return
+        self._next = first + len(block.samples)
+        if self._stream.num_gaps > gaps:
+            self._tell(Event("gap", f"a gap at {first / self._rate:.3f} s: decisions begin anew"))
+        for sink in self._sinks:
+            sink.samples(first, block)
+        self._hand_on(decisions)
+
+    def _hand_on(self, decisions: Decisions) -> None:
+        if len(decisions.number):
+            self.counts.alarms += int(decisions.is_alarm.sum())
+            for sink in self._sinks:
+                sink.decisions(decisions)
+
+    def _tell(self, event: Event) -> None:
+        for sink in self._sinks:
+            sink.event(*event)
+
+    def _close(self, sink: Sink) -> None:
+        try:
+            sink.close()
+        except Exception as error:
+            self.error = self.error or error
+
+
+def _merged(items: list[tuple[int, Block] | Event]) -> list[tuple[int, Block] | Event]:
+    """Blocks that follow one another without times as one: a push costs less than two."""
+    merged: list[tuple[int, Block] | Event] = []
+    parts: list[tuple[int, Block]] = []
+
+    def together() -> None:
+        if parts:
+            samples = [block.samples for _, block in parts]
+            whole = samples[0] if len(samples) == 1 else np.concatenate(samples)
+            merged.append((parts[0][0], Block(whole, parts[0][1].time_s)))
+            parts.clear()
+
+    for item in items:
+        if isinstance(item, Event):
+            together()
+            merged.append(item)
+            continue
+        first, block = item
+        if parts:
+            last, before = parts[-1]
+            follows = last + len(before.samples) == first
+            if not follows or block.time_s is not None or before.time_s is not None:
+                together()
+        parts.append(item)
+    together()
+    return merged
