@@ -11,6 +11,7 @@ COMMANDS = {
     "train": "fit a detector, evaluate, save and export it",
     "evaluate": "evaluate a saved detector on recordings",
     "detect": "find slips in recordings",
+    "stream": "find slips in samples as they come: serial port, socket, stdin or file",
     "generate": "write simulated recordings as files",
     "data": "check, describe and convert recordings in files",
     "export": "write a detector as ONNX",

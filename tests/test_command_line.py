@@ -82,6 +82,15 @@ MISTAKES = {
     "evaluate recipe=paper model=detector.pt": "'evaluate has no key recipe'",
     "detect model=missing.pt input=recordings": "missing.pt",
     "detect model=missing.pt imput=recordings": "'did you mean input?'",
+    "stream": "model=",
+    "stream model=detector.pt": "source=",
+    "stream model=detector.pt source=nowhere.csv": "nowhere.csv serial: listen: stdin",
+    "stream model=detector.pt source=serial:/dev/ttyNONE": "/dev/ttyNONE 'there are:'",
+    "stream model=detector.pt source=tcp:robot": "[HOST:]PORT 'robot'",
+    "stream model=detector.pt source=stdin --serve": "'write serve='",
+    "stream model=detector.pt source=stdin frame.format=csv": "frame.format text binary 'csv'",
+    "stream model=detector.pt source=serial:/dev/ttyACM0 frame.format=binary": "frame.header",
+    "stream model=detector.pt source=stdin serve=true token=abc": "token 8 3",
     "export model=missing.pt": "missing.pt",
     "importance model=missing.pt": "missing.pt",
     "data root=recordings": "action=",
@@ -126,6 +135,8 @@ def in_a_folder():
         (place / "recordings").mkdir()
         (place / "recordings" / "cup1.csv").write_text("t,SG1\n0,1\n")
         (place / "notes.txt").write_text("no detector")
+        pretrained = ROOT / "tactslip_torch" / "pretrained" / "paper24-sim.pt"
+        (place / "detector.pt").write_bytes(pretrained.read_bytes())
         os.chdir(place)
         try:
             yield place

@@ -107,7 +107,7 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
                 f"{key} must be true or false, got {config[key]!r}; files are called as their "
                 "recordings"
             )
-    context = _DetectionContext(detector, _settings(config, detector), reading, config, folder)
+    context = _DetectionContext(detector, settings_of(config, detector), reading, config, folder)
     paths = recording_files(Path(str(config.input)))
     save_config(config, folder)
     content = _origin(context) | {"events": None, "recordings": [], "failed": []}
@@ -255,7 +255,12 @@ def _with_truth(
     return entry | {"truth": known, "alarms": alarms}, events
 
 
-def _settings(config: DictConfig, detector: SlipDetector) -> AlarmSettings:
+def settings_of(config: DictConfig, detector: SlipDetector) -> AlarmSettings:
+    """The settings in a detector's file, with ``threshold``, if it is given.
+
+    Raises:
+        ValueError: if it is no number.
+    """
     settings = AlarmSettings.of(detector)
     if config.threshold is None:
         return settings

@@ -1,6 +1,44 @@
-"""A detector on samples as they come: sources, sinks, and the pump between them."""
+"""A detector on samples as they come: sources, sinks, and the pump between them.
 
-from tactslip_torch.live.sinks import Block, Callback, Event, JsonLines, Sink
-from tactslip_torch.live.sources import Source
+Example:
+    >>> from tactslip_torch import SlipDetector, StreamingDetector
+    >>> from tactslip_torch.live import Callback, Frames, SerialPort, watch
+    >>> detector = SlipDetector.load("detector.pt")  # doctest: +SKIP
+    >>> port = SerialPort("/dev/ttyACM0", Frames(), detector)  # doctest: +SKIP
+    >>> watch(port, StreamingDetector(detector), [Callback(print)])  # doctest: +SKIP
+"""
 
-__all__ = ["Block", "Callback", "Event", "JsonLines", "Sink", "Source"]
+from tactslip_torch.live.frames import Frames
+from tactslip_torch.live.pump import Counts, watch
+from tactslip_torch.live.server import PageServer, page_facts
+from tactslip_torch.live.sinks import Block, Callback, Event, JsonLines, LineServer, Sink
+from tactslip_torch.live.sources import (
+    FileInTime,
+    SerialPort,
+    Source,
+    StandardInput,
+    TcpClient,
+    TcpListener,
+    source_of,
+)
+
+__all__ = [
+    "Block",
+    "Callback",
+    "Counts",
+    "Event",
+    "FileInTime",
+    "Frames",
+    "JsonLines",
+    "LineServer",
+    "PageServer",
+    "SerialPort",
+    "Sink",
+    "Source",
+    "StandardInput",
+    "TcpClient",
+    "TcpListener",
+    "page_facts",
+    "source_of",
+    "watch",
+]

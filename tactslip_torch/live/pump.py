@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 
@@ -19,6 +19,8 @@ from tactslip_torch.runtime import one_thread
 
 _LONGER_THAN_GAP_S = 0.06  # begins a stream anew; StreamingDetector fills up to 0.05 s
 _PATIENCE_S = 10.0  # for sinks, when all is to end
+_BREAKS = ("lost", "waiting", "gap", "dropped")
+"""Events behind which samples are lacking."""
 
 
 @dataclass
@@ -105,6 +107,7 @@ class _State:
         self._changed = threading.Condition()
         self._is_over = False
         self._next: int | None = None  # index of the sample that would go on
+        self._is_break_told = False
         self.error: BaseException | None = None
 
     def stop(self) -> None:
@@ -119,29 +122,32 @@ class _State:
     def read(self) -> None:
         """Blocks from the source into the queue, each with the index of its first sample."""
         position, came_s, next_s = 0, time.monotonic(), 0.0
-        is_broken = False
+        is_broken, items = False, iter(self._source)
         try:
-            for item in self._source:
+            for item in items:
                 if isinstance(item, Event):
-                    is_broken |= item.kind in ("lost", "waiting", "gap")
+                    is_broken |= item.kind in _BREAKS
                     self._put(item)
                     continue
                 num, now_s = len(item.samples), time.monotonic()
                 if item.time_s is not None and num:
-                    if position:
-                        position += max(0, round((item.time_s[0] - next_s) * self._rate))
-                    next_s = item.time_s[-1] + 1 / self._rate
+                    lacking = round((item.time_s[0] - next_s) * self._rate) if position else 0
+                    position += max(0, lacking)
+                    num = num if lacking >= 0 else 0  # goes back: not to be decided on
+                    next_s = max(next_s, item.time_s[-1] + 1 / self._rate)
                 elif is_broken and position:
                     lacking = round((now_s - came_s) * self._rate) - num
                     position += max(lacking, round(_LONGER_THAN_GAP_S * self._rate))
                 is_broken, came_s = False, now_s
-                self.counts.received += num
+                self.counts.received += len(item.samples)
                 self._put((position, item))
                 position += num
                 if self._is_over:
                     break
         except BaseException as error:
             self.error = self.error or error
+        if isinstance(items, Generator):
+            items.close()  # gives back what it holds
         with self._changed:
             self._is_over = True
             self._changed.notify_all()
@@ -181,7 +187,8 @@ class _State:
                         else:
                             self._push(*item)
                 self._hand_on(self._stream.flush())
-                self._tell(Event("ended", f"{self._source.name}: ended"))
+                if self.error is None:
+                    self._tell(Event("ended", f"{self._source.name}: ended"))
             except BaseException as error:
                 self.error = error
                 self.stop()
@@ -211,8 +218,9 @@ class _State:
             self._tell(Event("garbage", f"{len(block.samples)} samples passed over: {error}"))
             return
         self._next = first + len(block.samples)
-        if self._stream.num_gaps > gaps:
+        if self._stream.num_gaps > gaps and not self._is_break_told:
             self._tell(Event("gap", f"a gap at {first / self._rate:.3f} s: decisions begin anew"))
+        self._is_break_told = False
         for sink in self._sinks:
             sink.samples(first, block)
         self._hand_on(decisions)
@@ -224,6 +232,7 @@ class _State:
                 sink.decisions(decisions)
 
     def _tell(self, event: Event) -> None:
+        self._is_break_told |= event.kind in _BREAKS
         for sink in self._sinks:
             sink.event(*event)
 

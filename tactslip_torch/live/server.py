@@ -210,6 +210,7 @@ class PageServer:
                 process_request=self._answer,
                 compression=None,
                 max_size=1024,
+                close_timeout=_LAST_WORDS_S,
                 server_header=None,
                 logger=quiet,
             )
@@ -228,8 +229,8 @@ class PageServer:
                     self._tell_state()
             self._send_pending()
             self._tell_state()
-            waits = [page.drained() for page in self._pages]
-            await asyncio.wait_for(asyncio.gather(*waits), _LAST_WORDS_S) if waits else None
+            if waits := [asyncio.ensure_future(page.drained()) for page in self._pages]:
+                await asyncio.wait(waits, timeout=_LAST_WORDS_S)
 
     def _send_pending(self) -> None:
         with self._lock:
@@ -322,12 +323,12 @@ class _Page:
 
     def offer(self, messages: list[tuple[str | bytes, int]]) -> None:
         """Put messages behind the others, with how many samples each holds."""
-        self._waiting.extend(messages)
-        self._rows += sum(rows for _, rows in messages)
         if self._rows > self._most_rows:
             self.dropped += self._rows
             self._waiting = deque(each for each in self._waiting if not each[1])
             self._rows = 0
+        self._waiting.extend(messages)
+        self._rows += sum(rows for _, rows in messages)
         self._is_hopeless |= len(self._waiting) > _MOST_TEXTS
         if self._waiting:
             self._empty.clear()

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import math
+import socket
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, NamedTuple, Protocol, TextIO
 
 from numpy.typing import NDArray
@@ -15,6 +17,10 @@ from numpy.typing import NDArray
 from tactslip_torch.onset.decisions import Alarm, Decisions
 
 Array = NDArray[Any]
+
+
+_MOST_WAITING = 1 << 20
+"""Bytes that a program which reads lines may be behind."""
 
 
 class Block(NamedTuple):
@@ -196,3 +202,54 @@ class Callback:
 
     def close(self) -> None:
         """Nothing is left to be told."""
+
+
+class LineServer:
+    """A port on which programs connect to read lines. One that does not read is cut off.
+
+    Args:
+        host: address to listen at.
+        port: to listen at, 0 for any that is free.
+
+    Attributes:
+        host: that it listens at.
+        port: so.
+
+    Raises:
+        OSError: if the port is taken.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        try:
+            self._listener = socket.create_server((host, port), family=family)
+        except OSError as error:
+            reason = error.strerror or error
+            raise OSError(f"cannot listen at {host}:{port}: {reason}; give another port") from None
+        self._listener.setblocking(False)
+        self.host, self.port = host, int(self._listener.getsockname()[1])
+        self._readers: dict[socket.socket, bytearray] = {}
+
+    def write(self, text: str) -> None:
+        """Send lines to all that are connected, as far as they take them now."""
+        with suppress(BlockingIOError):
+            while True:
+                reader, _ = self._listener.accept()
+                reader.setblocking(False)
+                self._readers[reader] = bytearray()
+        for reader, waiting in list(self._readers.items()):
+            waiting += text.encode()
+            try:
+                del waiting[: reader.send(waiting)]
+            except BlockingIOError:
+                pass
+            except OSError:
+                waiting.extend(bytes(_MOST_WAITING))  # gone
+            if len(waiting) >= _MOST_WAITING:
+                self._readers.pop(reader).clear()
+                reader.close()
+
+    def close(self) -> None:
+        """No more lines."""
+        for each in (self._listener, *self._readers):
+            each.close()

@@ -223,7 +223,7 @@ class SerialPort(_ByteSource):
         try:
             port = self._serial.Serial(self._port, self._baud, timeout=_POLL_S, exclusive=True)
         except self._serial.SerialException as error:
-            raise OSError(None, self._said(error)) from None
+            raise OSError(self._said(error)) from None
         with suppress(Exception):  # only where the driver has it
             port.set_low_latency_mode(True)
         return _SerialConnection(port)
@@ -393,6 +393,10 @@ class FileInTime:
         speed: times faster than real time; ``None``: as fast as it is taken.
         repeat: whether it begins again at its end.
 
+    Attributes:
+        recording: its truth and origin, around no samples; ``None``: a file of others.
+        dtype: of its samples, float32 or float64.
+
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: in one line, if it is damaged or not of this detector.
@@ -419,8 +423,9 @@ class FileInTime:
         self._stopped = threading.Event()
         with open_file(path, how) as opened:
             self.simulated = bool(file_facts(path, opened.archived)["simulated"])
-        with hand_file(*self._given):
-            pass
+            self.recording = opened.archived and opened.archived.recording
+        with hand_file(*self._given) as opened:
+            self.dtype = opened.samples.dtype
 
     def close(self) -> None:
         """End the iteration."""
@@ -437,7 +442,7 @@ class FileInTime:
 
     def _once(self) -> Iterator[Block]:
         started_s, done = time.monotonic(), 0
-        step = max(1, round(_BLOCK_S * self._rate * max(1.0, self._speed or np.inf)))
+        step = max(1, round(_BLOCK_S * self._rate * max(1.0, self._speed or 1.0)))
         with hand_file(*self._given) as opened:
             num_piece = round(_PIECE_S * self._rate)
             for piece in pieces(opened.samples, num_piece):

@@ -1,0 +1,172 @@
+"""Slip in samples as they come: ``tactslip stream model=detector.pt source=PLACE``.
+
+``live`` does the work; here is what the configuration makes of it. JSON lines alone go to standard
+output, what happens to the stream to standard error as well, in a line each.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from tactslip_torch.commands.detect import settings_of
+from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.commands.hosts import hosts_dir
+from tactslip_torch.data.formats import Reading
+from tactslip_torch.live.frames import Frames
+from tactslip_torch.live.pump import Counts, watch
+from tactslip_torch.live.server import PageServer, page_facts
+from tactslip_torch.live.sinks import Callback, JsonLines, LineServer, Sink
+from tactslip_torch.live.sources import FileInTime, Source, address_of, source_of
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.runtime import check_number
+
+_SWITCH_S = 5e-4
+"""Between threads of Python: by default one may keep the others from running for 5 ms."""
+
+
+def stream(config: DictConfig, folder: Path) -> Counts:
+    """Watch a source until it ends.
+
+    Args:
+        config: composed from ``conf/stream.yaml``.
+        folder: of no use, nothing is left.
+
+    Returns:
+        What was counted.
+
+    Raises:
+        ValueError: for bad input, in one line.
+        OSError: so, of a file, a serial port or an address.
+    """
+    del folder
+    for name in ("decisions", "serve", "repeat"):
+        if type(config[name]) is not bool:
+            raise ValueError(f"{name} must be true or false, got {config[name]!r}")
+    check_number("queue_s", config.queue_s)
+    detector = SlipDetector.load(config.model, backend=config.backend)
+    settings = settings_of(config, detector)
+    source, counts = _source(config, detector), Counts()
+    dtype = source.dtype if isinstance(source, FileInTime) else torch.float64
+    masked = config.masked_channels or ()
+    watching = StreamingDetector(detector, settings, dtype=dtype, masked_channels=masked)
+    logging.getLogger(StreamingDetector.__module__).setLevel(logging.ERROR)  # an event says it
+    with ExitStack() as stack, closing(source):
+        stack.enter_context(_quick_threads())
+        sinks: list[Sink] = [Callback(lambda alarm: None, _say)]
+        if config.serve:
+            page = _page(config, watching, source, counts)
+            stack.callback(page.close)  # also where another sink cannot be made
+            sinks.append(page)
+            print(f"page: {page.address}", file=sys.stderr, flush=True)
+        sinks += _logs(config, watching, source)
+        if config.output is not None:
+            options = {
+                "every": config.decisions,
+                "has_onset": settings.onset is not None,
+                "sample_rate_hz": detector.pool.sample_rate_hz,
+            }
+            if config.output == "stdout":
+                sinks.append(JsonLines.to_file(sys.stdout, **options))
+            else:
+                lines = LineServer(*address_of(str(config.output), "output="))
+                stack.callback(lines.close)
+                sinks.append(JsonLines(lines.write, **options))
+                print(f"lines: {lines.host}:{lines.port}", file=sys.stderr, flush=True)
+        try:
+            watch(source, watching, sinks, queue_s=config.queue_s, counts=counts)
+        except BrokenPipeError:  # whoever reads standard output has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return counts
+
+
+def _source(config: DictConfig, detector: SlipDetector) -> Source:
+    """Where samples come from."""
+    return source_of(
+        str(config.source),
+        detector,
+        Frames.of(_plain(config.frame)),
+        baud=config.baud,
+        reading=Reading.of(_plain(config.reading)),
+        tare_s=config.tare_s,
+        speed=config.speed,
+        repeat=config.repeat,
+    )
+
+
+def _logs(config: DictConfig, watching: StreamingDetector, source: Source) -> list[Sink]:
+    """Files that samples and decisions are written to."""
+    sinks: list[Sink] = []
+    detector = watching.detector
+    recording = source.recording if isinstance(source, FileInTime) else None
+    if config.mcap is not None:
+        from tactslip_torch.live.mcap_log import McapLog
+
+        sinks.append(
+            McapLog(
+                Path(str(config.mcap)),
+                detector.pool.hand,
+                detector.pool.sample_rate_hz,
+                watching.settings,
+                recording=recording,
+                units=str(detector.info.get("units", "V")),
+                is_live=source.is_live,
+            )
+        )
+    return sinks
+
+
+def _page(
+    config: DictConfig, watching: StreamingDetector, source: Source, counts: Counts
+) -> PageServer:
+    """The page, served."""
+    port = config.port
+    if type(port) is not int or not 0 <= port < 1 << 16:
+        raise ValueError(f"port must be a whole number from 0 to 65535, got {port!r}")
+    place = hosts_dir()
+    return PageServer(
+        {"": place / "web", "node": place / "node"},
+        page_facts(watching.detector, watching.settings),
+        source=source.name,
+        simulated=source.simulated,
+        counts=counts,
+        host=str(config.host),
+        port=port,
+        token=None if config.token is None else str(config.token),
+    )
+
+
+def _say(kind: str, text: str) -> None:
+    with suppress(OSError):  # nobody reads it
+        print(f"{kind}: {text}", file=sys.stderr, flush=True)
+
+
+def _plain(section: Any) -> Any:
+    return (
+        OmegaConf.to_container(section, resolve=True) if OmegaConf.is_config(section) else section
+    )
+
+
+@contextmanager
+def _quick_threads() -> Iterator[None]:
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+main = entry_point("stream", stream, lambda config, folder, again: "all decisions are written")
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,729 @@
+"""Samples as they come: frames, sources that break off, the pump, and the page's server."""
+
+import asyncio
+import json
+import os
+import pty
+import re
+import socket
+import struct
+import threading
+import time
+import zlib
+from contextlib import contextmanager, suppress
+
+import numpy as np
+import pytest
+import torch
+import websockets
+from small_detector import HAND, alarming_detector
+
+from tactslip_torch.data.formats import Reading
+from tactslip_torch.deploy.check import simulated_stream
+from tactslip_torch.live import (
+    Block,
+    Callback,
+    Counts,
+    Event,
+    FileInTime,
+    Frames,
+    JsonLines,
+    LineServer,
+    PageServer,
+    SerialPort,
+    StandardInput,
+    TcpClient,
+    TcpListener,
+    page_facts,
+    source_of,
+    watch,
+)
+from tactslip_torch.live.sinks import decision_columns
+from tactslip_torch.onset.streaming import StreamingDetector
+
+RATE = 2000.0
+NAMES = HAND.names
+HEADER = "AA 55"
+START = bytes.fromhex(HEADER)
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return alarming_detector()
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return simulated_stream(HAND, RATE, torch.float64).T.numpy().copy()
+
+
+class Kept:
+    """A sink that keeps all it is given."""
+
+    def __init__(self, wait_s=0.0):
+        self.blocks, self.made, self.events, self.is_closed = [], [], [], False
+        self._wait_s, self.changed = wait_s, threading.Event()
+
+    def samples(self, first, block):
+        self.blocks.append((first, block.samples))
+        time.sleep(self._wait_s)
+        self.changed.set()
+
+    def decisions(self, decisions):
+        self.made.append(decisions)
+
+    def event(self, kind, text):
+        self.events.append((kind, text))
+        self.changed.set()
+
+    def close(self):
+        self.is_closed = True
+
+    def column(self, name):
+        return torch.cat([getattr(each, name) for each in self.made])
+
+    def told(self, kind):
+        return [text for each, text in self.events if each == kind]
+
+    def until(self, is_there, seconds=20.0):
+        end = time.monotonic() + seconds
+        while not is_there():
+            assert time.monotonic() < end, self.events
+            self.changed.wait(0.02)
+            self.changed.clear()
+
+
+def expected(detector, samples, dtype=torch.float64):
+    stream = StreamingDetector(detector, dtype=dtype)
+    parts = stream.push(samples.astype(np.float64)), stream.flush()
+    return {name: torch.cat([getattr(p, name) for p in parts]) for name in parts[0]._fields}
+
+
+def assert_decided(kept, wanted):
+    for name, values in wanted.items():
+        torch.testing.assert_close(kept.column(name), values, rtol=1e-9, atol=1e-9, msg=name)
+
+
+# Frames ------------------------------------------------------------------------------------------
+
+
+def written(values, how):
+    """Frames of ``values [n, C]``, made by the words of the description alone."""
+    order = "<" if how.byte_order == "little" else ">"
+    frames = []
+    for number, first in enumerate(range(0, len(values), how.samples)):
+        content = b""
+        if how.counter:
+            size = int(how.counter[4:]) // 8
+            content += (number % (1 << 8 * size)).to_bytes(size, how.byte_order)
+        content += b"\xee" * how.skip
+        for value in values[first : first + how.samples].ravel().tolist():
+            if how.dtype == "int24":
+                content += int(value).to_bytes(3, how.byte_order, signed=True)
+            else:
+                code = {"int16": "h", "uint8": "B", "int32": "i", "float32": "f"}[how.dtype]
+                content += struct.pack(order + code, value)
+        sums = {None: 0, "sum8": 1, "xor8": 1, "crc16": 2, "crc32": 4}[how.checksum]
+        if how.length:
+            content += bytes(how.length - len(content) - sums - len(how.start))
+        total = 0
+        if how.checksum == "sum8":
+            total = sum(content) % 256
+        elif how.checksum == "crc32":
+            total = zlib.crc32(content)
+        elif how.checksum:  # bit by bit, as in the standard
+            for byte in content:
+                total ^= byte
+            if how.checksum == "crc16":
+                total = 0xFFFF
+                for byte in content:
+                    total ^= byte << 8
+                    for _ in range(8):
+                        total = (total << 1 ^ (0x1021 if total & 0x8000 else 0)) & 0xFFFF
+        frames.append(how.start + content + total.to_bytes(sums, how.byte_order))
+    return frames
+
+
+def fed(reader, content, rng):
+    """What a reader makes of bytes in pieces of any size, and of the end."""
+    items = []
+    while content:
+        num = int(rng.integers(1, 60))
+        items += reader.feed(content[:num])
+        content = content[num:]
+    items += reader.end()
+    blocks = [item.samples for item in items if isinstance(item, Block)]
+    return np.concatenate([np.empty((0, 4)), *blocks]), [i for i in items if isinstance(i, Event)]
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {},
+        {"header": HEADER},
+        {"header": HEADER, "byte_order": "big", "counter": "uint8", "checksum": "xor8"},
+        {"header": "7E", "dtype": "int24", "samples": 5, "skip": 3, "checksum": "crc16"},
+        {"header": HEADER, "dtype": "int24", "byte_order": "big", "counter": "uint16"},
+        {"header": HEADER, "dtype": "float32", "length": 40, "checksum": "crc32"},
+        {"dtype": "uint8", "checksum": "sum8", "columns": ["t", *reversed(NAMES)], "scale": 2.0},
+        {"header": HEADER, "dtype": "int32", "scale": [1.0, 0.5, 2.0, -1.0], "offset": 3.0},
+    ],
+    ids=str,
+)
+def test_binary_frames_are_read_as_they_are_described(how, rng):
+    frames = Frames(format="binary", **how)
+    reader = frames.reader(NAMES, RATE)
+    columns = frames.columns or list(NAMES)
+    low = 0 if frames.dtype == "uint8" else -120
+    values = rng.integers(low, 120, (400, len(columns)))
+    found, events = fed(reader, b"".join(written(values, frames)), rng)
+    picked = values[:, [columns.index(name) for name in NAMES]]
+    wanted = picked * np.asarray(frames.scale) + frames.offset
+    np.testing.assert_array_equal(found, wanted)
+    assert events == []
+
+
+@pytest.mark.parametrize("counter", [None, "uint8"])
+@pytest.mark.parametrize("checksum", [None, "crc16"])
+@pytest.mark.parametrize("fault", ["noise", "short", "long", "absent"])
+def test_behind_garbage_frames_are_found_again_in_one_line(fault, checksum, counter, rng):
+    frames = Frames("binary", header=HEADER, checksum=checksum, counter=counter)
+    values = rng.integers(-9, 9, (300, 4))
+    whole = written(values, frames)
+    whole[100] = {
+        "noise": whole[100] + rng.integers(0, 256, 200, np.uint8).tobytes() + START,
+        "short": whole[100][:-3],
+        "long": whole[100] + b"\x01\x02",
+        "absent": b"",
+    }[fault]
+    reader = frames.reader(NAMES, RATE, begins_inside=True)
+    items = [*reader.feed(whole[0][5:] + b"".join(whole[1:99]))]
+    for frame in whole[99:]:  # as a device sends them
+        items += reader.feed(frame)
+    items += reader.end()
+    found = np.concatenate([item.samples for item in items if isinstance(item, Block)])
+    events = [item for item in items if isinstance(item, Event)]
+    wanted = "missing" if fault == "absent" else "garbage"
+    kinds = {event.kind for event in events}
+    if fault == "absent" and counter is None:
+        assert events == []  # nobody can know
+    else:
+        assert wanted in kinds
+        assert all(sum(e.kind == kind for e in events) == 1 for kind in kinds), events
+    is_known = np.isfinite(found).all(1)
+    known = found[is_known]
+    np.testing.assert_array_equal(known[:98], values[1:99])
+    np.testing.assert_array_equal(known[-190:], values[-190:])
+    assert len(known) >= 299 - 3
+    if counter:  # time stays right
+        assert len(found) == 299
+
+
+def test_lines_of_text_are_read_with_their_faults(rng):
+    values = rng.normal(size=(50, 4)).round(6)
+    names = ["counter", "t", *NAMES]
+    lines = [f"{i},{i / RATE},{','.join(map(str, row))}" for i, row in enumerate(values.tolist())]
+    lines[20] = "20,0.01,1,2"
+    lines[30] = "30,0.015,1,2,x,4"
+    del lines[40:42]
+    frames = Frames(columns=names, scale=2.0)
+    found, events = fed(
+        frames.reader(NAMES, RATE), "".join(f"{x}\r\n" for x in lines).encode(), rng
+    )
+    wanted = 2 * values
+    wanted[[20, 30, 40, 41]] = np.nan
+    np.testing.assert_array_equal(found, wanted)
+    kinds = sorted(event.kind for event in events)
+    assert kinds == ["garbage", "garbage", "missing", "missing"]
+    assert "4 values, expected 6, counter to PVDF2" in events[0].text
+    text = f"# a comment\n{';'.join(reversed(NAMES))}\n1;2;3;4\n\n5;;7;8\n"
+    found, events = fed(Frames(separator=";").reader(NAMES, RATE), text.encode(), rng)
+    np.testing.assert_array_equal(found, [[4, 3, 2, 1], [8, 7, np.nan, 5]])
+    assert events == []
+
+
+def test_garbage_without_end_is_told_ever_less_often():
+    now = [0.0]
+    frames = Frames("binary", header=HEADER)
+    reader = frames.reader(NAMES, RATE, now=lambda: now[0])
+    told = []
+    for second in range(300):
+        now[0] = float(second)
+        told += [second for _ in reader.feed((START + bytes(20)) * 50)]
+    assert 3 <= len(told) <= 12
+    (event,) = reader.end()
+    assert "10 bytes that begins with aa 55 (two such headers are 22 apart)" in event.text
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"format": "csv"}, "frame.format text, binary 'csv'"),
+        ({"format": "binary", "dtype": "int12"}, "frame.dtype int16 'int12'"),
+        ({"format": "binary", "header": "zz"}, "frame.header hexadecimal AA 55"),
+        ({"format": "binary", "header": 5555}, "frame.header quotes 5555"),
+        ({"format": "binary", "length": 7}, "frame.length 7 8"),
+        ({"columns": ["SG1", "SG2", "PVDF1"]}, "frame.columns PVDF2"),
+        ({"columns": ["SG1", "SG1"]}, "frame.columns different"),
+        ({"scale": [1.0, 2.0]}, "frame.scale 4"),
+        ({"samples": 0}, "frame.samples 0"),
+        ({"skip": -1}, "frame.skip -1"),
+    ],
+)
+def test_a_description_that_cannot_be_is_refused(how, words):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011  # the words are below
+        Frames.of(how).reader(NAMES, RATE)
+    assert [word for word in words.split() if word not in str(caught.value)] == []
+    with pytest.raises(ValueError, match=r"frame must be of .*'lenght'"):
+        Frames.of({"lenght": 3})
+
+
+# Sources -----------------------------------------------------------------------------------------
+
+BINARY = Frames("binary", header=HEADER, dtype="int16", counter="uint16", scale=2**-12)
+
+
+def as_sent(samples):
+    """Whole numbers that a device sends, and the volts that they are."""
+    numbers = (samples * 2**12).round().clip(-(2**15), 2**15 - 1).astype(int)
+    return written(numbers, BINARY), numbers / 2.0**12
+
+
+@contextmanager
+def watched(source, detector, *sinks, **options):
+    """A source that is watched while the block runs; it is closed at its end."""
+    kept, failed = Kept(), []
+
+    def run():
+        try:
+            watch(
+                source, StreamingDetector(detector, dtype=torch.float64), [kept, *sinks], **options
+            )
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield kept
+    finally:
+        source.close()
+        thread.join(20)
+        assert not thread.is_alive()
+        assert failed == []
+        assert kept.is_closed
+
+
+class Pty:
+    """A serial cable: what is written comes out of a port whose path stays when it is pulled."""
+
+    def __init__(self, folder):
+        self.path = folder / "ttyACM0"
+        self.plug()
+
+    def plug(self):
+        self.master, self.slave = pty.openpty()
+        import tty
+
+        tty.setraw(self.slave)
+        with suppress(FileNotFoundError):
+            self.path.unlink()
+        self.path.symlink_to(os.ttyname(self.slave))
+
+    def source(self, detector):
+        return SerialPort(str(self.path), BINARY, detector)
+
+    def accept(self):
+        pass
+
+    def send(self, content):
+        while content:
+            content = content[os.write(self.master, content) :]
+
+    def pull(self):
+        os.close(self.slave)
+        os.close(self.master)
+        self.path.unlink()
+
+    close = pull
+
+
+class Device:
+    """A device on a socket, which listens or connects."""
+
+    def __init__(self, listens):
+        self._server = socket.create_server(("127.0.0.1", 0)) if listens else None
+        self._port = self._server.getsockname()[1] if listens else None
+
+    def source(self, detector):
+        if self._server:
+            return TcpClient("127.0.0.1", self._port, BINARY, detector)
+        source = TcpListener("127.0.0.1", 0, BINARY, detector)
+        self._port = source.port
+        return source
+
+    def accept(self):
+        if self._server:
+            self._peer = self._server.accept()[0]
+        else:
+            self._peer = socket.create_connection(("127.0.0.1", self._port))
+
+    plug = accept
+
+    def send(self, content):
+        self._peer.sendall(content)
+
+    def close(self):
+        self._peer.close()
+        if self._server:
+            self._server.close()
+
+    def pull(self):
+        reset = struct.pack("ii", 1, 0)
+        self._peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, reset)
+        self._peer.close()
+
+
+@pytest.mark.parametrize("kind", ["serial", "connects", "listens"])
+def test_a_stream_is_decided_on_and_recovers_when_the_cable_is_pulled(
+    kind, detector, samples, tmp_path
+):
+    device = Pty(tmp_path) if kind == "serial" else Device(kind == "listens")
+    frames, volts = as_sent(samples)
+    whole = b"".join(frames)
+    counts = Counts()
+    lines = []
+    to_lines = JsonLines(lines.append, every=True, sample_rate_hz=RATE)
+    with watched(device.source(detector), detector, to_lines, counts=counts) as kept:
+        device.accept()
+        kept.until(lambda: kept.told("connected"))
+        first = b"\x01\x02" * 4 if kind == "serial" else b""  # the end of a frame
+        device.send(first + whole)
+        kept.until(lambda: counts.received == len(samples))
+        device.pull()
+        kept.until(lambda: kept.told("lost"))
+        device.plug()
+        kept.until(lambda: len(kept.told("connected")) == 2)
+        device.send(whole)
+        kept.until(lambda: counts.received == 2 * len(samples))
+    device.close()
+    assert [kind for kind, _ in kept.events if kind != "waiting"] == [
+        *("connected", "lost", "connected", "ended")
+    ]
+    assert counts.dropped == 0
+    wanted = expected(detector, volts)
+    num = len(wanted["number"])
+    for name in ("number", "score", "statistic", "is_alarm", "is_valid"):
+        for part in (kept.column(name)[:num], kept.column(name)[num:]):
+            torch.testing.assert_close(part, wanted[name], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(kept.column("available_s")[:num], wanted["available_s"])
+    begins = kept.blocks[-1][0] + len(kept.blocks[-1][1]) - len(samples)
+    again_s = kept.column("available_s")[num:] - begins / RATE
+    torch.testing.assert_close(again_s, wanted["available_s"])
+    assert begins > len(samples)
+    rows = [json.loads(line) for text in lines for line in text.splitlines()]
+    assert [row["score"] for row in rows if "score" in row] == kept.column("score").tolist()
+    alarms = int(kept.column("is_alarm").sum())
+    assert alarms == counts.alarms > 2
+    assert rows[-1] == {"decisions": 2 * num, "alarms": alarms, "seconds": rows[-1]["seconds"]}
+
+
+@pytest.mark.parametrize("written_as", ["npz", "csv"])
+def test_a_file_is_decided_on_as_it_is(written_as, detector, samples, tmp_path):
+    path = tmp_path / f"recording.{written_as}"
+    if written_as == "npz":
+        np.savez(path, samples=samples)
+    else:
+        np.savetxt(path, samples, delimiter=",", header=",".join(NAMES), comments="")
+    reading = Reading(sample_rate_hz=RATE, time_first=True)
+    kept = Kept()
+    source = source_of(str(path), detector, Frames(), reading=reading, speed=None)
+    watch(source, StreamingDetector(detector, dtype=source.dtype), [kept])
+    assert_decided(kept, expected(detector, samples))
+    np.testing.assert_array_equal(np.concatenate([x for _, x in kept.blocks]), samples)
+    fast = FileInTime(path, detector, reading, speed=40.0, repeat=True)
+    started_s = time.monotonic()
+    with watched(fast, detector, queue_s=0.5) as kept:
+        kept.until(lambda: len(kept.told("gap")) == 2)
+        assert time.monotonic() - started_s >= 2 * len(samples) / RATE / 40
+    assert kept.column("number").eq(0).sum() >= 2
+
+
+def test_standard_input_is_read_to_its_end(detector, samples, monkeypatch):
+    text = "".join(f"{' '.join(map(repr, row))}\n" for row in samples.tolist()).encode()
+    ours, theirs = os.pipe()
+    before = os.dup(0)
+    os.dup2(ours, 0)
+    writer = threading.Thread(target=lambda: (os.write(theirs, text), os.close(theirs)))
+    try:
+        writer.start()
+        kept = Kept()
+        source = StandardInput(Frames(), detector)
+        watch(source, StreamingDetector(detector, dtype=torch.float64), [kept], queue_s=0.05)
+    finally:
+        os.dup2(before, 0)
+        for each in (ours, before):
+            os.close(each)
+        writer.join()
+    assert_decided(kept, expected(detector, samples))
+
+
+# The pump ----------------------------------------------------------------------------------------
+
+
+class Sent:
+    """A source of blocks that are there."""
+
+    name, is_live, simulated = "sent", True, False
+
+    def __init__(self, items, is_live=True):
+        self.items, self.is_live = items, is_live
+
+    def __iter__(self):
+        return iter(self.items)
+
+    def close(self):
+        self.items = []
+
+
+def test_what_waits_too_long_is_dropped_and_counted_and_times_stay_right(detector, samples):
+    blocks = [Block(samples[i : i + 50]) for i in range(0, len(samples), 50)]
+    for is_live in (True, False):
+        kept, counts = Kept(wait_s=0.002), Counts()
+        stream = StreamingDetector(detector, dtype=torch.float64)
+        watch(Sent(blocks, is_live), stream, [kept], queue_s=0.2, counts=counts)
+        num = sum(len(block) for _, block in kept.blocks)
+        assert counts.received == len(samples)
+        assert num + counts.dropped == counts.received
+        assert (counts.dropped > 0) is is_live
+        assert bool(kept.told("dropped")) is is_live
+        for first, block in kept.blocks:
+            np.testing.assert_array_equal(block, samples[first : first + len(block)])
+        assert (kept.column("available_s").diff() > 0).all()
+
+
+def test_times_of_a_sender_count_and_what_goes_back_is_passed_over(detector, samples):
+    time_s = 1e5 + np.arange(len(samples)) / RATE
+    blocks = [
+        *(Block(samples[i : i + 100], time_s[i : i + 100]) for i in range(0, 1000, 100)),
+        Block(samples[:100], time_s[:100]),
+        *(Block(samples[i : i + 100], time_s[i : i + 100]) for i in range(1040, 2000, 100)),
+    ]
+    kept = Kept()
+    watch(Sent(blocks), StreamingDetector(detector, dtype=torch.float64), [kept])
+    padded = samples[: blocks[-1].time_s.size + 1940].copy()
+    padded[1000:1040] = np.nan
+    wanted = expected(detector, padded)
+    torch.testing.assert_close(kept.column("score"), wanted["score"], equal_nan=True)
+    torch.testing.assert_close(kept.column("available_s"), wanted["available_s"] + 1e5)
+    (line,) = kept.told("garbage")
+    assert "time_s goes back" in line
+    assert kept.blocks[-1][0] == 1940
+
+
+def test_an_error_of_a_sink_ends_the_stream_and_closes_the_others(detector, samples):
+    def fail(alarm):
+        raise RuntimeError("no place left")
+
+    kept = Kept()
+    sinks = [kept, Callback(fail)]
+    with pytest.raises(RuntimeError, match="no place left"):
+        watch(Sent([Block(samples)]), StreamingDetector(detector), sinks)
+    assert kept.is_closed
+
+
+def test_lines_go_to_all_who_connect_and_one_that_does_not_read_is_cut_off():
+    server = LineServer("127.0.0.1", 0)
+    reader, idle = (socket.create_connection((server.host, server.port)) for _ in range(2))
+    text = "x" * 99_999 + "\n"
+    got = []
+    thread = threading.Thread(target=lambda: got.extend(reader.makefile("rb")))
+    thread.start()
+    for _ in range(100):
+        server.write(text)
+        time.sleep(0.002)
+    server.close()
+    thread.join(20)
+    assert got[0] == text.encode()
+    assert len(got) > 50
+    other = LineServer("127.0.0.1", 0)
+    with pytest.raises(OSError, match="cannot listen"):
+        LineServer("127.0.0.1", other.port)
+    for each in (reader, idle, other):
+        each.close()
+
+
+# The page ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folders(tmp_path):
+    (tmp_path / "web" / "node_modules").mkdir(parents=True)
+    (tmp_path / "node").mkdir()
+    (tmp_path / "secret.html").write_text("secret")
+    for name in ("web/index.html", "web/page.mjs", "web/node_modules/x.mjs", "node/graph.mjs"):
+        (tmp_path / name).write_text(name)
+    (tmp_path / "web" / "notes.txt").write_text("secret")
+    (tmp_path / "web" / "link.html").symlink_to(tmp_path / "secret.html")
+    return {"": tmp_path / "web", "node": tmp_path / "node"}
+
+
+@pytest.fixture
+def serve(detector, folders):
+    made = []
+
+    def start(**options):
+        stream = StreamingDetector(detector)
+        facts = page_facts(detector, stream.settings)
+        options = {"source": "test", "simulated": True, "counts": Counts()} | options
+        made.append(PageServer(folders, facts, **options))
+        return made[-1]
+
+    yield start
+    for server in made:
+        server.close()
+
+
+def asked(server, path, method="GET", host=None):
+    """Status and body of a request whose path goes as it is."""
+    with socket.create_connection(("127.0.0.1", server.port)) as peer:
+        host = host or f"127.0.0.1:{server.port}"
+        peer.sendall(f"{method} {path} HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+        head, _, body = peer.makefile("rb").read().partition(b"\r\n\r\n")
+    return int(head.split()[1]), body.decode()
+
+
+def test_files_of_the_page_and_no_others_are_read(serve):
+    server = serve()
+    told = {"socket": "ws", "token_needed": False}
+    assert json.loads(asked(server, "/live.json")[1]) == told
+    assert asked(server, "/?token=x") == (200, "web/index.html")
+    assert asked(server, "/page.mjs") == (200, "web/page.mjs")
+    assert asked(server, "/node/graph.mjs") == (200, "node/graph.mjs")
+    assert asked(server, "/page.mjs", "HEAD") == (200, "")
+    assert asked(server, "/page.mjs", "POST")[0] == 405
+    assert asked(server, "/page.mjs", host="evil.example")[0] == 403
+    for path in (
+        *("/../secret.html", "/%2e%2e/secret.html", "/..%2fsecret.html", "/%252e%252e/secret.html"),
+        *("/..\\secret.html", "/..%5csecret.html", "//secret.html", "/node/../../secret.html"),
+        *("/link.html", "/notes.txt", "/node_modules/x.mjs", "/page.mjs%00.html", "/./page.mjs"),
+        *("/etc/passwd", "/file:///etc/passwd", "/web/index.html", "/node/", "/node"),
+    ):
+        status, body = asked(server, path)
+        assert (status, "secret" in body) == (404, False), path
+
+
+def test_a_file_that_became_a_link_to_elsewhere_is_not_read(serve, folders):
+    server = serve()
+    page = folders[""] / "page.mjs"
+    page.unlink()
+    page.symlink_to(folders[""].parent / "secret.html")
+    assert asked(server, "/page.mjs")[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("query", "origin", "status"),
+    [
+        ("?token=a%20token%2Bmore", None, 101),
+        ("?token=a%20token%2Bmore", "own", 101),
+        ("", "own", 401),
+        ("?token=a%20token", "own", 401),
+        ("?token=a%20token%2Bmore", "http://evil.example", 403),
+        ("?token=a%20token%2Bmore", "null", 403),
+    ],
+)
+def test_a_wrong_token_and_a_wrong_origin_are_refused(serve, query, origin, status):
+    server = serve(token="a token+more")
+    assert server.address.endswith("/?token=a%20token%2Bmore")
+    assert json.loads(asked(server, "/live.json")[1])["token_needed"] is True
+    origin = f"http://127.0.0.1:{server.port}" if origin == "own" else origin
+
+    async def connect():
+        await (
+            await websockets.connect(f"ws://127.0.0.1:{server.port}/ws{query}", origin=origin)
+        ).close()
+
+    if status == 101:
+        asyncio.run(connect())
+        return
+    with pytest.raises(websockets.InvalidStatus) as caught:
+        asyncio.run(connect())
+    assert caught.value.response.status_code == status
+
+
+def test_beyond_this_machine_there_is_always_a_token(serve):
+    server = serve(host="0.0.0.0")
+    assert len(server.address.partition("?token=")[2]) >= 20
+    assert json.loads(asked(server, "/live.json")[1])["token_needed"] is True
+    assert server.address != serve(host="0.0.0.0").address
+    with pytest.raises(ValueError, match="token must have at least 8 characters, got 3"):
+        serve(token="abc")
+    with pytest.raises(OSError, match="give another port"):
+        serve(port=server.port)
+
+
+def test_the_page_is_given_the_samples_and_the_decisions(serve, detector, samples):
+    counts = Counts()
+    server = serve(counts=counts)
+    got, is_there = [], threading.Event()
+
+    async def read():
+        async with websockets.connect(f"ws://127.0.0.1:{server.port}/ws") as page:
+            async for message in page:
+                got.append(message)
+                is_there.set()
+
+    thread = threading.Thread(target=lambda: asyncio.run(read()))
+    thread.start()
+    is_there.wait(20)
+    kept = Kept()
+    blocks = [Block(samples[i : i + 7]) for i in range(0, len(samples), 7)]
+    stream = StreamingDetector(detector, dtype=torch.float64)
+    watch(Sent(blocks), stream, [kept, server], counts=counts, queue_s=60.0)
+    thread.join(20)
+    texts = [json.loads(each) for each in got if isinstance(each, str)]
+    assert texts[0]["type"] == "hello"
+    assert texts[0]["facts"]["channels"] == list(NAMES)
+    assert (texts[0]["simulated"], texts[0]["source"]) == (True, "test")
+    parts = [each for each in got if isinstance(each, bytes)]
+    headers = [struct.unpack("<IId", each[:16]) for each in parts]
+    assert [kind for kind, _, _ in headers] == [1] * len(parts)
+    firsts = np.cumsum([0, *(rows for _, rows, _ in headers)])
+    assert [first for _, _, first in headers] == firsts[:-1].tolist()
+    shown = np.concatenate([np.frombuffer(each[16:], "<f4").reshape(-1, 4) for each in parts])
+    np.testing.assert_array_equal(shown, samples.astype(np.float32))
+    columns = [each["columns"] for each in texts if each["type"] == "decisions"]
+    wanted = [decision_columns(made, has_onset=False) for made in kept.made]
+    for name in wanted[0]:
+        given, made = ([value for each in of for value in each[name]] for of in (columns, wanted))
+        assert given == made
+    status = [each for each in texts if each["type"] == "status"][-1]
+    assert status == {
+        **{"type": "status", "state": "ended", "text": "sent: ended"},
+        **{"received": len(samples), "dropped": 0, "dropped_to_page": 0},
+    }
+
+
+def test_a_page_that_does_not_read_loses_samples_for_itself_alone(serve, detector):
+    server = serve()
+    peer = socket.create_connection(("127.0.0.1", server.port))
+    key = "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+    host = f"Host: 127.0.0.1:{server.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    peer.sendall(f"GET /ws HTTP/1.1\r\n{host}{key}\r\n".encode())
+    assert b"101" in peer.recv(100)
+    block = Block(np.zeros((4000, 4)))
+    time.sleep(0.1)
+    longest_s = 0.0
+    for number in range(400):
+        started_s = time.monotonic()
+        server.samples(4000 * number, block)
+        longest_s = max(longest_s, time.monotonic() - started_s)
+        time.sleep(0.001)
+    assert longest_s < 1.0  # nothing waited for the page
+    server.event("ended", "no more")
+    got, last = b"", None
+    peer.settimeout(20)
+    while not (last := re.search(rb'"ended".*?"dropped_to_page": (\d+)', got)):
+        got = got[-1000:] + peer.recv(1 << 20)
+    assert int(last[1]) > 0
+    peer.close()
