@@ -22,7 +22,10 @@ from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.commands.hosts import hosts_dir
 from tactslip_torch.data.formats import Reading
 from tactslip_torch.live.frames import Frames
+from tactslip_torch.live.mcap_log import McapLog
 from tactslip_torch.live.pump import Counts, watch
+from tactslip_torch.live.rerun_log import RerunLog
+from tactslip_torch.live.ros2 import RosTopic
 from tactslip_torch.live.server import PageServer, page_facts
 from tactslip_torch.live.sinks import Callback, JsonLines, LineServer, Sink
 from tactslip_torch.live.sources import FileInTime, Source, address_of, source_of
@@ -104,24 +107,17 @@ def _source(config: DictConfig, detector: SlipDetector) -> Source:
 
 
 def _logs(config: DictConfig, watching: StreamingDetector, source: Source) -> list[Sink]:
-    """Files that samples and decisions are written to."""
-    sinks: list[Sink] = []
-    detector = watching.detector
-    recording = source.recording if isinstance(source, FileInTime) else None
+    """Files that samples and decisions are written to, and topics of ROS 2 beside the source's."""
+    detector, settings = watching.detector, watching.settings
+    known = source.recording if isinstance(source, FileInTime) else None
+    about: dict[str, Any] = {"recording": known, "is_live": source.is_live}
+    sinks: list[Sink] = [source.publisher()] if isinstance(source, RosTopic) else []
     if config.mcap is not None:
-        from tactslip_torch.live.mcap_log import McapLog
-
-        sinks.append(
-            McapLog(
-                Path(str(config.mcap)),
-                detector.pool.hand,
-                detector.pool.sample_rate_hz,
-                watching.settings,
-                recording=recording,
-                units=str(detector.info.get("units", "V")),
-                is_live=source.is_live,
-            )
-        )
+        pool, units = detector.pool, str(detector.info.get("units", "V"))
+        parts = (Path(str(config.mcap)), pool.hand, pool.sample_rate_hz, settings)
+        sinks.append(McapLog(*parts, units=units, dtype=watching.dtype, **about))
+    if config.rerun is not None:
+        sinks.append(RerunLog(Path(str(config.rerun)), detector, settings, **about))
     return sinks
 
 

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
+from tactslip_torch.data.formats._reading import needs
 from tactslip_torch.live.pump import Counts
 from tactslip_torch.live.sinks import Array, Block, decision_columns
-from tactslip_torch.live.sources import needs
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.runtime import plain
@@ -118,7 +118,7 @@ class PageServer:
         port: int = 0,
         token: str | None = None,
     ) -> None:
-        needs("websockets", "serve=true")
+        needs("websockets", "serve=true", "live")
         self._is_loopback = is_loopback(host)
         if token is None and not self._is_loopback:
             token = secrets.token_urlsafe(16)

@@ -5,7 +5,6 @@ A source connects again by itself; what happens to it comes as events among the 
 
 from __future__ import annotations
 
-import importlib
 import os
 import select
 import socket
@@ -16,7 +15,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -24,6 +22,7 @@ import numpy as np
 from tactslip_torch.data.file_recordings import hand_file
 from tactslip_torch.data.folder import file_facts
 from tactslip_torch.data.formats import Reading, open_file, pieces
+from tactslip_torch.data.formats._reading import needs
 from tactslip_torch.live.frames import FrameReader, Frames
 from tactslip_torch.live.sinks import Block, Event
 from tactslip_torch.model.detector import SlipDetector
@@ -37,7 +36,7 @@ _POLL_S = 0.1  # in which a source notices that it is closed
 _MOST_BYTES = 1 << 16  # of a read
 _PIECE_S, _BLOCK_S = 1.0, 0.005  # of a file: what is read at once, and what is handed on at once
 _AGAIN = f"tries again every {RETRY_S:g} s"
-KINDS = "serial:PORT, tcp:HOST:PORT, listen:PORT, stdin, or a file"
+KINDS = "serial:PORT, tcp:HOST:PORT, listen:PORT, ros2:TOPIC, stdin, or a file"
 
 
 class Source(Protocol):
@@ -59,21 +58,6 @@ class Source(Protocol):
 
     def close(self) -> None:
         """End the iteration within a fraction of a second; from any thread."""
-
-
-def needs(module: str, what: str) -> ModuleType:
-    """A library that is there only if the extra ``live`` was installed.
-
-    Raises:
-        ValueError: in one line, if it is absent.
-    """
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError:
-        name = {"serial": "pyserial"}.get(module.partition(".")[0], module.partition(".")[0])
-        raise ValueError(
-            f'{what} needs {name}, which is not installed; pip install "tactslip-torch[live]"'
-        ) from None
 
 
 def address_of(text: str, what: str, default_host: str = "127.0.0.1") -> tuple[str, int]:
@@ -215,7 +199,7 @@ class SerialPort(_ByteSource):
         self, port: str, frames: Frames, detector: SlipDetector, baud: int = 115200
     ) -> None:
         check_number("baud", baud, whole=True)
-        self._serial = needs("serial", "a serial port")
+        self._serial = needs("serial", "a serial port", "live")
         self._port, self._baud = port, baud
         super().__init__(f"serial:{port}", frames, detector)
 
@@ -229,7 +213,7 @@ class SerialPort(_ByteSource):
         return _SerialConnection(port)
 
     def _said(self, error: OSError) -> str:
-        there = needs("serial.tools.list_ports", "a serial port").comports()
+        there = needs("serial.tools.list_ports", "a serial port", "live").comports()
         names = ", ".join(sorted(each.device for each in there)) or "none"
         if error.errno == 2 or not Path(self._port).exists():
             return f"there is no serial port {self._port}; there are: {names}"
@@ -473,11 +457,12 @@ def source_of(
     """The source that a text names.
 
     Args:
-        text: ``serial:PORT``, ``tcp:HOST:PORT``, ``listen:[HOST:]PORT``, ``stdin``, or a file.
+        text: ``serial:PORT``, ``tcp:HOST:PORT``, ``listen:[HOST:]PORT``, ``ros2:TOPIC``,
+            ``stdin``, or a file.
         detector: whose channels and rate it has.
         frames: how samples are written, but of a file.
         baud: of ``SerialPort``.
-        reading: of ``FileInTime``, as what follows.
+        reading: of ``FileInTime`` and ``RosTopic``; what follows is of ``FileInTime``.
         tare_s: so.
         speed: so.
         repeat: so.
@@ -496,6 +481,10 @@ def source_of(
         host, port = address_of(rest, f"source={kind}:")
         made = TcpClient if kind == "tcp" else TcpListener
         return made(host, port, frames, detector)
+    if found and kind == "ros2":
+        from tactslip_torch.live.ros2 import RosTopic
+
+        return RosTopic(rest, detector, reading)
     path = Path(text)
     if not path.exists():
         raise FileNotFoundError(f"no file at {text}; source is {KINDS}")
