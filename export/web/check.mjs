@@ -177,13 +177,14 @@ async function live(page, address, seconds) {
     const { metrics: all } = await client.send("Performance.getMetrics");
     return Object.fromEntries(all.map(({ name, value }) => [name, value]));
   };
-  await client.send("Performance.enable");
+  await client.send("Performance.enable", { timeDomain: "threadTicks" }); // CPU time, whatever else runs
   await page.goto(address);
   await ready(page);
+  const begun = performance.now();
   const start = await metrics();
   await page.waitForTimeout(1000 * seconds);
   const end = await metrics();
-  const busy = (end.TaskDuration - start.TaskDuration) / (end.Timestamp - start.Timestamp);
+  const busy = (end.TaskDuration - start.TaskDuration) / ((performance.now() - begun) / 1000);
   const heap = [start.JSHeapUsedSize, end.JSHeapUsedSize];
   const { decisions, ...more } = await held(page);
   const told = ["stream-state", "received", "dropped", "dropped_to_page", "position", "simulated"];

@@ -104,9 +104,9 @@ function fixed(facts) {
 }
 
 /** Channels that the detector uses: those its features are of; a pooled one is of a whole kind. */
-export function usedChannels({ channels, features = channels, kinds }) {
-  const named = new Set(features.map((feature) => feature.split(" ")[0]));
-  return channels.map((name, i) => named.has(name) || named.has(kinds[i]));
+export function usedChannels({ channels, features = channels, kinds, used_channels: used }) {
+  const named = new Set(used ?? features.map((feature) => feature.split(" ")[0]));
+  return channels.map((name, i) => named.has(name) || (!used && named.has(kinds[i])));
 }
 
 /** Lowest and highest statistic shown. */

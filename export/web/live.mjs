@@ -1,4 +1,4 @@
-// Samples and decisions of a server (`tactslip stream --serve`), as they come. Nothing is computed here.
+// Samples and decisions of a server (`tactslip stream serve=true`), as they come. Nothing is computed here.
 
 import { History, Samples } from "./history.mjs";
 
@@ -22,13 +22,20 @@ export class Live {
   #wait = WAIT_MS[0];
   #address;
   #onHello;
+  #say;
 
-  /** Connect; it is kept once the server has said what it sends. */
-  static open({ socket }) {
-    return new Promise((onHello) => new this(socket, onHello));
+  /**
+   * Connect; the promise is kept once the server has said what it sends.
+   *
+   * @param {string} socket its path
+   * @param {(text: string) => void} say what hinders that
+   */
+  static open(socket, say) {
+    return new Promise((onHello) => new this(socket, onHello, say));
   }
 
-  constructor(socket, onHello) {
+  constructor(socket, onHello, say) {
+    this.#say = say;
     this.#address = new URL(socket, location.href);
     this.#address.protocol = location.protocol.replace("http", "ws");
     const token = new URL(location.href).searchParams.get("token");
@@ -76,7 +83,8 @@ export class Live {
     };
     socket.onclose = () => {
       const text = "no connection to tactslip stream; trying again";
-      this.status = { ...this.status, state: "lost", text };
+      if (this.status.state !== "ended") this.status = { ...this.status, state: "lost", text };
+      if (!this.facts) this.#say(`${text} (is it the address that it printed, with its token?)`);
       setTimeout(() => this.#connect(), this.#wait);
       this.#wait = Math.min(2 * this.#wait, WAIT_MS[1]);
     };

@@ -36,7 +36,7 @@ async function opened() {
       throw new Error("this page needs a token: open the address that tactslip stream prints");
     }
     write("model", "waiting for tactslip stream");
-    return Live.open(told);
+    return Live.open(told.socket, say).finally(() => say(null));
   }
   if (answer.status !== 404) {
     throw new Error(`the server refuses (${answer.status}): open the address that it prints`);
@@ -100,9 +100,9 @@ function connectPlayback() {
 function connectFiles() {
   const open = async (file) => {
     if (!file) return;
+    say(null);
     try {
       await source.take(await file.arrayBuffer(), file.name);
-      say(null);
     } catch (error) {
       say(error);
     }
@@ -281,8 +281,10 @@ export function held() {
   const { history, samples, facts } = source;
   const decisions = [];
   for (let i = history.first; i < history.count; i += 1) decisions.push(history.decision(i));
-  const { first, end, numMissing } = samples;
-  return { decisions, first, end, numMissing, facts };
+  const { first, end, numMissing, values, width, capacity } = samples;
+  const at = ((end + capacity - 1) % capacity) * width;
+  const last = Array.from(values.subarray(at, at + width));
+  return { decisions, first, end, numMissing, last, facts };
 }
 
 for (const name of ["dragover", "drop"]) {
