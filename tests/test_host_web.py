@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,13 +30,15 @@ from hosts import (
     truth,
 )
 
-from tactslip_torch import sample_recording
+from tactslip_torch import SlipDetector, StreamingDetector, sample_recording
 from tactslip_torch.data.formats import named_format
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.live.sinks import decision_columns
 from tactslip_torch.onset.decisions import KEY
-from tactslip_torch.pretrained import RECORDING
+from tactslip_torch.pretrained import NAME, RECORDING
 
 WEB = EXPORT / "web"
+ROOT = Path(__file__).parents[1]
 BROWSER = Path(os.environ.get("CHROMIUM", "/usr/bin/chromium"))
 
 
@@ -312,6 +315,51 @@ def test_a_model_that_is_not_what_it_should_be_is_one_line(seen):
     assert "1 kHz" in slower
     assert "bin graph" in of_bins
     assert all(len(line.splitlines()) == 1 for line in seen["altered"])
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_a_live_stream_is_drawn_whole_and_as_the_package_decides(script, tmp_path):
+    """Two minutes at 2 kHz and 24 channels, from ``tactslip stream`` over its socket."""
+    detector, sample = SlipDetector.pretrained(NAME), named_format("npz").load(RECORDING)
+    recording = replace(sample.recording, samples=sample.recording.samples.repeat(1, 100))
+    model, source = tmp_path / "detector.pt", tmp_path / "long.npz"
+    detector.save(model)
+    named_format("npz").save(source, recording, sample.hand, {})
+    words = [f"model={model}", f"source={source}", "serve=true", "port=0", "output=null"]
+    command = [sys.executable, "-m", "tactslip_torch", "stream", *words]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as server:
+        assert server.stderr is not None
+        try:
+            said = next(line for line in server.stderr if line.startswith("page: "))
+            done = script("check.mjs", f"--live={said.split()[1]}", "--seconds=120")
+        finally:
+            server.kill()
+    assert done.returncode == 0, done.stderr
+    seen = json.loads(done.stdout)
+    live, shown = seen["live"], seen["live"]["shown"]
+    assert (seen["errors"], live["numMissing"]) == ([], 0)
+    assert live["end"] - live["first"] > 115 * RATE
+    assert (shown["stream-state"], shown["dropped"], shown["dropped_to_page"]) == (
+        "connected",
+        "0",
+        "0",
+    )
+    assert live["busy"] < 0.5  # of a core
+    assert live["slip"] > 0
+    assert not [url for url in seen["requests"] if "ort" in Path(url).name or "/node" in url]
+    assert [fault for fault in seen["accessibility"] if fault[1] in ("serious", "critical")] == []
+    samples = recording.samples[:, : live["end"]].T
+    np.testing.assert_array_equal(np.array(live["last"], np.float32), samples[-1])
+    stream = StreamingDetector(detector, dtype=samples.dtype)
+    expected = decision_columns(stream.push(samples), has_onset=False)
+    held = live["decisions"]
+    skipped = expected["time_s"].index(held[0]["time_s"])
+    assert len(held) > 115 * RATE / detector.info[KEY]["hop_samples"]
+    for name, column in expected.items():
+        drawn = [decision[name] for decision in held]
+        wanted = column[skipped : skipped + len(held)]
+        np.testing.assert_allclose(drawn, wanted, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
 SCALE = """
