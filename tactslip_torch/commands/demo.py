@@ -22,9 +22,8 @@ def demo(folder: Path) -> None:
         raise FileExistsError(f"{folder} is there and not empty; give another one, --out DIR")
     from omegaconf import OmegaConf  # here and below what --help has no need of
 
-    from tactslip_torch.commands.configuration import conf_dir
+    from tactslip_torch.commands.configuration import conf_dir, copy_host
     from tactslip_torch.commands.detect import detect
-    from tactslip_torch.commands.hosts import copy_host
     from tactslip_torch.deploy.export import export_detector
     from tactslip_torch.model.detector import SlipDetector
     from tactslip_torch.pretrained import NAME, RECORDING, sample_recording

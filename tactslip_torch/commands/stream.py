@@ -17,18 +17,18 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from tactslip_torch.commands.configuration import hosts_dir
 from tactslip_torch.commands.detect import settings_of
 from tactslip_torch.commands.entry import entry_point
-from tactslip_torch.commands.hosts import hosts_dir
 from tactslip_torch.data.formats import Reading
 from tactslip_torch.live.frames import Frames
 from tactslip_torch.live.mcap_log import McapLog
-from tactslip_torch.live.pump import Counts, watch
+from tactslip_torch.live.pump import watch
 from tactslip_torch.live.rerun_log import RerunLog
 from tactslip_torch.live.ros2 import RosTopic
 from tactslip_torch.live.server import PageServer, page_facts
-from tactslip_torch.live.sinks import Callback, JsonLines, LineServer, Sink
-from tactslip_torch.live.sources import FileInTime, Source, address_of, source_of
+from tactslip_torch.live.sinks import Callback, Counts, JsonLines, LineServer, Sink, Source
+from tactslip_torch.live.sources import FileInTime, address_of, source_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.runtime import check_number

@@ -16,11 +16,13 @@ from tactslip_torch.deploy.value import BOOL, F64, Graph, Value
 from tactslip_torch.features.bank import Bank, Frame, Samples
 from tactslip_torch.features.ops import TINY
 from tactslip_torch.features.pool import LARGEST_SAMPLE
-from tactslip_torch.model.calibration import Calibration, probability, widened_llr
+from tactslip_torch.model.calibration import Abstention, Calibration, probability, widened_llr
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
 from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetEvidence
 from tactslip_torch.onset.rules import NOTHING_YET, KOfN, Rule
+from tactslip_torch.own_files import SIDECAR as FORMAT
+from tactslip_torch.runtime import __version__
 from tactslip_torch.signals.filtering import overlap_matrix
 
 Precision = Literal["float32", "float64"]
@@ -278,3 +280,48 @@ def _samples(windows: Value, detector: SlipDetector, frame: Frame) -> tuple[Samp
     is_alive = (high - low) * inverse > loudest
     values: tuple[Any, ...] = shifted, moving, scale, unit
     return Samples(*values), ~is_known, is_alive & is_known
+
+
+def host_metadata(detector: SlipDetector, kind: str, precision: Precision) -> dict[str, Any]:
+    """All that a host must know of a graph."""
+    hand, info, raw = detector.pool.hand, detector.info, RawBin.of(detector)
+    calibrated, abstain = calibration_of(detector), Abstention.of(detector)
+    metadata = {
+        "format": FORMAT,
+        "version": __version__,
+        "graph": kind,
+        "precision": precision,
+        "channels": list(hand.names),
+        "kinds": [channel.kind for channel in hand.channels],
+        "unit": info.get("units", "V"),
+        "sample_rate_hz": detector.pool.sample_rate_hz,
+        "bin_samples": raw.bin,
+        "context_before_samples": raw.before,
+        "context_after_samples": raw.after,
+        "features": [str(name) for name in detector.selected_names],
+        "slip_if_score_at_least": 0.0,
+        "calibration": calibrated and calibrated[0].to_dict(),
+        "slip_share": calibrated and calibrated[1],
+        "abstain": abstain and abstain.to_dict(),
+        "experiment": info.get("experiment"),
+        "train_materials": list(info.get("train_materials", ())),
+        "simulated": info.get("simulated"),
+    }
+    if kind == "stream":
+        settings = AlarmSettings.of(detector)
+        timing = Timing.of(detector, settings)
+        metadata |= {
+            "hop_samples": timing.hop,
+            "first_samples": timing.first,
+            "frame_samples": timing.frame,
+            "tail_samples": timing.tail,
+            "state_size": timing.state_size,
+            "rule": settings.rule.to_dict(),
+            "threshold": (settings.onset or settings).threshold,
+            "target_false_alarms_per_hour": settings.target_per_hour,
+            "threshold_curve": settings.metadata.get("threshold_curve", []),
+        }
+        if settings.onset is not None:  # whose threshold the one above is
+            metadata["status_threshold"] = settings.threshold
+            metadata["onset_hop_samples"] = timing.onset_hop
+    return metadata

@@ -20,15 +20,14 @@ from typing import Any, get_args
 import onnx
 from onnx import helper
 
-from tactslip_torch.deploy.bins import Precision, RawBin, Timing, bin_graph, dtype_of
+from tactslip_torch.deploy.bins import Precision, bin_graph, dtype_of, host_metadata
 from tactslip_torch.deploy.check import GraphKind, check_model
 from tactslip_torch.deploy.stream import stream_graph
-from tactslip_torch.model.calibration import Abstention
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decisions import KEY, AlarmSettings, calibration_of
+from tactslip_torch.onset.decisions import KEY, AlarmSettings
 from tactslip_torch.own_files import SIDECAR as FORMAT
 from tactslip_torch.own_files import read_json
-from tactslip_torch.runtime import __version__, plain, whole_file
+from tactslip_torch.runtime import plain, whole_file
 
 CERTIFICATE_FORMAT = "tactslip_torch certificate 1"
 FILES: dict[GraphKind, str] = {"bin": "model.onnx", "stream": "stream.onnx"}
@@ -90,51 +89,6 @@ def export_detector(
             metadata["onnx_bytes"] = len(content)
             beside.write_text(json.dumps(metadata, indent=1, allow_nan=False) + "\n")
     return paths
-
-
-def host_metadata(detector: SlipDetector, kind: GraphKind, precision: Precision) -> dict[str, Any]:
-    """All that a host must know of a graph."""
-    hand, info, raw = detector.pool.hand, detector.info, RawBin.of(detector)
-    calibrated, abstain = calibration_of(detector), Abstention.of(detector)
-    metadata = {
-        "format": FORMAT,
-        "version": __version__,
-        "graph": kind,
-        "precision": precision,
-        "channels": list(hand.names),
-        "kinds": [channel.kind for channel in hand.channels],
-        "unit": info.get("units", "V"),
-        "sample_rate_hz": detector.pool.sample_rate_hz,
-        "bin_samples": raw.bin,
-        "context_before_samples": raw.before,
-        "context_after_samples": raw.after,
-        "features": [str(name) for name in detector.selected_names],
-        "slip_if_score_at_least": 0.0,
-        "calibration": calibrated and calibrated[0].to_dict(),
-        "slip_share": calibrated and calibrated[1],
-        "abstain": abstain and abstain.to_dict(),
-        "experiment": info.get("experiment"),
-        "train_materials": list(info.get("train_materials", ())),
-        "simulated": info.get("simulated"),
-    }
-    if kind == "stream":
-        settings = AlarmSettings.of(detector)
-        timing = Timing.of(detector, settings)
-        metadata |= {
-            "hop_samples": timing.hop,
-            "first_samples": timing.first,
-            "frame_samples": timing.frame,
-            "tail_samples": timing.tail,
-            "state_size": timing.state_size,
-            "rule": settings.rule.to_dict(),
-            "threshold": (settings.onset or settings).threshold,
-            "target_false_alarms_per_hour": settings.target_per_hour,
-            "threshold_curve": settings.metadata.get("threshold_curve", []),
-        }
-        if settings.onset is not None:  # whose threshold the one above is
-            metadata["status_threshold"] = settings.threshold
-            metadata["onset_hop_samples"] = timing.onset_hop
-    return metadata
 
 
 def _origin(detector: SlipDetector, source: str | os.PathLike[str] | None) -> dict[str, Any]:

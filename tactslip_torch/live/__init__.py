@@ -9,13 +9,21 @@ Example:
 """
 
 from tactslip_torch.live.frames import Frames
-from tactslip_torch.live.pump import Counts, watch
+from tactslip_torch.live.pump import watch
 from tactslip_torch.live.server import PageServer, page_facts
-from tactslip_torch.live.sinks import Block, Callback, Event, JsonLines, LineServer, Sink
+from tactslip_torch.live.sinks import (
+    Block,
+    Callback,
+    Counts,
+    Event,
+    JsonLines,
+    LineServer,
+    Sink,
+    Source,
+)
 from tactslip_torch.live.sources import (
     FileInTime,
     SerialPort,
-    Source,
     StandardInput,
     TcpClient,
     TcpListener,

@@ -7,12 +7,10 @@ import time
 from collections import deque
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 
 import numpy as np
 
-from tactslip_torch.live.sinks import Block, Event, Sink
-from tactslip_torch.live.sources import Source
+from tactslip_torch.live.sinks import Block, Counts, Event, Sink, Source
 from tactslip_torch.onset.decisions import Decisions
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.runtime import one_thread
@@ -21,21 +19,6 @@ _LONGER_THAN_GAP_S = 0.06  # begins a stream anew; StreamingDetector fills up to
 _PATIENCE_S = 10.0  # for sinks, when all is to end
 _BREAKS = ("lost", "waiting", "gap", "dropped")
 """Events behind which samples are lacking."""
-
-
-@dataclass
-class Counts:
-    """What came of a stream so far.
-
-    Attributes:
-        received: samples that came, those included that a source put NaN for.
-        dropped: of these, samples that the detector never saw, since it was behind.
-        alarms: that were raised.
-    """
-
-    received: int = 0
-    dropped: int = 0
-    alarms: int = 0
 
 
 def watch(

@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
 from tactslip_torch.data.formats._reading import needs
-from tactslip_torch.live.pump import Counts
-from tactslip_torch.live.sinks import Array, Block, decision_columns
+from tactslip_torch.live.sinks import Array, Block, Counts, decision_columns
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.runtime import plain
@@ -61,7 +60,7 @@ def is_loopback(host: str) -> bool:
 
 def page_facts(detector: SlipDetector, settings: AlarmSettings) -> dict[str, Any]:
     """What the page is told of a detector: the metadata of its ``stream.onnx``, and more."""
-    from tactslip_torch.deploy.export import host_metadata  # brings onnx
+    from tactslip_torch.deploy.bins import host_metadata  # brings onnx
 
     names = detector.pool.hand.names
     facts = host_metadata(detector, "stream", "float32") | {

@@ -8,8 +8,9 @@ from __future__ import annotations
 import json
 import math
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TextIO
 
 from numpy.typing import NDArray
@@ -46,6 +47,42 @@ class Event(NamedTuple):
 
     kind: str
     text: str
+
+
+class Source(Protocol):
+    """Blocks of samples as they come, and events between them.
+
+    Attributes:
+        name: for people, such as ``"serial:/dev/ttyACM0"``.
+        is_live: whether samples come whether or not they are taken: what waits too long is then
+            dropped; else the source waits.
+        simulated: whether samples are known to be simulated.
+    """
+
+    name: str
+    is_live: bool
+    simulated: bool
+
+    def __iter__(self) -> Iterator[Block | Event]:
+        """Blocks and events in order, from one thread; ends with the stream."""
+
+    def close(self) -> None:
+        """End the iteration within a fraction of a second; from any thread."""
+
+
+@dataclass
+class Counts:
+    """What came of a stream so far.
+
+    Attributes:
+        received: samples that came, those included that a source put NaN for.
+        dropped: of these, samples that the detector never saw, since it was behind.
+        alarms: that were raised.
+    """
+
+    received: int = 0
+    dropped: int = 0
+    alarms: int = 0
 
 
 class Sink(Protocol):

@@ -24,7 +24,7 @@ from tactslip_torch.data.folder import file_facts
 from tactslip_torch.data.formats import Reading, open_file, pieces
 from tactslip_torch.data.formats._reading import needs
 from tactslip_torch.live.frames import FrameReader, Frames
-from tactslip_torch.live.sinks import Block, Event
+from tactslip_torch.live.sinks import Block, Event, Source
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.runtime import check_number
 
@@ -37,27 +37,6 @@ _MOST_BYTES = 1 << 16  # of a read
 _PIECE_S, _BLOCK_S = 1.0, 0.005  # of a file: what is read at once, and what is handed on at once
 _AGAIN = f"tries again every {RETRY_S:g} s"
 KINDS = "serial:PORT, tcp:HOST:PORT, listen:PORT, ros2:TOPIC, stdin, or a file"
-
-
-class Source(Protocol):
-    """Blocks of samples as they come, and events between them.
-
-    Attributes:
-        name: for people, such as ``"serial:/dev/ttyACM0"``.
-        is_live: whether samples come whether or not they are taken: what waits too long is then
-            dropped; else the source waits.
-        simulated: whether samples are known to be simulated.
-    """
-
-    name: str
-    is_live: bool
-    simulated: bool
-
-    def __iter__(self) -> Iterator[Block | Event]:
-        """Blocks and events in order, from one thread; ends with the stream."""
-
-    def close(self) -> None:
-        """End the iteration within a fraction of a second; from any thread."""
 
 
 def address_of(text: str, what: str, default_host: str = "127.0.0.1") -> tuple[str, int]:
