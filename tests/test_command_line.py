@@ -82,6 +82,8 @@ MISTAKES = {
     "evaluate recipe=paper model=detector.pt": "'evaluate has no key recipe'",
     "detect model=missing.pt input=recordings": "missing.pt",
     "detect model=missing.pt imput=recordings": "'did you mean input?'",
+    "detect model=missing.pt input=recordings mcap=a.mcap": "'mcap must be true or false'",
+    "detect model=missing.pt input=recordings rerun=yes": "'rerun must be true or false'",
     "stream": "model=",
     "stream model=detector.pt": "source=",
     "stream model=detector.pt source=nowhere.csv": "nowhere.csv serial: listen: stdin",

@@ -97,16 +97,16 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
         FileNotFoundError: if there is no such detector or recording.
     """
     started = time.perf_counter()
-    detector = SlipDetector.load(config.model, backend=config.backend)
-    said = config.reading
-    said = OmegaConf.to_container(said, resolve=True) if OmegaConf.is_config(said) else said
-    reading = Reading.of(said)
     for key in ("mcap", "rerun"):
         if type(config[key]) is not bool:
             raise ValueError(
                 f"{key} must be true or false, got {config[key]!r}; files are called as their "
                 "recordings"
             )
+    detector = SlipDetector.load(config.model, backend=config.backend)
+    said = config.reading
+    said = OmegaConf.to_container(said, resolve=True) if OmegaConf.is_config(said) else said
+    reading = Reading.of(said)
     context = _DetectionContext(detector, settings_of(config, detector), reading, config, folder)
     paths = recording_files(Path(str(config.input)))
     save_config(config, folder)

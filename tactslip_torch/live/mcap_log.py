@@ -78,7 +78,8 @@ class McapLog:
         is_live: whether the first sample is of now, where nobody tells times; else it is at 0.
 
     Raises:
-        ValueError: in one line, if ``mcap`` or ``rosbags`` is not installed.
+        ValueError: in one line, if ``mcap`` or ``rosbags`` is not installed, or the path does not end in
+            ``.mcap``.
     """
 
     def __init__(
@@ -93,6 +94,8 @@ class McapLog:
         dtype: torch.dtype = torch.float32,
         is_live: bool = False,
     ) -> None:
+        if path.suffix != ".mcap":
+            raise ValueError(f"{path} must end in .mcap")
         library = needs("mcap.writer", "writing .mcap")
         none = torch.empty(len(hand), 0, dtype=dtype)
         known = recording or Recording(none, sample_rate_hz, "unknown", (), (), (), units=units)
@@ -103,6 +106,8 @@ class McapLog:
         self._num, self._last_s, self._is_even = 0, 0.0, True
         self._types = Types()
         topics = {f"/slip/{name}": kind for name, kind in _KINDS.items()}
+        if not self._has_onset:
+            del topics["/slip/onset_score"]
         self._kinds = {TOPIC: kind_of(self._header), **topics}
         self._prefix, self._stored = self._of_samples(len(hand)), np.dtype(self._header["dtype"])
         self._stack = ExitStack()

@@ -33,6 +33,7 @@ _SENT_S = 0.1  # of samples that are sent at once
 _FROM_TIP = ("tip", "distal", "intermediate", "middle", "proximal", "base", "palm")
 _TO_SLIP, _AGAINST = np.array([213, 94, 0], np.uint8), np.array([0, 114, 178], np.uint8)
 _RADIUS = 0.4  # of a channel that is all of it; a segment is 0.92 wide
+_MOST_NAMED = 48  # channels; the names of more show where the mouse is
 _LONG_AGO_S = 1e8  # times above are since 1970
 
 Array = NDArray[np.float64]
@@ -72,7 +73,8 @@ class RerunLog:
         is_live: whether the first sample is of now, where nobody tells times; else it is at 0.
 
     Raises:
-        ValueError: in one line, if ``rerun-sdk`` is not installed.
+        ValueError: in one line, if ``rerun-sdk`` is not installed, or the path does not end in
+            ``.rrd``.
     """
 
     def __init__(
@@ -84,6 +86,8 @@ class RerunLog:
         recording: Recording | None = None,
         is_live: bool = False,
     ) -> None:
+        if path.suffix != ".rrd":
+            raise ValueError(f"{path} must end in .rrd")
         self._rr: Any = needs("rerun", "writing .rrd", "rerun")
         self._detector, self._is_live = detector, is_live
         self._hand, self._rate = detector.pool.hand, detector.pool.sample_rate_hz
@@ -216,6 +220,7 @@ class RerunLog:
                 radii=_RADIUS * np.sqrt(0.02 + part),
                 colors=np.where(share[:, None] > 0, _TO_SLIP, _AGAINST),
                 labels=self._hand.names,
+                show_labels=len(self._hand) <= _MOST_NAMED,
             )
             self._log("hand/channels", time_s, discs)
 
@@ -237,13 +242,16 @@ class RerunLog:
             how = {"interpolation_mode": step} if entity in ("slip/state", "slip/truth") else {}
             self._to.log(entity, self._rr.SeriesLines(names=lines, **how), static=True)
         self._places, segments = _places_of(self._hand)
+        middles = np.array(list(segments.values()))
+        grey = [(160, 160, 160)]
         boxes = self._rr.Boxes2D(
-            centers=list(segments.values()),
-            half_sizes=[(0.46, 0.46)] * len(segments),
-            labels=[" ".join(place) for place in segments],
-            colors=[(160, 160, 160)] * len(segments),
+            centers=middles, half_sizes=[(0.46, 0.46)], colors=grey, draw_order=0.0
         )
         self._to.log("hand/segments", boxes, static=True)
+        tips = {finger: at for (finger, _), at in reversed(segments.items())}  # the first of each
+        names_at = [(x, y - 0.75) for x, y in tips.values()]
+        fingers = self._rr.Points2D(names_at, radii=0.01, colors=grey, labels=list(tips))
+        self._to.log("hand/fingers", fingers, static=True)
 
     def _blueprint(self, units: str) -> Any:
         """Views: the hand beside the lines."""
@@ -261,7 +269,8 @@ class RerunLog:
             views.TimeSeriesView(origin="slip/shares", name="Shares"),
             views.TextLogView(origin="slip/events", name="Alarms and events"),
         ]
-        whole = views.Horizontal(views.Vertical(*plots), views.Vertical(*beside))
+        right = views.Vertical(*beside, row_shares=[4, 2, 1])
+        whole = views.Horizontal(views.Vertical(*plots), right)
         return views.Blueprint(whole, collapse_panels=True)
 
 
