@@ -92,6 +92,7 @@ MISTAKES = {
     "stream model=detector.pt source=stdin --serve": "'write serve='",
     "stream model=detector.pt source=stdin frame.format=csv": "frame.format text binary 'csv'",
     "stream model=detector.pt source=serial:/dev/ttyACM0 frame.format=binary": "frame.header",
+    "stream model=detector.pt source=ros2:/tactile": "rclpy setup.bash",
     "stream model=detector.pt source=stdin serve=true token=abc": "token 8 3",
     "export model=missing.pt": "missing.pt",
     "importance model=missing.pt": "missing.pt",

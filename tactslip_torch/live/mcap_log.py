@@ -78,7 +78,7 @@ class McapLog:
         is_live: whether the first sample is of now, where nobody tells times; else it is at 0.
 
     Raises:
-        ValueError: in one line, if ``mcap`` or ``rosbags`` is not installed, or the path does not end in
+        ValueError: in one line, if ``mcap`` or ``rosbags`` is not installed, or the path is no
             ``.mcap``.
     """
 

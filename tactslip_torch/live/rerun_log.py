@@ -73,8 +73,7 @@ class RerunLog:
         is_live: whether the first sample is of now, where nobody tells times; else it is at 0.
 
     Raises:
-        ValueError: in one line, if ``rerun-sdk`` is not installed, or the path does not end in
-            ``.rrd``.
+        ValueError: in one line, if ``rerun-sdk`` is not installed, or the path is no ``.rrd``.
     """
 
     def __init__(
