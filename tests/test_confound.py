@@ -36,11 +36,9 @@ class SmallScenes:
     sample_rate_hz = RATE_HZ
 
     def __init__(self, *, cycles, materials, scene, extra_scenes, **_):
-        kinds = {scene["name"]: cycles} | {
-            k: v.get("cycles", cycles) for k, v in extra_scenes.items()
-        }
+        kinds = (scene["name"], *extra_scenes)
         self.ids = tuple(
-            RecordingId(m, c, k) for k, num in kinds.items() for m in materials for c in range(num)
+            RecordingId(m, c, k) for k in kinds for m in materials for c in range(cycles)
         )
 
     def timeline(self, recording):
@@ -68,7 +66,7 @@ class SmallScenes:
 SMALL = (
     "data._target_=test_confound.SmallScenes",
     "data.materials=[a,b,c]",
-    "data.cycles=6",
+    "data.cycles=2",
     "split.seen=[a,b]",
     "split.unseen=[c]",
     "split.train_fraction=0.5",

@@ -1,6 +1,5 @@
 """Which sensors matter: sets whose answer is known, machines refitted the slow way, the command."""
 
-import json
 import shutil
 import sys
 from dataclasses import replace
@@ -9,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from drawing import assert_png
-from hydra import compose, initialize_config_dir
 from small_detector import HAND, raw_bins, small_detector
 from test_commands import TINY
 from test_commands import composed as composed_train
@@ -26,8 +23,7 @@ from tactslip_torch.analysis.importance import (
     score_gradients,
     without,
 )
-from tactslip_torch.commands.configuration import conf_dir
-from tactslip_torch.commands.importance import main, sensors
+from tactslip_torch.commands.importance import main
 from tactslip_torch.commands.train import train
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.selection import ClassMoments, t_scores
@@ -233,12 +229,6 @@ def test_what_no_first_order_can_be_told_of_is_refused(change, words):
 
 # The command -----------------------------------------------------------------------------------
 SMALL = ("bins=20", "scored_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
-CHANNELS = ["SG1", "SG2", "PVDF1", "PVDF2"]
-
-
-def composed(*overrides):
-    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-        return compose("importance", [*SMALL, *overrides])
 
 
 @pytest.fixture(scope="module")
@@ -246,45 +236,6 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     train(composed_train(*TINY, "recipe=robust", "cache=off"), folder)
     return folder
-
-
-@pytest.fixture(scope="module")
-def found(run, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sensors")
-    content = sensors(composed(f"model={run / 'detector.pt'}", "cache=off"), folder)
-    assert json.loads((folder / "sensors.json").read_text()) == content
-    return folder, content
-
-
-# What it leaves ----------------------------------------------------------------------------------
-
-
-def test_every_channel_finger_and_kind_has_its_row(found):
-    folder, content = found
-    names = {path.name for path in folder.iterdir()}
-    assert names == {"config.yaml", "sensors.json", "sensors.csv", "sensors.png"}
-    assert_png(folder / "sensors.png")
-    named = [(row["unit"], row["name"]) for row in content["units"]]
-    assert named == [
-        *(("channel", name) for name in CHANNELS),
-        *(("finger", name) for name in ("index", "thumb")),
-        *(("kind", name) for name in ("SG", "PVDF")),
-    ]
-    roles = ["held_out", "test", "unseen"]
-    in_use = {row["name"]: row["features_in_use"] for row in content["units"]}
-    assert sum(in_use[name] for name in CHANNELS) == content["detector"]["features"] == 10
-    for row in content["units"]:
-        assert list(row["lost"]) == list(row["lost_reselected"]) == list(row["alone"]) == roles
-        if row["unit"] == "channel":
-            assert (row["gradient"]["slip"] > 0) is (row["features_in_use"] > 0)
-        if not row["features_in_use"]:
-            assert row["lost"]["unseen"] == {"lost": 0.0, "low": 0.0, "high": 0.0}
-    assert content["groups"] == {"held_out": ["A", "B"], "test": ["A", "B"], "unseen": ["C"]}
-    assert content["num_bins"]["held_out"] == 2 * 2 * 20
-    assert content["simulated"] is False
-
-
-# The figure --------------------------------------------------------------------------------------
 
 
 # The command -------------------------------------------------------------------------------------
@@ -324,6 +275,7 @@ def moved(run, folder, *, change=None):
     return f"model={folder / 'detector.pt'}"
 
 
+@pytest.mark.slow
 def test_a_detector_without_its_run_is_refused(monkeypatch, capsys, run, tmp_path):
     here = f"hydra.run.dir={tmp_path / 'out'}"
     alone = moved(run, tmp_path / "far" / "away")

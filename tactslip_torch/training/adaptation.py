@@ -7,7 +7,7 @@ undone.
 
 A change is accepted only if the old materials keep their accuracy. What every known bin scores by
 the machine without its recording follows in closed form from the factor that solves for the machine
-(``model.leave_one_group_out``). Of an added recording all bins are known, of one trained on those
+(``model.fit.HeldOut``). Of an added recording all bins are known, of one trained on those
 sampled; its other bins stay in, so a score is a little better than that of a machine without the
 recording, before and after a change alike.
 """

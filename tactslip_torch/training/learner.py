@@ -103,7 +103,7 @@ class EvaluatedBins(NamedTuple):
         says_slip: of the detector, ``[N]``, bool.
         baselines: decisions of baselines by name, ``[N]`` each.
         is_whole: whether these are all bins of the recording.
-        answer: slip, non-slip or none (``model.abstention``), ``[N]``; None of a detector that
+        answer: slip, non-slip or none (``Abstention``), ``[N]``; None of a detector that
             never abstains.
     """
 

@@ -971,7 +971,7 @@ class Abstaining:
     Calibration recordings are not set aside: each sampled bin is scored in closed form by the
     machine that was fitted without its recording (``HeldOut``). Features, scaling, K, c and C are
     the plan's, which saw all of them, and the detector itself is trained on the left-out recording
-    too, so the guarantee of ``model.abstention`` holds as far as one recording of the training set
+    too, so the guarantee of ``Abstention`` holds as far as one recording of the training set
     changes little; ``benchmarks.abstaining`` looks. A recording has the mean of its sampled bins,
     which are drawn by a hash of the bin alone.
 
