@@ -11,7 +11,9 @@ export function explain({ rule, sample_rate_hz: rate, hop_samples: hop, onset_ho
     cusum: () =>
       "cusum adds up the evidence of all decisions and never falls below 0" +
       (rule.ceiling === null ? "" : ` or rises above ${rounded(rule.ceiling)}`) +
-      (rule.drift ? `; ${rounded(rule.drift)} is taken off each, so that weak evidence fades` : "") +
+      (rule.drift
+        ? `; ${rounded(rule.drift)} is taken off each, so that weak evidence fades`
+        : "") +
       ". An alarm comes when the sum reaches the threshold.",
   };
   return [

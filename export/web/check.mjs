@@ -40,7 +40,11 @@ async function tabbed(page) {
       const own = document.activeElement.ariaLabel ?? document.activeElement.textContent;
       const label = labels?.[0]?.textContent ?? own;
       const isRinged = ring(document.activeElement) || ring(next);
-      return { id: id || name || document.activeElement.dataset.timeS, label: label.trim(), isRinged };
+      return {
+        id: id || name || document.activeElement.dataset.timeS,
+        label: label.trim(),
+        isRinged,
+      };
     });
     if (!at.id || seen.some(({ id }) => id === at.id)) return seen;
     seen.push(at);
@@ -78,7 +82,12 @@ async function seeking(page) {
   await alarms.last().click();
   await frames(page);
   moments.alarm = await position(page);
-  return { ...moments, value: await seek.getAttribute("aria-valuetext"), before, after: await slipPixels(page) };
+  return {
+    ...moments,
+    value: await seek.getAttribute("aria-valuetext"),
+    before,
+    after: await slipPixels(page),
+  };
 }
 
 /** Pixels of the picture in the colour of slip. */
@@ -188,7 +197,9 @@ async function live(page, address, seconds) {
   const heap = [start.JSHeapUsedSize, end.JSHeapUsedSize];
   const { decisions, ...more } = await held(page);
   const told = ["stream-state", "received", "dropped", "dropped_to_page", "position", "simulated"];
-  const shown = Object.fromEntries(await Promise.all(told.map(async (id) => [id, await text(page, id)])));
+  const shown = Object.fromEntries(
+    await Promise.all(told.map(async (id) => [id, await text(page, id)])),
+  );
   return { busy, heap, ...more, shown, slip: await slipPixels(page), decisions };
 }
 

@@ -125,7 +125,9 @@ function number(cell) {
 function rateOf(times, name) {
   if (times.length < 2) return undefined;
   const step = (times.at(-1) - times[0]) / (times.length - 1);
-  const isEven = times.every((time, i) => i === 0 || Math.abs(time - times[i - 1] - step) < step / 2);
+  const isEven = times.every(
+    (time, i) => i === 0 || Math.abs(time - times[i - 1] - step) < step / 2,
+  );
   if (!(step > 0) || !isEven) {
     throw new Error(`${name} has times that are not evenly spaced: resample it`);
   }
@@ -142,7 +144,8 @@ async function fromNpz(content, name, facts) {
   let samples;
   try {
     const members = zipMembers(new DataView(content));
-    const word = async (key) => members.has(key) && value(await unpacked(content, members.get(key)));
+    const word = async (key) =>
+      members.has(key) && value(await unpacked(content, members.get(key)));
     const form = await word("format");
     if (form && form !== FORM) throw new Error(`its format is "${form}", wanted "${FORM}"`);
     if (!members.has("samples")) throw new Error("no array is called samples");
@@ -224,7 +227,9 @@ function value({ type, shape, data }) {
   const points = new Uint32Array(data);
   const words = [];
   for (let at = 0; at < points.length; at += length) {
-    const word = Array.from(points.subarray(at, at + length), (point) => String.fromCodePoint(point));
+    const word = Array.from(points.subarray(at, at + length), (point) =>
+      String.fromCodePoint(point),
+    );
     words.push(word.join("").replace(/\0+$/, ""));
   }
   return shape.length ? words : words[0];

@@ -107,7 +107,12 @@ export class Live {
   }
 
   #clear() {
-    const { channels, sample_rate_hz: rate, onset_hop_samples: fast, hop_samples: hop } = this.facts;
+    const {
+      channels,
+      sample_rate_hz: rate,
+      onset_hop_samples: fast,
+      hop_samples: hop,
+    } = this.facts;
     const most = Math.floor(MOST_BYTES / 4 / channels.length);
     const rows = Math.min(Math.ceil(KEPT_S * rate), most);
     this.samples = new Samples(channels.length, rows);

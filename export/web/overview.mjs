@@ -39,7 +39,9 @@ export class Overview {
 
   draw(status) {
     const { samples, history, position, viewS } = this.#source;
-    const [first, end, now] = [samples.first, samples.end, position].map((row) => this.#seconds(row));
+    const [first, end, now] = [samples.first, samples.end, position].map((row) =>
+      this.#seconds(row),
+    );
     this.#move(first, end, now, status);
     const box = this.#canvas.getBoundingClientRect();
     const ratio = window.devicePixelRatio;
@@ -57,7 +59,13 @@ export class Overview {
     this.#canvas.height = Math.round(box.height * ratio);
     const context = this.#canvas.getContext("2d");
     context.scale(ratio, ratio);
-    this.#picture(context, box, (timeS) => EDGE + share(timeS) * (box.width - 2 * EDGE), first, end);
+    this.#picture(
+      context,
+      box,
+      (timeS) => EDGE + share(timeS) * (box.width - 2 * EDGE),
+      first,
+      end,
+    );
   }
 
   #seconds(row) {

@@ -62,7 +62,9 @@ function describe({ facts, isLive }) {
   const perSecond = Math.round(facts.sample_rate_hz / hop);
   const aheadMs = (1000 * facts.context_after_samples) / facts.sample_rate_hz;
   const parts = [
-    facts.file ? `${facts.file}, ${Math.round(facts.onnx_bytes / 1000)} kB, ${facts.precision}` : null,
+    facts.file
+      ? `${facts.file}, ${Math.round(facts.onnx_bytes / 1000)} kB, ${facts.precision}`
+      : null,
     `${facts.channels.length} channels at ${facts.sample_rate_hz} Hz`,
     `${perSecond} decisions a second, ${Number(aheadMs.toPrecision(3))} ms look-ahead`,
     facts.train_materials?.length ? `trained on ${facts.train_materials.join(", ")}` : null,
@@ -194,7 +196,8 @@ function positionText() {
   const { recording, facts, position, samples, progress, isLive } = source;
   if (recording === null) return "no recording";
   const [now, end] = [position, samples.end].map((row) => (row / facts.sample_rate_hz).toFixed(1));
-  const rate = isLive || recording.rate ? "" : ` (no rate in the file: taken as ${facts.sample_rate_hz} Hz)`;
+  const rate =
+    isLive || recording.rate ? "" : ` (no rate in the file: taken as ${facts.sample_rate_hz} Hz)`;
   const scored = progress < 1 ? `, ${Math.floor(100 * progress)} % scored` : "";
   return `${recording.name}: ${now} of ${end} s${scored}${rate}`;
 }

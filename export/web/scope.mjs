@@ -22,7 +22,9 @@ const SCALE_MS = 2000; // and how often
 /** Colours of the page, by name. */
 export function pageColours() {
   const style = getComputedStyle(document.documentElement);
-  return Object.fromEntries(COLOURS.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
+  return Object.fromEntries(
+    COLOURS.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
+  );
 }
 
 /** Draws what a source has at its position. */
@@ -254,7 +256,8 @@ export class Scope {
     context.strokeStyle = colours.grid;
     context.lineWidth = 1;
     for (const panel of [probability, statistic, onset].filter(Boolean)) {
-      for (const share of [0, 1]) line(context, size.left, panel.top + share * panel.height, size.right);
+      for (const share of [0, 1])
+        line(context, size.left, panel.top + share * panel.height, size.right);
     }
     const { threshold } = this.source;
     const ofBins = onset ? (facts.status_threshold ?? Infinity) : threshold;
@@ -270,7 +273,15 @@ export class Scope {
     context.setLineDash([6, 4]);
     line(context, size.left, y, size.right);
     context.setLineDash([]);
-    write(context, FONT, colours.alarm, "left", "threshold", size.left + 4, y < panel.top + 9 ? y + 8 : y - 7);
+    write(
+      context,
+      FONT,
+      colours.alarm,
+      "left",
+      "threshold",
+      size.left + 4,
+      y < panel.top + 9 ? y + 8 : y - 7,
+    );
   }
 
   #drawAxis(context, startS) {

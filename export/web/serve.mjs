@@ -116,7 +116,9 @@ export function given(words, more = {}) {
   });
   const [model, recording] = SAMPLE.map((name) => fileURLToPath(new URL(name, HERE)));
   if (!values.model && !existsSync(model)) {
-    throw new Error("wanted --model stream.onnx; tactslip hosts web DIR gives a page with a sample");
+    throw new Error(
+      "wanted --model stream.onnx; tactslip hosts web DIR gives a page with a sample",
+    );
   }
   if (!values.model) values.recording ??= recording;
   values.model ??= model;

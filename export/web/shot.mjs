@@ -74,7 +74,9 @@ export async function toEnd(page) {
   await page.waitForFunction(() => !document.body.dataset.busy);
   await page.locator("#seek").press("End");
   await page.locator("#seek").blur();
-  await page.waitForFunction(() => /Play again|Follow/.test(document.getElementById("play").innerText));
+  await page.waitForFunction(() =>
+    /Play again|Follow/.test(document.getElementById("play").innerText),
+  );
 }
 
 /** All that the page holds: decisions, facts, and which samples. */
