@@ -60,11 +60,11 @@ def watch(
     decider.start()
     reader.start()
     try:
-        while decider.is_alive():
-            decider.join(0.2)  # signals come in between
-    except BaseException:
+        while not state.is_done.wait(0.2):  # signals come in between
+            pass
+    except BaseException:  # Thread.join would take a thread for ended now (CPython, bpo-45274)
         state.stop()
-        decider.join(_PATIENCE_S)
+        state.is_done.wait(_PATIENCE_S)
         raise
     if state.error is not None:
         raise state.error
@@ -92,6 +92,7 @@ class _State:
         self._next: int | None = None  # index of the sample that would go on
         self._is_break_told = False
         self.error: BaseException | None = None
+        self.is_done = threading.Event()
 
     def stop(self) -> None:
         """End soon: what waits is still decided on."""
@@ -160,6 +161,7 @@ class _State:
     def decide(self) -> None:
         """All that waits, at once, until nothing more can come."""
         with one_thread(), ExitStack() as closing:
+            closing.callback(self.is_done.set)
             for sink in reversed(self._sinks):
                 closing.callback(self._close, sink)
             try:

@@ -1,0 +1,267 @@
+"""``tactslip stream`` fed as by a device, for minutes: ``python -m benchmarks.live``.
+
+A process of its own watches a pseudo-terminal, then a socket, which get frames at the rate of the
+hand. When each frame was sent and when each line came is on one clock: from a sample to the line of
+the first decision on it, whether one was lost, and the memory and load of the process.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import pty
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from benchmarks.harness import Benchmark, Job, Report, Table, limit, limits, number, say
+from benchmarks.subjects import RATE_HZ, Array
+from tactslip_torch import SlipDetector, StreamingDetector, sample_recording
+
+HEADER, FRAME_SAMPLES = "AA55", 2
+MARGIN_MS, MOST_GROWTH_MB = 5.0, 5.0
+_FRAME = (
+    f'frame.format=binary frame.header="{HEADER}" frame.counter=uint32 frame.dtype=float32 '
+    f"frame.samples={FRAME_SAMPLES}"
+)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Args:
+        seconds: of stream, of each source.
+        settled_s: of them, until the memory has to stay where it is.
+        checked_s: of them, whose decisions are held against ``StreamingDetector``.
+    """
+
+    seconds: float = 600.0
+    settled_s: float = 60.0
+    checked_s: float = 60.0
+
+
+class Live(Benchmark[Sizes]):
+    """From a sample to its line, over minutes."""
+
+    name = "live"
+    title = "Live"
+    about = (
+        "`tactslip stream` in a process of its own, fed the sample recording again and again: 24 "
+        f"channels at 2 kHz, {FRAME_SAMPLES} samples a frame, a line for each decision; from when "
+        "a sample was sent to when the line of the first decision on it could be read"
+    )
+    sizes = Sizes()
+    quick = Sizes(4.0, 1.0, 4.0)
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Latencies, memory and what was lost, by source."""
+        with TemporaryDirectory(prefix="tactslip-live-") as name:
+            folder = Path(name)
+            SlipDetector.pretrained("paper24-sim").save(folder / "detector.pt")
+            rows = [_fed(kind, folder, job.sizes) for kind in ("pseudo-terminal", "socket")]
+        return {"rows": rows, "settled_s": job.sizes.settled_s}
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Limits, and what was measured."""
+        goals, shown = [], []
+        for row in numbers["rows"]:
+            kind, bound_ms = row["source"], row["look_ahead_ms"] + row["hop_ms"] + MARGIN_MS
+            growth = _growth_mb(row, numbers["settled_s"])
+            p50, p99, most = (row["latency_ms"][key] for key in ("50", "99", "100"))
+            goals += [
+                limit(f"{kind}: sample to line, 99th percentile", p99, bound_ms, "ms"),
+                limit(f"{kind}: samples lost", row["sent"] - row["received"], 0),
+                limit(f"{kind}: resident memory, growth after it has settled", growth,
+                      MOST_GROWTH_MB, "MB"),
+                limit(f"{kind}: decisions unlike those of StreamingDetector", row["unlike"], 0),
+            ]  # fmt: skip
+            shown.append(
+                {
+                    "source": kind,
+                    "samples": f"{row['sent']:,}",
+                    "median, ms": number(p50),
+                    "99 %, ms": number(p99),
+                    "longest, ms": number(most),
+                    "of it computing and waiting, median, ms": number(row["late_ms"]["50"]),
+                    "99 %, us": number(1e3 * row["late_ms"]["99"]),
+                    "of a core": number(row["cpu_s"] / row["seconds"]),
+                    "resident, MB": number(row["resident_bytes"][-1] / 1e6),
+                    "machine's load": f"{row['load']:.1f}",
+                }
+            )
+        row = numbers["rows"][0]
+        parts = f"{row['look_ahead_ms']:g} ms of look-ahead, {row['hop_ms']:g} ms of hop"
+        note = f"Of the limit {parts} and {MARGIN_MS:g} ms of margin."
+        return {"Limits": limits(goals), "From a sample to its line": Table(shown, note)}
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Latency by share of samples, and memory over time."""
+        latency, memory = drawing.subplots(2, 1)
+        for row in numbers["rows"]:
+            shares = [float(share) for share in row["latency_ms"]]
+            latency.plot(list(row["latency_ms"].values()), shares, label=row["source"])
+            memory.plot(row["at_s"], np.asarray(row["resident_bytes"]) / 1e6, label=row["source"])
+        latency.set_xlabel("ms from a sample to its line")
+        latency.set_ylabel("% of samples")
+        latency.legend()
+        memory.set_xlabel("s of stream")
+        memory.set_ylabel("resident, MB")
+
+
+def _growth_mb(row: Report, settled_s: float) -> float:
+    looks = zip(row["at_s"], row["resident_bytes"], strict=True)
+    settled: list[float] = [resident for at_s, resident in looks if at_s >= settled_s]
+    return (max(settled) - settled[0]) / 1e6
+
+
+def _fed(kind: str, folder: Path, sizes: Sizes) -> dict[str, Any]:
+    """Feed one source, and what came of it."""
+    import psutil
+
+    say(f"live: {sizes.seconds:g} s of stream into a {kind}")
+    frames, samples = _frames()
+    with ExitStack() as stack:
+        source, send = _terminal(stack) if kind == "pseudo-terminal" else _socket(stack)
+        command = [sys.executable, "-m", "tactslip_torch", "stream", "model=detector.pt"]
+        command += [f"source={source}", "decisions=true", *_FRAME.split()]
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+        environment |= {"OMP_NUM_THREADS": "1"}
+        pipe: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        run = subprocess.Popen(command, cwd=folder, env=environment, **pipe)
+        stack.enter_context(run)
+        stack.callback(run.kill)
+        lines: list[tuple[float, bytes]] = []
+        is_ready = threading.Event()
+
+        def read() -> None:
+            assert run.stdout is not None
+            for line in run.stdout:
+                lines.append((time.monotonic(), line))
+                if b"connected" in line:
+                    is_ready.set()
+
+        reading = threading.Thread(target=read)
+        reading.start()
+        send(None)
+        if not is_ready.wait(120):
+            run.kill()
+            raise RuntimeError(f"tactslip stream does not begin: {run.communicate()[1].decode()}")
+        process = psutil.Process(run.pid)
+        at_s: list[float] = []
+        resident: list[int] = []
+        num = round(sizes.seconds * RATE_HZ / FRAME_SAMPLES)
+        sent_s = np.empty(num)
+        gc.collect()
+        started_s, cpu_s = time.monotonic(), sum(process.cpu_times()[:2])
+        for place in range(num):
+            due_s = started_s + place * FRAME_SAMPLES / RATE_HZ
+            if (wait_s := due_s - time.monotonic()) > 0:
+                time.sleep(wait_s)
+            body = struct.pack("<I", place) + frames[place % len(frames)]
+            sent_s[place] = time.monotonic()
+            send(bytes.fromhex(HEADER) + body)
+            if place * FRAME_SAMPLES / RATE_HZ >= len(at_s):
+                at_s.append(place * FRAME_SAMPLES / RATE_HZ)
+                resident.append(int(process.memory_info().rss))
+        time.sleep(1.0)
+        cpu_s = sum(process.cpu_times()[:2]) - cpu_s
+        run.terminate()
+        run.wait(30)
+        reading.join(30)
+    detector = SlipDetector.pretrained("paper24-sim")
+    stream = StreamingDetector(detector, dtype=torch.float64)
+    found = [(came_s, json.loads(line)) for came_s, line in lines]
+    decided = [(came_s, row) for came_s, row in found if "score" in row]
+    last = found[-1][1]
+    end = np.rint([row["time_s"] * RATE_HZ for _, row in decided]).astype(int)  # behind the last
+    in_time = end <= num * FRAME_SAMPLES  # those that are flushed wait for what is never sent
+    came_s, end = np.array([came_s for came_s, _ in decided])[in_time], end[in_time]
+    late_s = came_s - sent_s[(end - 1) // FRAME_SAMPLES]
+    ahead = round(stream.look_ahead_s * RATE_HZ)
+    # a sample's first decision is that on the first bin that ends with it or later
+    first = np.searchsorted(end - ahead, np.arange(end[0] - ahead, end[-1] - ahead), side="right")
+    samples_s = np.repeat(sent_s, FRAME_SAMPLES)[end[0] - ahead : end[-1] - ahead]
+    latency_s = came_s[first] - samples_s
+    shares = [0, *range(1, 100, 2), 50, 99, 99.9, 100]
+    checked = round(min(sizes.checked_s, sizes.seconds) * RATE_HZ)
+    expected = stream.push(np.resize(samples, (checked, samples.shape[1])).astype(np.float64))
+    pairs = zip(expected.score.tolist(), expected.is_alarm.tolist(), decided, strict=False)
+    return {
+        "source": kind,
+        "seconds": sizes.seconds,
+        "sent": num * FRAME_SAMPLES,
+        "received": round(last["seconds"] * RATE_HZ) if "decisions" in last else 0,
+        "decisions": len(decided),
+        "unlike": sum(
+            alarm != row["alarm"] or not abs(score - row["score"]) < 1e-9
+            for score, alarm, (_, row) in pairs
+        )
+        + max(0, len(expected.score) - len(decided)),
+        "events": [row["text"] for _, row in found if "event" in row],
+        "look_ahead_ms": 1e3 * stream.look_ahead_s,
+        "hop_ms": 1e3 * stream.hop_s,
+        "latency_ms": {
+            f"{share:g}": 1e3 * float(np.percentile(latency_s, share)) for share in sorted(shares)
+        },
+        "late_ms": {
+            f"{share:g}": 1e3 * float(np.percentile(late_s, share)) for share in (50, 99, 100)
+        },
+        "cpu_s": cpu_s,
+        "at_s": at_s,
+        "resident_bytes": resident,
+        "load": os.getloadavg()[0],
+    }
+
+
+def _frames() -> tuple[list[bytes], Array]:
+    """The sample recording as values of frames, and its samples ``[T, 24]``."""
+    samples = sample_recording().samples.T.contiguous().numpy().astype("<f4")
+    samples = samples[: len(samples) // FRAME_SAMPLES * FRAME_SAMPLES]
+    return [part.tobytes() for part in np.split(samples, len(samples) // FRAME_SAMPLES)], samples
+
+
+def _terminal(stack: ExitStack) -> tuple[str, Callable[[bytes | None], object]]:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    for each in (master, slave):
+        stack.callback(os.close, each)
+
+    def send(data: bytes | None) -> None:
+        while data:
+            data = data[os.write(master, data) :]
+
+    return f"serial:{os.ttyname(slave)}", send
+
+
+def _socket(stack: ExitStack) -> tuple[str, Callable[[bytes | None], object]]:
+    server = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+    peers: list[socket.socket] = []
+
+    def send(data: bytes | None) -> None:
+        if data is None:
+            peers.append(stack.enter_context(server.accept()[0]))
+            peers[0].setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        else:
+            peers[0].sendall(data)
+
+    return f"tcp:127.0.0.1:{server.getsockname()[1]}", send
+
+
+if __name__ == "__main__":
+    raise SystemExit(Live().run())
