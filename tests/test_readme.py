@@ -118,7 +118,11 @@ def test_every_public_name_is_in_the_reference():
 
 def test_every_dependency_and_its_licence_is_named():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    needed = project["dependencies"] + project["optional-dependencies"]["formats"]
+    extras = project["optional-dependencies"]
+    needed = [
+        *project["dependencies"],
+        *(x for of in ("formats", "live", "rerun") for x in extras[of]),
+    ]
     licences = PAGES["README.md"].split("## Licence")[1]
     names = [re.match(r"[\w-]+", one)[0] for one in needed]
     assert [name for name in names if not re.search(rf"\b{name}\b", licences)] == []

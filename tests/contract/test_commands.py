@@ -2,8 +2,11 @@
 
 import csv
 import json
+import os
 import runpy
 import shutil
+import signal
+import time
 
 import numpy as np
 import pytest
@@ -29,6 +32,7 @@ from .names import (
     PARETO,
     RUN_FILES,
     SPLITS,
+    STREAM_OUTPUTS,
     SUMMARY,
     TEMPLATE,
     TEST,
@@ -122,6 +126,40 @@ def test_detect_decides_as_a_stream(command, trained_or_slow, recordings, tmp_pa
     np.testing.assert_allclose(scores, expected.score.numpy(), rtol=1e-4, atol=1e-4)
     alarms = [row["is_alarm"] == "True" for row in decided][: len(scores)]
     assert alarms == expected.is_alarm.tolist()
+
+
+def test_stream_decides_as_detect_and_ends_whole_by_a_signal(
+    command, trained_or_slow, recordings, tmp_path
+):
+    """Of a file, as fast as it goes; then over and over, until it is stopped."""
+    model = settings(model=trained_or_slow.file)
+    told = settings(input=recordings / "D_2.csv", folder="run", every_decision=True, figure=False)
+    command.well(tmp_path, "detect", *model, *told)
+    decided = table(tmp_path / "run" / DECISIONS.format("D_2"))
+    told = settings(source_of_stream=recordings / "D_2.csv", every_decision=True, speed=None)
+    out = command.well(tmp_path, "stream", *model, *told)
+    *rows, last = [json.loads(line) for line in out.splitlines()]
+    rows = [row for row in rows if "event" not in row]
+    for name, word in STREAM_OUTPUTS.items():
+        of_stream, of_detect = [row[name] for row in rows], [row[word] for row in decided]
+        if isinstance(of_stream[0], float):
+            assert of_stream == pytest.approx([float(x) for x in of_detect], abs=1e-12), name
+        else:
+            assert [str(x) for x in of_stream] == of_detect, name
+    counts = {"decisions": len(rows), "alarms": sum(row["alarm"] for row in rows)}
+    assert last == {**counts, "seconds": len(samples_of("D", 2)) / 2000}
+
+    pid = command.start(tmp_path, "stream", *model, *told, *settings(repeat=True))
+    end = time.monotonic() + 60
+    while (tmp_path / ".stdout").read_text().count("\n") < 500:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    os.kill(pid, signal.SIGTERM)
+    ran = command.wait()
+    assert ran.status == 128 + signal.SIGTERM, ran.err
+    *rows, last = [json.loads(line) for line in ran.out.splitlines()]
+    assert last["decisions"] == sum("event" not in row for row in rows)
+    assert "all decisions are written" in ran.err.splitlines()[-1]
 
 
 def test_detect_does_without_masked_channels(command, selected, recordings, tmp_path):
