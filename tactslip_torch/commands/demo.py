@@ -58,7 +58,9 @@ def demo(folder: Path) -> None:
         f"ONNX files    {folder / 'model.onnx'}, {folder / 'stream.onnx'}\n"
         f"page          needs Node 18 or later and, once, the internet:\n"
         f"              cd {page} && npm ci && node serve.mjs\n"
-        f"              then open the address it prints: the recording plays"
+        f"              then open the address it prints: the recording plays\n"
+        f'live          needs pip install "tactslip-torch[live]":\n'
+        f"              tactslip stream model={model} source={place} serve=true repeat=true"
     )
 
 
