@@ -1,5 +1,6 @@
 """The commands as a user runs them: what they leave behind, and what they say of bad input."""
 
+import importlib
 import json
 import os
 import pickle
@@ -412,7 +413,8 @@ def assert_one_line(error, expected):
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
 def test_bad_input_is_refused_before_anything_is_simulated(overrides, line, tmp_path, monkeypatch):
-    monkeypatch.setattr("tactslip_torch.simulation.simulate.simulate", None)
+    module = importlib.import_module("tactslip_torch.simulation.simulate")  # the name is a function
+    monkeypatch.setattr(module, "simulate", None)
     config = composed("num_workers=0", f"cache={tmp_path / 'cache'}", *overrides)
     with pytest.raises(BAD_INPUT) as caught:
         train(config, tmp_path / "run")

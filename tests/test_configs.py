@@ -74,9 +74,12 @@ def test_an_experiment_composes_and_everything_it_names_exists(name, layouts):
 def test_an_experiment_adds_no_key(name):
     """A misspelt key in an experiment file is added silently, so hold it against its groups."""
     content = yaml.safe_load((conf_dir() / "exp" / f"{name}.yaml").read_text())
-    groups = [
+    entries = content.pop("defaults", [])
+    groups = [f"+exp={entry}" for entry in entries if isinstance(entry, str) and entry != "_self_"]
+    groups += [
         f"{key.removeprefix('override /')}={option}"
-        for entry in content.pop("defaults", [])
+        for entry in entries
+        if isinstance(entry, dict)
         for key, option in entry.items()
         if key.startswith("override /")
     ]
