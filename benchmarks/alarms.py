@@ -170,6 +170,12 @@ class Alarms(Benchmark[Sizes]):
         found = stage(detector, peers)
         detector.save(folder / "detector.pt")
         found["settings"].pop("onset")
+        found.pop("reliability")
+        for by_role in found["scenes"].values():  # of these no table has more than the whole
+            for role in by_role.keys() & ROLES.keys():
+                for events in by_role[role].values():
+                    for part in ("per_material", "per_scene"):
+                        events.pop(part, None)
         for method in found["methods"].values():
             method.pop("metadata", None)
         if is_first:
