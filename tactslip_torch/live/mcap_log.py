@@ -40,7 +40,7 @@ from tactslip_torch.data.formats._messages import HEADER, TOPIC, Types, kind_of
 from tactslip_torch.data.formats._reading import header_of, needs, text_of
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.live.sinks import Block
+from tactslip_torch.live.sinks import Block, FileSink, alarm_text
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.runtime import whole_file
@@ -58,7 +58,7 @@ _INFO, _WARN = 20, 30
 _CHUNK = 2**18  # bytes; what a killed process loses at most
 
 
-class McapLog:
+class McapLog(FileSink):
     """A sink that writes an MCAP file, and ``NAME.foxglove.json`` beside it.
 
     The file has its name once it is closed; a ``with`` block that raises leaves none. A killed
@@ -130,17 +130,6 @@ class McapLog:
                 self._write("truth", start, data=True)
                 self._write("truth", end, data=False)
 
-    def __enter__(self) -> McapLog:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: Any
-    ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self._stack.__exit__(kind, error, trace)
-
     def samples(self, first: int, block: Block) -> None:
         """Write a message for each sample."""
         if block.time_s is not None:
@@ -179,11 +168,7 @@ class McapLog:
             self._write(
                 "onset", alarm.alarm_s, header=header, time_ref=began, source=alarm.raised_by
             )
-            text = (
-                f"slip alarm by {alarm.raised_by}; slip began {alarm.alarm_s - alarm.onset_s:.3f} "
-                f"s before; probability {alarm.probability:.3f}"
-            )
-            self._log(_WARN, alarm.alarm_s, text)
+            self._log(_WARN, alarm.alarm_s, alarm_text(alarm))
 
     def event(self, kind: str, text: str) -> None:
         """Write it at the time of the last sample."""

@@ -22,7 +22,7 @@ from tactslip_torch.data.folder import has_truth
 from tactslip_torch.data.formats._reading import needs
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.live.sinks import Block
+from tactslip_torch.live.sinks import Block, FileSink, alarm_text
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.onset.rules import NOTHING_YET
@@ -59,7 +59,7 @@ def channel_shares(detector: SlipDetector, samples: Tensor) -> Tensor:
     return score[:, num:] - score[:, :num]
 
 
-class RerunLog:
+class RerunLog(FileSink):
     """A sink that writes a ``.rrd`` file, which has its name once it is closed.
 
     A ``with`` block that raises leaves none. A killed process leaves ``.NAME.*.tmp.rrd``, which
@@ -115,17 +115,6 @@ class RerunLog:
             times = [0.0, *(time_s for slide in slides for time_s in slide)]
             self._send("slip/truth", times, [[0.0], *[[1.0], [0.0]] * len(slides)])
 
-    def __enter__(self) -> RerunLog:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: Any
-    ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self._stack.__exit__(kind, error, trace)
-
     def samples(self, first: int, block: Block) -> None:
         """Keep them, to be sent by the tenth of a second, and draw the hand as often."""
         if not len(block.samples):
@@ -153,11 +142,9 @@ class RerunLog:
         states = torch.stack([decisions.is_on, decisions.is_valid], 1).double().numpy()
         self._send("slip/state", times_s, states)
         for alarm in decisions.alarms:
-            text = (
-                f"slip alarm by {alarm.raised_by}; slip began {alarm.alarm_s - alarm.onset_s:.3f} "
-                f"s before; probability {alarm.probability:.3f}"
+            self._log(
+                "slip/events", alarm.alarm_s, self._rr.TextLog(alarm_text(alarm), level="WARN")
             )
-            self._log("slip/events", alarm.alarm_s, self._rr.TextLog(text, level="WARN"))
 
     def event(self, kind: str, text: str) -> None:
         """Log it at the time of the last sample."""

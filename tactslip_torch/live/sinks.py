@@ -8,10 +8,11 @@ from __future__ import annotations
 import json
 import math
 import socket
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TextIO
+from typing import Any, NamedTuple, Protocol, Self, TextIO
 
 from numpy.typing import NDArray
 
@@ -290,3 +291,32 @@ class LineServer:
         """No more lines."""
         for each in (self._listener, *self._readers):
             each.close()
+
+
+class FileSink(ABC):
+    """A sink whose file gets its name when it is closed; a ``with`` that raises leaves none."""
+
+    _stack: ExitStack
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: Any
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self._stack.__exit__(kind, error, trace)
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write what is left and give the file its name."""
+
+
+def alarm_text(alarm: Alarm) -> str:
+    """An alarm in a line, for people."""
+    return (
+        f"slip alarm by {alarm.raised_by}; slip began {alarm.alarm_s - alarm.onset_s:.3f} "
+        f"s before; probability {alarm.probability:.3f}"
+    )
