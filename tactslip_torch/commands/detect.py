@@ -104,9 +104,7 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
                 "recordings"
             )
     detector = SlipDetector.load(config.model, backend=config.backend)
-    said = config.reading
-    said = OmegaConf.to_container(said, resolve=True) if OmegaConf.is_config(said) else said
-    reading = Reading.of(said)
+    reading = Reading.of(plain_section(config.reading))
     context = _DetectionContext(detector, settings_of(config, detector), reading, config, folder)
     paths = recording_files(Path(str(config.input)))
     save_config(config, folder)
@@ -253,6 +251,12 @@ def _with_truth(
     )
     alarms = [alarm | alarm_outcome(alarm["alarm_s"], known) for alarm in alarms]
     return entry | {"truth": known, "alarms": alarms}, events
+
+
+def plain_section(section: Any) -> Any:
+    """A section of a configuration in plain Python types; what is none is given back."""
+    is_section = OmegaConf.is_config(section)
+    return OmegaConf.to_container(section, resolve=True) if is_section else section
 
 
 def settings_of(config: DictConfig, detector: SlipDetector) -> AlarmSettings:

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from tactslip_torch.commands.configuration import hosts_dir
-from tactslip_torch.commands.detect import settings_of
+from tactslip_torch.commands.detect import plain_section, settings_of
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.formats import Reading
 from tactslip_torch.live.frames import Frames
@@ -97,9 +97,9 @@ def _source(config: DictConfig, detector: SlipDetector) -> Source:
     return source_of(
         str(config.source),
         detector,
-        Frames.of(_plain(config.frame)),
+        Frames.of(plain_section(config.frame)),
         baud=config.baud,
-        reading=Reading.of(_plain(config.reading)),
+        reading=Reading.of(plain_section(config.reading)),
         tare_s=config.tare_s,
         speed=config.speed,
         repeat=config.repeat,
@@ -144,12 +144,6 @@ def _page(
 def _say(kind: str, text: str) -> None:
     with suppress(OSError):  # nobody reads it
         print(f"{kind}: {text}", file=sys.stderr, flush=True)
-
-
-def _plain(section: Any) -> Any:
-    return (
-        OmegaConf.to_container(section, resolve=True) if OmegaConf.is_config(section) else section
-    )
 
 
 @contextmanager
