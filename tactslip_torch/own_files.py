@@ -1,17 +1,16 @@
 """The project's own files: tables of tensors and JSON, and the one schema of what they hold.
 
-A table is an archive as ``torch.save`` writes it. The reader here takes members that are stored as
-they are, so a file takes no more memory than it is long, and executes nothing in it.
+A table is an archive as ``torch.save`` writes it. Members must be stored as they are and tensors
+fill their storage, so a file takes no more memory than it is long; nothing in it is executed.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import os
-import pickle
 import pickletools
+import re
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -90,7 +89,8 @@ def load_table(
         raise ValueError(f"{name} must be of format {form!r}, got {content['format']!r:.80}")
     try:
         metadata, tensors = content["facts"], content["tensors"]
-        is_whole = content["digest"] == _digest(metadata, tensors)
+        is_whole = all(map(Tensor.is_contiguous, tensors.values()))  # else larger than the file
+        is_whole = is_whole and content["digest"] == _digest(metadata, tensors)
         metadata = json.loads(metadata)
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
         is_whole = False
@@ -117,74 +117,11 @@ def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
     return content_digest(head, *(tensors[name] for name in names))
 
 
-_OPCODES = frozenset(
-    name
-    for line in (
-        "PROTO STOP MARK EMPTY_DICT EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINUNICODE BININT",
-        "BININT1 BININT2 LONG1 NONE NEWTRUE NEWFALSE BINPUT LONG_BINPUT BINGET LONG_BINGET",
-        "SETITEM SETITEMS GLOBAL BINPERSID REDUCE EMPTY_LIST APPEND APPENDS BINFLOAT",
-    )
-    for name in line.split()
+_MAY_NAME = re.compile(
+    r"torch\._utils _rebuild_tensor_v2|collections OrderedDict|"
+    r"torch (Double|Float|Half|BFloat16|Long|Int|Short|Char|Byte|Bool)Storage"
 )
-_STORAGES = {
-    f"{name}Storage": dtype
-    for name, dtype in {
-        "Double": torch.float64,
-        "Float": torch.float32,
-        "Half": torch.float16,
-        "BFloat16": torch.bfloat16,
-        "Long": torch.int64,
-        "Int": torch.int32,
-        "Short": torch.int16,
-        "Char": torch.int8,
-        "Byte": torch.uint8,
-        "Bool": torch.bool,
-    }.items()
-}
-
-
-class _TableReader(pickle.Unpickler):
-    """Of an archive; it knows tensors that fill their storage, and nothing else."""
-
-    def __init__(self, archive: zipfile.ZipFile, root: str) -> None:
-        text = archive.read(f"{root}/data.pkl")
-        for opcode, _, _ in pickletools.genops(text):
-            if opcode.name not in _OPCODES:
-                raise ValueError(f"{opcode.name} has no place in a table")
-        super().__init__(io.BytesIO(text))
-        self._archive, self._root = archive, root
-        self._storages: dict[str, Tensor] = {}
-
-    def find_class(self, module: str, name: str) -> Any:
-        if module == "torch" and name in _STORAGES:
-            return _STORAGES[name]
-        return _KNOWN[module, name]
-
-    def persistent_load(self, about: Any) -> Tensor:
-        _, dtype, key, _, num = about
-        if key not in self._storages:
-            content = bytearray(self._archive.read(f"{self._root}/data/{key}"))
-            made = (
-                torch.frombuffer(content, dtype=dtype) if content else torch.empty(0, dtype=dtype)
-            )
-            self._storages[key] = made
-        storage = self._storages[key]
-        if storage.dtype != dtype or len(storage) != num:
-            raise ValueError("a storage has another length")
-        return storage
-
-
-def _tensor(storage: Tensor, offset: int, shape: Any, stride: Any, *_: Any) -> Tensor:
-    tensor = storage.reshape(shape)
-    if offset or (tensor.numel() and tensor.stride() != tuple(stride)):
-        raise ValueError("a tensor is a view")
-    return tensor
-
-
-_KNOWN: Mapping[tuple[str, str], Any] = {
-    ("torch._utils", "_rebuild_tensor_v2"): _tensor,
-    ("collections", "OrderedDict"): dict,
-}
+"""What the pickle in an archive may name, of all that ``torch.load`` would let pass."""
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -198,7 +135,11 @@ def _read(path: Path) -> dict[str, Any]:
             )
             if not is_stored or sum(m.file_size for m in members) > path.stat().st_size:
                 raise ValueError("members must be stored as they are")
-            content = _TableReader(archive, members[0].filename.split("/")[0]).load()
+            text = archive.read(f"{members[0].filename.split('/')[0]}/data.pkl")
+        for opcode, name, _ in pickletools.genops(text):
+            if "GLOBAL" in opcode.name and not _MAY_NAME.fullmatch(str(name)):
+                raise ValueError(f"{name} has no place in a table")
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # archives and pickles raise many kinds for what is not their own
         raise ValueError(f"{path} is damaged or no file of ours; make it again") from error
     if not isinstance(content, dict) or not isinstance(content.get("format"), str):
@@ -341,7 +282,7 @@ def _tuple_of(each: Wanted, most: int) -> Callable[[Any], str | None]:
 
 
 def _tensor_of_finite(value: Any) -> str | None:
-    is_right = isinstance(value, Tensor) and value.dtype.is_floating_point
+    is_right = isinstance(value, Tensor) and value.dtype.is_floating_point and value.is_contiguous()
     return None if is_right and bool(value.isfinite().all()) else "a tensor of finite numbers"
 
 
