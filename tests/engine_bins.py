@@ -16,15 +16,7 @@ from tactslip_torch import FeaturePool, HandLayout
 from tactslip_torch.features.names import FeatureName
 
 PLAIN_KINDS = ("random", "tied", "near_constant")
-DEGENERATE_KINDS = (
-    "zeros",
-    "constants",
-    "ramps",
-    "impulses",
-    "square",
-    "rails",
-    "dead_channel",
-)
+DEGENERATE_KINDS = ("zeros", "constants", "ramps", "impulses", "square", "rails", "dead_channel")
 KINDS = PLAIN_KINDS + DEGENERATE_KINDS
 LARGE_CV = 3e4  # a mean good to 15 eps of the spread is then good to 1e-10 of itself
 FLOOR_CV = 9e5  # beyond it the mean is rounding (descriptors.CV_FLOOR), its sign too

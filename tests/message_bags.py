@@ -14,11 +14,7 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 START_NS = 1_700_000_000_123_456_789
 STEP_NS = 500_000
-PACKINGS = {
-    "none": CompressionType.NONE,
-    "lz4": CompressionType.LZ4,
-    "zstd": CompressionType.ZSTD,
-}
+PACKINGS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 
 
 @dataclass

@@ -78,12 +78,7 @@ class SmallSet:
         if recording == self.broken:
             noise[1, onset + 300] = torch.nan
         return Recording(
-            noise,
-            RATE_HZ,
-            recording.material,
-            times.speeds_mm_s,
-            times.onsets_s,
-            times.sliding_s,
+            noise, RATE_HZ, recording.material, times.speeds_mm_s, times.onsets_s, times.sliding_s
         )
 
 

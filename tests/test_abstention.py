@@ -12,13 +12,7 @@ from small_set import SMALL_HAND
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.statistics import TrainingStatistics
-from tactslip_torch.model.calibration import (
-    ABSTENTION,
-    NON_SLIP,
-    SLIP,
-    Abstention,
-    Platt,
-)
+from tactslip_torch.model.calibration import ABSTENTION, NON_SLIP, SLIP, Abstention, Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, answer_of

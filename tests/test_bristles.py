@@ -374,10 +374,7 @@ def largest_force(lanes: Lanes, speed: torch.Tensor, load: torch.Tensor) -> torc
 @pytest.mark.parametrize("step_s", [1e-6, 5e-3])
 @pytest.mark.parametrize(
     ("n", "dtype", "backend", "num"),
-    [
-        (4, torch.float64, "native", 60),
-        (2, torch.float32, "torch", 15),
-    ],
+    [(4, torch.float64, "native", 60), (2, torch.float32, "torch", 15)],
 )
 def test_bounded_and_within_the_cone(step_s, n, dtype, backend, num):
     if backend == "native" and NO_ENGINE:

@@ -153,7 +153,14 @@ def working_folder():
         yield
 
 
-@pytest.mark.parametrize("line", MISTAKES)
+SOME_SLOW = [
+    line if place % 3 == 0 else pytest.param(line, marks=pytest.mark.slow)
+    for place, line in enumerate(MISTAKES)
+]
+"""Every third mistake, of each kind some, is made in the fast tier: each composes several times."""
+
+
+@pytest.mark.parametrize("line", SOME_SLOW)
 def test_a_mistake_is_answered_in_one_line(line):
     status, said = answer(line)
     assert (status, said.count("\n")) == (2, 1), said
@@ -208,15 +215,24 @@ def test_keys_that_something_takes_pass(line):
 
 @pytest.mark.parametrize("command", CONFIGURED)
 def test_every_key_and_group_is_described(command):
-    name = FILES[command]
-    composed = Composed(name)
+    composed = Composed(FILES[command])
     assert composed.head
     assert len(composed.examples) == 3
+    assert [group.name for group in composed.groups if not group.description] == []
+    assert [key.name for key in composed.keys if not key.description] == []
+    text = help_text(command, COMMANDS[command], composed)
+    assert all(f"  {key.name}=" in text for key in composed.keys)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", CONFIGURED)
+def test_examples_pass_and_keys_of_every_option_are_described(command):
+    name = FILES[command]
+    composed = Composed(name)
     for example in composed.examples:
         _, given, *rest = typed(example)
         assert given == command
         checked(command, name, rest)
-    assert [group.name for group in composed.groups if not group.description] == []
     options = {g.name: g.options for g in composed.groups if g.name != "+exp"}
     if command != "train":  # what is looked at there
         options = {k: own for k, own in options.items() if k == "search"}
@@ -224,8 +240,6 @@ def test_every_key_and_group_is_described(command):
         chosen = [f"{group}={own[n % len(own)]}" for group, own in options.items()]
         keys = Composed(name, chosen).keys
         assert [key.name for key in keys if not key.description] == [], chosen
-    text = help_text(command, COMMANDS[command], composed)
-    assert all(f"  {key.name}=" in text for key in composed.keys)
 
 
 @pytest.mark.parametrize("line", ["-m tactslip_torch train --help", "-m tactslip_torch.train -h"])

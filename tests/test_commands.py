@@ -4,7 +4,6 @@ import importlib
 import json
 import os
 import pickle
-import shutil
 from types import SimpleNamespace
 
 import pytest
@@ -138,12 +137,6 @@ def assert_same_detector(folder, other):
     assert selected[0] == selected[1]
 
 
-def timeless(metrics):
-    return {
-        key: value for key, value in metrics.items() if key not in ("timing_s", "worker_s", "onnx")
-    }
-
-
 def damage(cache):
     """Flip a bit in the middle of every file."""
     paths = [path for path in cache.rglob("*") if path.is_file()]
@@ -222,20 +215,6 @@ def test_a_run_leaves_its_results(tiny):
     assert detector.info["abstain"] is None
 
 
-def test_neither_cache_nor_workers_change_anything(tiny, tmp_path, caplog):
-    cache = shutil.copytree(tiny.cache, tmp_path / "cache")
-    workers = [o for o in TINY if not o.startswith("num_workers")]
-    _, warm = run_train(tmp_path / "warm", *workers, "num_workers=2", f"cache={cache}")
-    assert "features" not in warm["worker_s"]  # all came from the cache
-    assert "features" in tiny.metrics["worker_s"]
-    damage(cache)
-    _, again = run_train(tmp_path / "again", *TINY, f"cache={cache}")
-    assert "damaged" in caplog.text
-    for name, metrics in (("warm", warm), ("again", again)):
-        assert timeless(metrics) == timeless(tiny.metrics)
-        assert_same_detector(tmp_path / name, tiny.folder)
-
-
 def test_a_fast_run_goes_all_the_way_and_caches_in_the_users_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     returned, metrics = run_train(tmp_path, *TINY, "trainer.fast_dev_run=true")
@@ -292,12 +271,7 @@ def test_the_checkpoint_of_a_fold_does_not_reach_another(tiny, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        "data.seed=1",
-        "split.train_fraction=0.75",
-        "features.spectrum=clean",
-    ],
+    "change", ["data.seed=1", "split.train_fraction=0.75", "features.spectrum=clean"]
 )
 def test_a_checkpoint_of_other_bins_is_refused(tiny, tmp_path, change):
     checkpoint = f"ckpt_path={tiny.folder / 'last.ckpt'}"
@@ -330,18 +304,6 @@ def test_what_is_no_checkpoint_is_refused_in_one_line(tiny, tmp_path, content, s
     with pytest.raises((ValueError, FileNotFoundError), match=said) as caught:
         train(config, tmp_path)
     assert "\n" not in str(caught.value)
-
-
-def test_random_bins_have_train_and_test_in_every_recording(tmp_path):
-    overrides = [o for o in TINY if not o.startswith("split")]
-    _, metrics = run_train(
-        tmp_path, *overrides, "cache=off", "split=random_bins", "split.seen=[A,B]"
-    )
-    splits = metrics["splits"]
-    assert list(splits) == ["train", "test"]
-    assert splits["train"]["num_bins"] + splits["test"]["num_bins"] == 2 * 4 * 72
-    assert "both sides" in metrics["events"]["test"]["first_transition"]["reason"]
-    assert not (tmp_path / "events.png").exists()
 
 
 # Prediction sets -----------------------------------------------------------------------------
@@ -429,15 +391,6 @@ def test_an_absent_class_is_named(tmp_path, num_workers):
     with pytest.raises(ValueError, match="slip") as caught:
         train(config, tmp_path)
     assert_one_line(caught.value, "no slip")
-
-
-def test_a_class_absent_from_a_role_is_no_perfect_score(tmp_path):
-    returned, metrics = run_train(tmp_path, *TINY, "cache=off", "+scene.quiet=[C]")
-    scores = metrics["splits"]["unseen"]
-    assert scores["slip_recall"] is None
-    assert scores["balanced_accuracy"] is None
-    assert "unseen/balanced_accuracy" not in returned
-    assert scores["accuracy"] == scores["non_slip_recall"]
 
 
 # Experiments, on the simulated hand ---------------------------------------------------------------

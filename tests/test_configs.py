@@ -16,11 +16,13 @@ from tactslip_torch.training.experiment import feature_maker
 RECORDED = {"biotacsp_dos"}
 """Experiments on real recordings, which are not here: a folder of their layout stands in."""
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "exp").glob("*.yaml"))
-OPTIONS = sorted(
-    (path.parent.name, path.stem)
-    for path in conf_dir().glob("*/*.yaml")
-    if path.parent.name != "exp"
-)
+OPTIONS = {
+    folder.name: sorted(path.stem for path in folder.glob("*.yaml"))
+    for folder in conf_dir().iterdir()
+    if folder.is_dir()
+}
+ALONE = ("exp", "extra_scenes", "scene", "search")
+"""Groups whose options are looked at one by one; those of the others go together."""
 SEEN = ["M1", "M2", "M3", "M4", "M5", "M6"]
 
 
@@ -73,6 +75,7 @@ def test_an_experiment_composes_and_everything_it_names_exists(name, layouts):
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_an_experiment_adds_no_key(name):
     """A misspelt key in an experiment file is added silently, so hold it against its groups."""
+    whole = composed(f"+exp={name}")
     content = yaml.safe_load((conf_dir() / "exp" / f"{name}.yaml").read_text())
     entries = content.pop("defaults", [])
     groups = [f"+exp={entry}" for entry in entries if isinstance(entry, str) and entry != "_self_"]
@@ -87,11 +90,11 @@ def test_an_experiment_adds_no_key(name):
     if name in RECORDED:
         known |= {"features.frames.electrode"}  # kinds of channels are the data's
     if weights := content.get("recipe", {}).get("scene_weights"):
-        assert set(weights) == set(composed(f"+exp={name}").extra_scenes)  # kinds of scenes too
+        assert set(weights) == set(whole.extra_scenes)  # kinds of scenes too
         known |= {f"recipe.scene_weights.{scene}" for scene in weights}
         known -= {"recipe.scene_weights"}
     assert set(keys_of(content)) <= known
-    assert set(keys_of(OmegaConf.to_container(composed(f"+exp={name}")))) == known
+    assert set(keys_of(OmegaConf.to_container(whole))) == known
 
 
 def test_a_misspelt_knob_of_a_further_scene_is_refused():
@@ -132,20 +135,35 @@ def test_sessions_trains_on_one_and_judges_the_same_materials_in_others():
 # The rest of conf/ ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_every_option_composes(group, option):
-    name = "pareto" if group == "search" else "train"
-    config = composed(f"{group}={option}", name=name)
-    section = config[group]
-    assert section or (option == "none" and group in ("extra_scenes", "onset", "tuning"))
-    if group == "extra_scenes":
-        assert config.data.extra_scenes == section
-    elif group == "scene":  # knobs, for the recordings
-        assert section.name == option
-        source = instantiate(config.data, cycles=1, materials=["M3", "wood"], _convert_="all")
-        assert [str(r.scene) for r in source.ids] == [option, option]
-    elif section and group != "features":  # plain values, for ``feature_maker``
+@pytest.mark.parametrize(
+    "number", range(max(len(own) for group, own in OPTIONS.items() if group not in ALONE))
+)
+def test_every_option_composes(number):
+    """The first option of each group, the second, and so on, as far as any group has one."""
+    groups = {k: own[number] for k, own in OPTIONS.items() if k not in ALONE and number < len(own)}
+    config = composed(*(f"{group}={option}" for group, option in groups.items())) if groups else {}
+    for group, option in groups.items():
+        assert config[group] or (option == "none" and group in ("onset", "tuning"))
+        if config[group] and group != "features":  # plain values, for ``feature_maker``
+            assert callable(get_object(config[group]._target_))
+    for option in OPTIONS["extra_scenes"][number : number + 1]:
+        config = composed(f"extra_scenes={option}")
+        assert config.data.extra_scenes == config.extra_scenes
+        assert bool(config.extra_scenes) == (option != "none")
+    for option in OPTIONS["search"][number : number + 1]:
+        section = composed(f"search={option}", name="pareto").search
         assert callable(get_object(section._target_))
+
+
+def test_every_scene_makes_recordings():
+    config = composed("scene=hard")
+    assert config.scene.name == "hard"
+    for option in OPTIONS["scene"]:
+        knobs = yaml.safe_load((conf_dir() / "scene" / f"{option}.yaml").read_text())
+        assert knobs["name"] == option
+        told = {"cycles": 1, "materials": ["M3", "wood"], "scene": knobs}
+        source = instantiate(config.data, **told, _convert_="all")
+        assert [str(r.scene) for r in source.ids] == [option, option]
 
 
 def test_evaluate_judges_on_the_same_defaults_as_train():

@@ -13,15 +13,9 @@ from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.report.results import (
-    confound_table,
-)
+from tactslip_torch.report.results import confound_table
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*isinstance.treespec, LeafSpec.*",
-    "ignore:The '.*_dataloader' does not have many workers",
-    "ignore:.*does not have many workers",
-)
+pytestmark = pytest.mark.slow
 
 
 class SmallScenes:
@@ -159,7 +153,6 @@ def evaluated(ran, folder, *overrides):
     return evaluate(composed(model, *overrides, name="evaluate"), folder)
 
 
-@pytest.mark.slow
 def test_evaluate_counts_bins_that_both_folds_hold_out_once(ran, tmp_path):
     metrics = evaluated(ran, tmp_path, "+exp=confound", "cache=off")
     trained = json.loads((ran[0] / "metrics.json").read_text())["folds"]["with_scenes"]

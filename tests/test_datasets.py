@@ -402,7 +402,11 @@ def with_speed(path, name="speed"):
 
 
 @pytest.mark.parametrize(
-    ("name", "isolate"), [("a.csv", False), ("a.npz", False), ("a.h5", False), ("a.csv", True)]
+    ("name", "isolate"),
+    [
+        *((name, False) for name in ("a.csv", "a.npz", "a.h5")),
+        pytest.param("a.csv", True, marks=pytest.mark.slow),
+    ],
 )
 def test_a_speed_above_a_threshold_is_slip(tmp_path, name, isolate):
     content = with_speed(tmp_path / name)
@@ -615,10 +619,7 @@ def test_a_rate_that_nobody_says_is_asked_for(tmp_path):
         ({"reading": {"delimiter": 3}}, r"reading\.delimiter must be one character, got 3"),
         ({"reading": {"samples": 3}}, r"reading\.samples must be the name of an array"),
         ({"reading": {"time_first": "abc"}}, r"reading\.time_first must be true, false or null"),
-        (
-            {"reading": {"isolate_s": 0}},
-            r"reading\.isolate_s must be a positive finite .* 0",
-        ),
+        ({"reading": {"isolate_s": 0}}, r"reading\.isolate_s must be a positive finite .* 0"),
         ({"resample_hz": 199.9999}, "is no ratio of whole numbers up to 50000"),
         ({"resample_hz": -5}, r"data\.resample_hz must be a positive finite"),
         ({"adapting": "quick"}, "adapting must be slow or fast, got 'quick'"),

@@ -48,13 +48,7 @@ from tactslip_torch.own_files import (
     read_checkpoint,
     save_table,
 )
-from tactslip_torch.training.adaptation import (
-    KnownBins,
-    Machine,
-    RecordingBins,
-    Statistics,
-    Step,
-)
+from tactslip_torch.training.adaptation import KnownBins, Machine, RecordingBins, Statistics, Step
 from tactslip_torch.training.datamodule import SlipDataModule
 from tactslip_torch.training.learner import SlipLearner
 

@@ -175,10 +175,7 @@ def test_a_file_that_is_not_ours_is_never_replaced(tmp_path, content):
         (["cycles=0", "scene=paper"], "data: cycles must be a whole number of at least 1, got 0"),
         (["data.fidelity=real", "scene=paper"], "data: unknown fidelity 'real'; known are kinem"),
         (["+data.scene.mu_k=2.0", "scene=paper"], "data: contact.mu_k must not exceed mu_s"),
-        (
-            ["scene=paper", "scene.name=a/b", "materials=[M1]"],
-            "cannot name a file; give the scene",
-        ),
+        (["scene=paper", "scene.name=a/b", "materials=[M1]"], "cannot name a file; give the scene"),
         (["format=xls"], "format must be one of npz, text, "),
         (["num_workers=-1"], "num_workers must be null or a number from 0, got -1"),
         (["num_workers=many"], "num_workers must be null or a number from 0, got 'many'"),

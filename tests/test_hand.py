@@ -32,11 +32,6 @@ def test_a_channel_is_found_by_name():
         HandLayout.paper24().channel("PVDF11")
 
 
-def test_no_channel_is_refused():
-    with pytest.raises(ValueError, match="at least one channel, got none"):
-        HandLayout(())
-
-
 def test_a_name_that_occurs_twice_is_refused():
     with pytest.raises(ValueError, match=r"must be unique, got \['pad'\] more than once"):
         HandLayout.from_rows([ROWS[0], ROWS[1], ROWS[0]])

@@ -233,12 +233,7 @@ def _folder_as_recording(path: Path) -> None:
     path.mkdir()
 
 
-NEEDED = (
-    "onnx_sha256",
-    "channels",
-    "sample_rate_hz",
-    "state_size",
-)
+NEEDED = ("onnx_sha256", "channels", "sample_rate_hz", "state_size")
 SIDECAR = "stream.onnx.json"
 BAD_OPTIONS = (
     ("--chunk", "5000", ("5000", "2000")),

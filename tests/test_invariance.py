@@ -122,19 +122,6 @@ def test_a_gain_of_a_power_of_two_changes_no_digit():
         assert torch.equal(pool(torch.ldexp(bins, torch.tensor(exponent))), wanted)
 
 
-def test_features_follow_their_channels():
-    pool = FeaturePool(HandLayout.paper24())
-    rng = np.random.default_rng(1)
-    bins = torch.from_numpy(rng.standard_normal((2, 24, 100)))
-    gauges, films = rng.permutation(14), rng.permutation(10)
-    moved = pool(bins[:, [*gauges, *(14 + films)]])
-    before = pool(bins)
-    of_gauges = before[:, : 14 * 13].unflatten(-1, (14, 13))[:, gauges]
-    of_films = before[:, 14 * 13 :].unflatten(-1, (10, 240))[:, films]
-    wanted = torch.cat([of_gauges.flatten(1), of_films.flatten(1)], dim=-1)
-    torch.testing.assert_close(moved, wanted, rtol=1e-9, atol=1e-12)
-
-
 def test_the_table_has_every_descriptor_once():
     of_spectra = [*SPECTRUM_DESCRIPTORS, "band_energy_ratio"]
     wanted = [("time", name) for name in TIME_DESCRIPTORS] + [("freq", n) for n in of_spectra]

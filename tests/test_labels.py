@@ -285,10 +285,7 @@ def test_shuffled_labels_keep_their_number_and_depend_on_seed_and_place():
     ("change", "said"),
     [
         ({"layout": "nope"}, "labels.layout must be one of whole_slide, half_second, got 'nope'"),
-        (
-            {"assign": "first"},
-            "labels.assign must be one of whole, majority, last, got 'first'",
-        ),
+        ({"assign": "first"}, "labels.assign must be one of whole, majority, last, got 'first'"),
         ({"onsets": "guessed"}, "labels.onsets must be one of annotated, exact, got 'guessed'"),
         ({"bin_ms": 0.0}, "labels.bin_ms must be positive, got 0.0"),
         ({"hop_ms": -50.0}, "labels.hop_ms must be positive, got -50.0"),

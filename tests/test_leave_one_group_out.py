@@ -148,16 +148,10 @@ def twice(bins):
         (lambda b, g: HeldOut(b, 0 * g + 7), r"at least two groups, all 20 bins are in \[7\]"),
         (lambda b, g: HeldOut(b, with_all_of(True, b)), "without group 9 no slip bin is left"),
         (lambda b, g: HeldOut(b, with_all_of(False, b)), "without group 9 no non-slip bin is left"),
-        (
-            lambda b, g: HeldOut(b, g, RADIAL, "primal"),
-            r"RadialBasis.* has no primal",
-        ),
+        (lambda b, g: HeldOut(b, g, RADIAL, "primal"), r"RadialBasis.* has no primal"),
         (lambda b, g: held_out(b, g, 1.0, -0.5), r"offset .* at least 0, got -0.5"),
         (lambda b, g: held_out(b, g, 1.0, weights=torch.zeros(20)), "weights must be positive"),
-        (
-            lambda b, g: held_out(twice(b), g.repeat(2), 1e12),
-            r"condition .*, wanted up to 1e\+10",
-        ),
+        (lambda b, g: held_out(twice(b), g.repeat(2), 1e12), r"condition .*, wanted up to 1e\+10"),
     ],
 )
 def test_what_has_no_held_out_scores_is_refused(fit, message, rng):

@@ -7,12 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactslip_torch.data.file_recordings import FileTimeline, on_time
-from tactslip_torch.data.manifest import (
-    Truth,
-    manifest_of,
-    read_manifest,
-    truth_of,
-)
+from tactslip_torch.data.manifest import Truth, manifest_of, read_manifest, truth_of
 from tactslip_torch.data.recording import RecordingId
 
 FILES = ("a.csv", "b.csv", "c.csv")
@@ -298,7 +293,7 @@ def test_what_leaves_the_recording_is_named_and_what_is_off_by_a_sample_is_cut()
 
 
 @given(
-    st.lists(st.floats(0, 1e6, allow_nan=False), unique=True, min_size=1, max_size=5).map(sorted),
+    st.lists(st.floats(0, 1e6, allow_nan=False), unique=True, min_size=1, max_size=5).map(sorted)
 )
 def test_numbers_are_read_as_they_are_written(moments):
     for text in (json.dumps(moments), "; ".join(map(repr, moments)), [repr(m) for m in moments]):

@@ -13,11 +13,7 @@ from scipy.stats import multivariate_normal
 
 from tactslip_torch.model.calibration import Isotonic, Platt, widened_llr
 from tactslip_torch.model.kernels import QuadraticForm
-from tactslip_torch.model.missing_channels import (
-    RESOLUTION,
-    ClassGaussians,
-    expected_score,
-)
+from tactslip_torch.model.missing_channels import RESOLUTION, ClassGaussians, expected_score
 
 NUM = 7
 MOST_OFF = 0.02  # by which a probability may be off the integral's, of equal priors

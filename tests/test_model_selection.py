@@ -10,12 +10,7 @@ from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.training.plan import (
-    candidates,
-    choose_model,
-    fitted_selection,
-    group_scores,
-)
+from tactslip_torch.training.plan import candidates, choose_model, fitted_selection, group_scores
 from tactslip_torch.training.recipe import FREE_CONSTANT, Recipe, sample_weight, scene_weights
 
 HAND = HandLayout.from_rows(

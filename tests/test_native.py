@@ -12,13 +12,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from engine_bins import (
-    KINDS,
-    assert_equals_reference,
-    assert_modes_are_fair,
-    bins_of,
-    some_hand,
-)
+from engine_bins import KINDS, assert_equals_reference, assert_modes_are_fair, bins_of, some_hand
 from small_detector import raw_bins, small_detector
 
 from tactslip_torch import FeaturePool, HandLayout, native

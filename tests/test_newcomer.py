@@ -43,14 +43,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "newcomer",
-        pytest.param("newcomer_tsfel", marks=pytest.mark.slow),
-        pytest.param("newcomer_aeon", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["newcomer", "newcomer_tsfel", "newcomer_aeon"])
 def test_a_newcomer_gets_from_files_to_a_model(folder: Path, name: str) -> None:
     if (library := name.removeprefix("newcomer_")) != name:
         pytest.importorskip(library)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
-from test_commands import TinyRecordings, composed
+from test_commands import BAD_INPUT, TinyRecordings, composed
 
 import tactslip_torch.analysis.pareto as module
 import tactslip_torch.commands.pareto as command
@@ -24,6 +24,7 @@ from tactslip_torch.analysis.pareto import (
     worth_naming,
     worth_timing,
 )
+from tactslip_torch.commands.entry import one_line
 from tactslip_torch.data.splits import seen6, unseen4
 from tactslip_torch.features.bank import pool_names
 from tactslip_torch.features.groups import allowed
@@ -478,12 +479,13 @@ def fails(monkeypatch, capsys, tmp_path, *arguments):
         ("search.sizes=[5000]", "an empty selection: no group of this hand"),
     ],
 )
-def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, argument, message):
+def test_bad_input_is_one_line(monkeypatch, tmp_path, argument, message):
     monkeypatch.setattr(ParetoSearch, "read", None)  # it refuses before it works
-    status, line = fails(monkeypatch, capsys, tmp_path, argument)
-    assert status == 2
-    assert line.startswith("error: ")
+    with pytest.raises(BAD_INPUT) as caught:
+        run(tmp_path, argument)
+    line = one_line(caught.value)
     assert message in line
+    assert "\n" not in line
     assert not (tmp_path / "pareto.json").exists()
 
 

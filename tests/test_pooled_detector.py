@@ -187,6 +187,7 @@ def test_the_graph_of_a_bin_is_torch(graphs, broken, detector):
     assert valid.tolist() == judged.is_valid.tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.onnx
 def test_an_order_statistic_and_both_kinds_of_column_are_exported(detector, run, tmp_path):
     folder = tmp_path / "both"
@@ -217,6 +218,7 @@ def sensors_of(run, folder, *overrides):
     return sensors(composed(*given, name="importance"), folder)
 
 
+@pytest.mark.slow
 def test_sensors_are_left_out_of_the_pools(pooled_run, tmp_path):
     found = sensors_of(pooled_run, tmp_path)
     detector = SlipDetector.load(pooled_run / "detector.pt")
@@ -234,6 +236,7 @@ def test_sensors_are_left_out_of_the_pools(pooled_run, tmp_path):
     assert rows["PVDF1"]["gradient"]["slip"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("override", ["num_features=3", "reselect=shared"])
 def test_sensors_select_nothing_anew_where_all_is_pooled(override, pooled_run, tmp_path):
     with pytest.raises(

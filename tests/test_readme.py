@@ -21,11 +21,7 @@ from tactslip_torch.onset.rules import KOfN
 ROOT = Path(__file__).parents[1]
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
-    for path in (
-        *ROOT.glob("*.md"),
-        *ROOT.glob("docs/*.md"),
-        *ROOT.glob("export/**/README.md"),
-    )
+    for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("export/**/README.md"))
     if "node_modules" not in path.parts
 }
 RUN = [name for name in PAGES if name.startswith("docs/") or name == "README.md"]

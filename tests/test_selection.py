@@ -8,12 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactslip_torch.features.selection import (
-    ClassMoments,
-    rank_distinct,
-    rank_features,
-    t_scores,
-)
+from tactslip_torch.features.selection import ClassMoments, rank_distinct, rank_features, t_scores
 
 VARIANCES = ["pooled", "welch"]
 

@@ -83,10 +83,7 @@ def test_quiet_and_missing_channels_are_drawn_without_a_warning(draw):
 
 @pytest.mark.parametrize(
     ("view", "onsets", "spans"),
-    [
-        (None, [2.0, 5.0], [(2.0, 4.0), (5.0, 6.5), (6.75, 7.5)]),
-        ((3.0, 4.5), [], [(3.0, 4.0)]),
-    ],
+    [(None, [2.0, 5.0], [(2.0, 4.0), (5.0, 6.5), (6.75, 7.5)]), ((3.0, 4.5), [], [(3.0, 4.0)])],
 )
 def test_onsets_are_marked_and_slides_and_handling_shaded_as_far_as_in_view(
     draw, view, onsets, spans

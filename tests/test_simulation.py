@@ -7,14 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scene_files import (
-    CONTACTS,
-    NAMES,
-    contacts,
-    is_within,
-    scene_of,
-    scene_on,
-)
+from scene_files import CONTACTS, NAMES, contacts, is_within, scene_of, scene_on
 
 from tactslip_torch.deploy.check import extreme_bins
 from tactslip_torch.simulation import (

@@ -22,13 +22,8 @@ from tactslip_torch.simulation import (
     simulate_many,
     timeline,
 )
-from tactslip_torch.simulation._contact import (
-    draw_grasp,
-    quasi_static_slips,
-)
-from tactslip_torch.simulation._sensors import (
-    highpass_response,
-)
+from tactslip_torch.simulation._contact import draw_grasp, quasi_static_slips
+from tactslip_torch.simulation._sensors import highpass_response
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 
 BRISTLES = ("one", "many")

@@ -34,13 +34,7 @@ from tactslip_torch.simulation._sensors import (
 
 SLOW, FAST = slice(0, 14), slice(14, 24)  # the paper's SG and PVDF channels
 SURE = {**CALM, "lifted_fraction": 0.0}
-QUIET = {
-    **FINE,
-    **CALM,
-    "white_noise_mv": 0.0,
-    "motor_vibration_mv": 0.0,
-    "arm_transient_mv": 0.0,
-}
+QUIET = {**FINE, **CALM, "white_noise_mv": 0.0, "motor_vibration_mv": 0.0, "arm_transient_mv": 0.0}
 
 
 def highpassed(samples: np.ndarray, corner_hz: float) -> np.ndarray:

@@ -10,11 +10,7 @@ import torch
 
 from tactslip_torch.signals.filtering import bins_at
 from tactslip_torch.signals.resampling import resample
-from tactslip_torch.signals.wavelet import (
-    amplitude_spectrum,
-    frequency_axis_hz,
-    spectrum_matrix,
-)
+from tactslip_torch.signals.wavelet import amplitude_spectrum, frequency_axis_hz, spectrum_matrix
 
 METHODS = ["reference", "clean"]
 

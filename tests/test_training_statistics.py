@@ -37,11 +37,7 @@ def statistics_of(recordings, sample_bins=3):
 def bits_of(statistics):
     """All of a statistics but its moments, as bytes and text, so that 0 and -0 differ."""
     sample = statistics.sample.state_dict()
-    tensors = {
-        **sample["tensors"],
-        "minimum": statistics.minimum,
-        "maximum": statistics.maximum,
-    }
+    tensors = {**sample["tensors"], "minimum": statistics.minimum, "maximum": statistics.maximum}
     bits = {
         name: (str(tensor.dtype), tuple(tensor.shape), tensor.numpy().tobytes())
         for name, tensor in tensors.items()
@@ -141,10 +137,7 @@ def test_other_refusals_of_merge_change_nothing():
     for other, match in [
         (statistics_of(recordings[4:]), "1 batches are in both statistics, such as 'M1/4'"),
         (statistics, "5 batches are in both"),
-        (
-            statistics_of(recordings[5:], sample_bins=4),
-            "statistics of 3 and 4 sample_bins",
-        ),
+        (statistics_of(recordings[5:], sample_bins=4), "statistics of 3 and 4 sample_bins"),
         (TrainingStatistics(NUM + 1, 3), "4 and 5 features"),
     ]:
         with pytest.raises(ValueError, match=match):

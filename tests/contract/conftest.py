@@ -8,14 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from .names import (
-    BIN_GRAPH,
-    DETECTOR,
-    METRICS,
-    STREAM_GRAPH,
-    SlipDetector,
-    settings,
-)
+from .names import BIN_GRAPH, DETECTOR, METRICS, STREAM_GRAPH, SlipDetector, settings
 from .recordings import of_set, split_of_set, write_set
 from .running import Runner
 

@@ -56,11 +56,7 @@ MISTAKES = {  # beside those of tests/test_command_line.py, which a page lists
     ),
     "evaluate another hand": ("evaluate", settings(model="{model}", cycles=2), "4 24 SG1"),
     "detect in nothing": ("detect", settings(model="{model}", input="nowhere"), "nowhere"),
-    "detect without an alarm": (
-        "detect",
-        settings(model="{bare}", input="{root}"),
-        "alarm onset",
-    ),
+    "detect without an alarm": ("detect", settings(model="{bare}", input="{root}"), "alarm onset"),
     "mask of no channel": (
         "detect",
         settings(model="{model}", input="{root}", masked_channels=["SG9"]),
@@ -88,11 +84,7 @@ MISTAKES = {  # beside those of tests/test_command_line.py, which a page lists
         "num_unseen 4",
     ),
     "pareto without time": ("pareto", files(deadline_ms=-1), "deadline_ms -1"),
-    "calibrate on reported seeds": (
-        "calibrate",
-        settings(calibration_seeds=[3]),
-        "seeds 1000 [3]",
-    ),
+    "calibrate on reported seeds": ("calibrate", settings(calibration_seeds=[3]), "seeds 1000 [3]"),
     "convert to nothing": (
         "data",
         settings(action="convert", root_of_data="{root}", format="docx", output="to"),
@@ -116,7 +108,14 @@ def places(trained_by, recordings, tmp_path_factory):
     return {"{model}": model, "{root}": recordings, "{bare}": folder / DETECTOR}
 
 
-@pytest.mark.parametrize("name", MISTAKES)
+SOME_SLOW = [
+    name if place % 2 == 0 else pytest.param(name, marks=pytest.mark.slow)
+    for place, name in enumerate(MISTAKES)
+]
+"""Each is a command in a process of its own: every second one is made among the slow tests."""
+
+
+@pytest.mark.parametrize("name", SOME_SLOW)
 def test_a_mistake_is_one_line_and_a_failing_exit(command, places, name, tmp_path):
     which, overrides, words = MISTAKES[name]
     for word, place in places.items():
