@@ -20,14 +20,14 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.commands.entry import entry_point, leave_results
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.deploy.export import export_detector, stale_graphs
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import KEY as ALARM
 from tactslip_torch.report.adaptation import adaptation_figure, adaptation_table, journal_table
-from tactslip_torch.runtime import check_number, whole_file, write_json
+from tactslip_torch.runtime import check_number, whole_file
 from tactslip_torch.training.adaptation import (
     FILE,
     Change,
@@ -126,16 +126,12 @@ def _stepped(
         "versions": versions(),
     }
     save_config(config, folder)
-    write_json(folder / "adaptation.json", content)
-    adaptation_figure(content, folder / "adaptation.png")
-    print("\n" + adaptation_table(content))
+    leave_results(folder, "adaptation", content, adaptation_figure, adaptation_table(content))
     if not is_accepted:
         raise ValueError(
-            f"refused, nothing is changed: {problem}; lower weight, or force=true accepts it "
-            f"(figures in {folder})"
+            f"refused, nothing is changed: {problem}; lower weight, or force=true accepts it"
         )
-    print(f"\n{config.model} and {FILE} beside it are new; action=undo takes it back")
-    print(f"figures in {folder}")
+    print(f"{config.model} and {FILE} beside it are new; action=undo takes it back")
     return content
 
 

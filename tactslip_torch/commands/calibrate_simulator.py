@@ -19,7 +19,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from tactslip_torch.analysis.signal_checks import Signals, check_signals, filtered
-from tactslip_torch.commands.configuration import conf_dir
+from tactslip_torch.commands.configuration import Composed
 from tactslip_torch.commands.entry import entry_point, leave_results
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
@@ -203,10 +203,9 @@ def calibrate(config: DictConfig, folder: Path) -> dict[str, Any]:
     )
     kept = best_point(points, target)
     if kept is None:
-        failed = ", ".join(_failed(points[0]))
         raise ValueError(
-            f"the signal checks {failed} do not hold at the starting values, so there is no point "
-            "to calibrate from; raise check_cycles, or mend the simulation"
+            f"the signal checks {_failed(points[0])} do not hold at the starting values, so there "
+            "is no point to calibrate from; raise check_cycles, or mend the simulation"
         )
     content: dict[str, Any] = plain(_content(config, points, kept, target))
     leave_results(folder, "calibration", content, calibration_figure, calibration_table(content))
@@ -250,12 +249,10 @@ def _check(config: DictConfig) -> None:
 
 def _changed_sections(config: DictConfig) -> list[str]:
     """Groups of the configuration that are not as ``calibrate_simulator.yaml`` composes them."""
-    default: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "calibrate_simulator.yaml"))
-    options = {k: v for entry in default["defaults"] if entry != "_self_" for k, v in entry.items()}
-    groups: Any = {k: OmegaConf.load(conf_dir() / k / f"{v}.yaml") for k, v in options.items()}
-    whole: Any = OmegaConf.to_container(OmegaConf.merge(groups, default))
-    given: Any = OmegaConf.to_container(config)  # unresolved: seeds come in turn
-    return [group for group in groups if given[group] != whole[group]]
+    default = Composed("calibrate_simulator")
+    own: Any = OmegaConf.to_container(default.config)  # unresolved: data has scene in it
+    given: Any = OmegaConf.to_container(config)
+    return [group.name for group in default.groups if own.get(group.name) != given.get(group.name)]
 
 
 def _content(
@@ -307,10 +304,9 @@ def _outcome(config: DictConfig, points: Sequence[Point], kept: Point, target: f
     ]
     if failing:
         nearest = min(failing, key=lambda point: abs(point["difficulty"] - kept["difficulty"]))
-        failed = ", ".join(
-            check["name"] for check in nearest["signal_checks"] if not check["holds"]
+        why = (
+            f"cut back: at d {nearest['difficulty']:+.2f} the checks {_failed(nearest)} do not hold"
         )
-        why = f"cut back: at d {nearest['difficulty']:+.2f} the checks {failed} do not hold"
     elif kept["difficulty"] in tuple(config.bounds):
         why = "the bound of d is reached"
     else:
@@ -318,8 +314,8 @@ def _outcome(config: DictConfig, points: Sequence[Point], kept: Point, target: f
     return f"{100 * missing:+.2f} points from the target: {why}"
 
 
-def _failed(point: Point) -> list[str]:
-    return [check["name"] for check in point["signal_checks"] if not check["holds"]]
+def _failed(point: Point) -> str:
+    return ", ".join(check["name"] for check in point["signal_checks"] if not check["holds"])
 
 
 main = entry_point("calibrate_simulator", calibrate)

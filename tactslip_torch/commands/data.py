@@ -32,7 +32,7 @@ from tactslip_torch.report.recordings import (
 from tactslip_torch.report.style import SIMULATED_LINE
 from tactslip_torch.runtime import __version__, in_processes
 
-FIGURE = Path("outputs/data_tool.png")
+FIGURE = Path("outputs/data.png")
 _SHOWN = 5  # rows of a template
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import shutil
 from pathlib import Path
-from typing import Any
 
 
 def demo(folder: Path) -> None:
@@ -20,10 +19,9 @@ def demo(folder: Path) -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} is there and not empty; give another one, --out DIR")
-    from omegaconf import OmegaConf  # here and below what --help has no need of
-
-    from tactslip_torch.commands.configuration import conf_dir, copy_host
+    from tactslip_torch.commands.configuration import Composed  # of no need for --help
     from tactslip_torch.commands.detect import detect
+    from tactslip_torch.commands.hosts import copy_host
     from tactslip_torch.deploy.export import export_detector
     from tactslip_torch.model.detector import SlipDetector
     from tactslip_torch.pretrained import NAME, RECORDING, sample_recording
@@ -33,10 +31,8 @@ def demo(folder: Path) -> None:
     model, place = folder / "detector.pt", folder / "recording.npz"
     detector.save(model)
     shutil.copyfile(RECORDING, place)
-    plain: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "detect.yaml"))
-    for name in ("hydra", "defaults"):
-        del plain[name]
-    config = OmegaConf.create(plain | {"model": str(model), "input": str(place)})
+    config = Composed("detect").config
+    config.model, config.input = str(model), str(place)
     (found,) = detect(config, folder)["recordings"]
     export_detector(detector, folder, source=model)
     page = copy_host("web", folder)

@@ -42,13 +42,13 @@ from tactslip_torch.analysis.pareto import (
     worth_naming,
     worth_timing,
 )
-from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.commands.entry import entry_point, leave_results
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.report.pareto import none_meets, pareto_figure, pareto_table
-from tactslip_torch.runtime import bar, check_number, write_json
+from tactslip_torch.runtime import bar, check_number
 from tactslip_torch.signals.filtering import Align
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.experiment import (
@@ -103,13 +103,11 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
             found |= _searched(limits, search, candidates, timed)
             found |= {"headroom": config.headroom} | _chosen(config, limits, search, timed, trial)
             found["seconds"] = time.perf_counter() - started
-            write_json(folder / "pareto.json", found)
-            pareto_figure(found, folder / "pareto.png")
+            leave_results(folder, "pareto", found, pareto_figure, pareto_table(found))
             if found["chosen"]:
                 trial.replace(folder / "detector.pt")
         finally:
             trial.unlink(missing_ok=True)
-    print(f"\n{pareto_table(found)}\n\nresults in {folder}")
     return found
 
 

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import mean, pstdev
 
 import numpy as np
 
 from tactslip_torch.report.style import (
+    UPPER_LEFT_OUTSIDE,
     colours_of,
     csv_writer,
     lanes,
     marked,
     new_figure,
+    percent,
     save,
     styled,
     table,
+    words,
 )
 
 Run = tuple[str, Mapping[str, float]]
@@ -27,11 +31,10 @@ def sweep_table(runs: Sequence[Run], *, simulated: bool) -> str:
     names = _scores(runs)
     rows: list[dict[str, object]] = []
     for given, scores in runs:
-        told = {f"{name} %": f"{100 * scores[name]:.2f}" for name in names if name in scores}
-        rows.append({"run": given, **{f"{name} %": told.get(f"{name} %") for name in names}})
-    for what, reduced in (("mean", np.mean), ("standard deviation", np.std)):
+        rows.append({"run": given, **{f"{name} %": percent(scores.get(name)) for name in names}})
+    for what, reduced in (("mean", mean), ("standard deviation", pstdev)):
         own = {name: [scores[name] for _, scores in runs if name in scores] for name in names}
-        rows.append({"run": what, **{f"{n} %": f"{100 * reduced(v):.2f}" for n, v in own.items()}})
+        rows.append({"run": what, **{f"{n} %": percent(reduced(v)) for n, v in own.items()}})
     return marked(simulated, table(rows))
 
 
@@ -46,10 +49,10 @@ def write_sweep(runs: Sequence[Run], folder: Path, *, simulated: bool) -> None:
     axes = figure.subplots()
     for name, colour in colours_of(shown).items():
         values = [100 * scores.get(name, np.nan) for _, scores in runs]
-        axes.plot(values, range(len(runs)), "o", color=colour, label=name.replace("_", " "))
+        axes.plot(values, range(len(runs)), "o", color=colour, label=words(name))
     lanes(axes, [given for given, _ in runs])
     axes.set_xlabel("%")
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    axes.legend(**UPPER_LEFT_OUTSIDE)
     save(figure, folder / "runs.png")
 
 
