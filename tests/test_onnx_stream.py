@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from streams import detector_of, onset_of, signal
 
-from tactslip_torch.deploy.bins import Timing, memory_size
+from tactslip_torch.deploy.bins import Timing
 from tactslip_torch.deploy.check import runner, session_of
-from tactslip_torch.deploy.stream import onset_scores, stream_graph
+from tactslip_torch.deploy.stream import onset_memory, onset_scores, stream_graph
 from tactslip_torch.deploy.value import F32, F64, I64, Graph
 from tactslip_torch.model.calibration import LARGEST_LLR, Isotonic, Platt, probability
 from tactslip_torch.onset.decisions import AlarmSettings, score_stream
@@ -172,11 +172,12 @@ def test_onset_scores_of_any_hand_with_channels_missing(kinds):
         graph = Graph()
         x, memory = graph.input("x", F64, ("n", len(hand))), graph.input("memory", F64, ("m",))
         places = graph.input("places", I64, ("k",))
-        made = onset_scores(x, places, memory, classifier)
-        for name, value in zip("sm", made, strict=True):
+        known = onset_memory(memory, 0, classifier.evidence)
+        score, after = onset_scores(x, places, known, classifier)
+        for name, value in zip("sm", (score, graph.concat(*after, axis=0)), strict=True):
             graph.output(name, value, ("j",))
         run, evidence = runner(session_of(graph.model())), classifier.evidence
-        memory = np.full(memory_size(evidence), np.nan)
+        memory = np.empty(0)
         before = np.full((evidence.context, len(hand)), np.nan)
         held, found = np.concatenate([before, samples.T.numpy()]), []
         held[:, masked] = np.nan

@@ -14,6 +14,7 @@ from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.native import why_not
 from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence, OnsetStream
 from tactslip_torch.onset.rules import NOTHING_YET, KOfN
@@ -230,6 +231,9 @@ SAMPLES = samples_of(CLASSIFIER.evidence, 2.0, seed=7)
 SAMPLES[1, 3100] = torch.nan
 
 
+BACKENDS = ["torch", *([] if why_not() else ["native"])]
+
+
 def in_pieces(stream, samples, cuts, masked=None):
     places = [0, *sorted(cuts), samples.shape[-1]]
     return torch.cat([stream.push(samples[:, a:b], masked) for a, b in pairwise(places)])
@@ -247,11 +251,32 @@ def test_a_score_is_that_of_the_machine_on_scaled_columns():
     np.testing.assert_allclose(score[first + 2 :], mean, rtol=1e-10, atol=1e-10)
 
 
-@given(cuts=st.lists(st.integers(0, 4000), max_size=25), dtype=st.sampled_from(["float", "double"]))
-def test_any_cut_gives_the_scores_of_the_recording(cuts, dtype):
+@given(
+    cuts=st.lists(st.integers(0, 4000), max_size=25),
+    dtype=st.sampled_from(["float", "double"]),
+    backend=st.sampled_from(BACKENDS),
+)
+def test_any_cut_gives_the_scores_of_the_recording(cuts, dtype, backend):
     samples = getattr(SAMPLES, dtype)()
-    found = in_pieces(OnsetStream(CLASSIFIER), samples, cuts)
+    found = in_pieces(OnsetStream(CLASSIFIER, backend), samples, cuts)
     torch.testing.assert_close(found, CLASSIFIER.score_recording(samples), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("kinds", ["SFFSFS", "FSF", "FF", "F"])
+def test_backends_agree_on_any_hand_with_channels_missing(kinds, backend):
+    classifier = classifier_of(evidence_of(kinds, comb_periods=4), linear=kinds == "FF")
+    samples, evidence = samples_of(classifier.evidence, 3.0, seed=4), classifier.evidence
+    samples[-1, 2500], samples[0, 4000:] = torch.inf, 1.5
+    for masked in (None, torch.arange(len(kinds)) == len(kinds) - 1):
+        found = in_pieces(OnsetStream(classifier, backend), samples.T.clone().T, [7, 4001], masked)
+        alone = torch.full((600 + 2,), torch.nan, dtype=torch.float64)
+        alone[evidence.first_hop + 2 :] = classifier.score(
+            evidence.blocks_of_recording(samples), masked
+        )
+        expected = alone.unfold(0, 3, 1).mean(-1).nan_to_num(NOTHING_YET)
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-8)
+        assert (kinds == "F" and masked is not None) or (found > NOTHING_YET).any()
 
 
 @pytest.mark.parametrize("size", [9, 50, 63])

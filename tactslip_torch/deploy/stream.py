@@ -9,6 +9,7 @@ With an onset classifier decisions are its hop apart; its scores are those of ``
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -149,11 +150,7 @@ def stream_graph(
         sizes = graph.axes(1, 1, 1, 3, small - 6 - num_said, num_said)
         parts = graph.ops("Split", state, sizes, dtypes=[F64] * 6, axis=0)
         before, made, run, of_latch, of_rule, said = parts
-        (memory,) = graph.if_(
-            given.length(0) > 0,
-            lambda: [given.slice(small, END, 0)],
-            lambda: [memory_start(graph, onset.evidence)],
-        )
+        memory = onset_memory(given, small, onset.evidence)
 
         def decide_bins() -> list[Value]:
             number, scored, llr, statistic, after = bins(made, of_rule)
@@ -171,8 +168,8 @@ def stream_graph(
         hop, of_bin = float(onset.evidence.hop_samples), float(timing.hop)
         hops, first = (seen / hop).floor(), (before / hop).floor()
 
-        def next_state(of_latch: Value, memory: Value) -> Value:
-            kept = (seen, *of_bins[:2], of_latch, of_bins[2], _last(rows).squeeze(0), memory)
+        def next_state(of_latch: Value, memory: Sequence[Value]) -> Value:
+            kept = (seen, *of_bins[:2], of_latch, of_bins[2], _last(rows).squeeze(0), *memory)
             return graph.concat(*kept, axis=0)
 
         def decide_hops() -> list[Value]:
@@ -308,22 +305,37 @@ def _times_s(
 # Onset scores ----------------------------------------------------------------------------------
 
 
-def memory_start(graph: Graph, evidence: OnsetEvidence) -> Value:
-    """What is kept before the first block: NaN, on which no score rests."""
-    nothing = numpy_helper.from_array(np.array([np.nan]))
-    size = graph.axes(memory_size(evidence))
-    return graph.op("ConstantOfShape", size, dtype=F64, value=nothing)
+def onset_memory(state: Value, start: int, evidence: OnsetEvidence) -> list[Value]:
+    """Scores of hops, half the log powers of blocks and their means, as a state has them; flat.
+
+    Args:
+        state: in which they lie last; empty: of no stream yet, NaN, on which no score rests.
+        start: where they begin.
+        evidence: whose they are.
+    """
+    graph = state.graph
+    sizes = [MEAN_HOPS - 1, *(num * width for num, width in memory_shapes(evidence) if width)]
+
+    def known() -> list[Value]:
+        dtypes = [F64] * (1 + len(sizes))
+        return list(graph.ops("Split", state, graph.axes(start, *sizes), dtypes=dtypes, axis=0))[1:]
+
+    def nothing() -> list[Value]:
+        nan = numpy_helper.from_array(np.array([np.nan]))
+        return [graph.op("ConstantOfShape", graph.axes(n), dtype=F64, value=nan) for n in sizes]
+
+    return graph.if_(state.length(0) > 0, known, nothing)
 
 
 def onset_scores(
-    samples: Value, places: Value, memory: Value, classifier: OnsetClassifier
-) -> tuple[Value, Value]:
+    samples: Value, places: Value, memory: Sequence[Value], classifier: OnsetClassifier
+) -> tuple[Value, list[Value]]:
     """Scores of hops, ``NOTHING_YET`` where there is no evidence, and what is kept.
 
     Args:
         samples: from ``context`` samples before the first of these hops on; NaN before a stream.
         places: of the hops, from 0.
-        memory: of ``memory_start`` or the call before.
+        memory: of ``onset_memory`` or the call before; as it is large, copied as seldom as can be.
         classifier: that scores.
 
     Shape:
@@ -341,7 +353,8 @@ def onset_scores(
         return graph.op("Gather", rows, start + graph.axes(*places), axis=0)
 
     frames = windows(samples.take(fast, 1), first * hop, range(context + hop)).cast(F64)
-    heard = graph.constant(evidence.filter_matrix.T, F64) @ (frames - frames.slice(0, 1, 1))
+    filters = evidence.filter_matrix.reshape(context + hop, -1).T
+    heard = graph.constant(filters, F64) @ (frames - frames.slice(0, 1, 1))
     to_power = np.kron(np.eye(num_filters), np.full(hop, 1 / hop))
     square = graph.constant(to_power, F64) @ (heard * heard)  # [k, B, F]
     power = square + np.square(evidence.fast_knee)[:, None]
@@ -350,46 +363,50 @@ def onset_scores(
         block = windows(samples.take(slow, 1), first * hop, range(context, context + hop))
         made.append(block.cast(F64).mean(1))
     shapes = memory_shapes(evidence)[: len(made)]
-    sizes = graph.axes(MEAN_HOPS - 1, *(num * width for num, width in shapes))
-    dtypes = [F64] * (1 + len(made))
-    of_hops, *kept = graph.ops("Split", memory, sizes, dtypes=dtypes, axis=0)
-    rows = [
-        graph.concat(before.reshape(num, width), own, axis=0)
-        for before, own, (num, width) in zip(kept, made, shapes, strict=True)
-    ]
-    logs, num_floor = rows[0], evidence.memory - longest
+    of_hops, *kept = memory
+    kept = [x.reshape(*shape) for x, shape in zip(kept, shapes, strict=True)]
+
+    def latest(of: int, num: int) -> Value:
+        """Rows up to each hop, as many: ``[k, num, *]``."""
+        rows = graph.concat(kept[of].slice(1 - num, END, 0), made[of], axis=0)
+        return windows(rows, first, range(num))
+
+    num_floor = evidence.memory - longest
 
     def one_floor() -> list[Value]:  # by a product, which copies nothing
-        weights = np.append(np.full(num_floor, 1 / num_floor), np.zeros(longest))
-        return [graph.constant(weights[None], F64) @ logs]
+        weights = np.append(np.full(num_floor, 1 / num_floor), np.zeros(longest - 1))
+        return [graph.constant(weights[None], F64) @ kept[0]]
 
     def floors() -> list[Value]:
-        return [windows(logs, first, range(num_floor)).mean(1)]
+        rows = graph.concat(kept[0], made[0], axis=0)
+        return [windows(rows, first, range(num_floor)).mean(1)]
 
     (floor,) = graph.if_(places.length(0).eq(1), one_floor, floors)
     to_means = np.zeros((num_windows, longest))
-    for means, length in zip(to_means, evidence.windows, strict=True):
-        means[-length:] = 1 / length
-    latest = (windows(logs, first, range(num_floor, evidence.memory)) * 2.0).exp()
+    for row, length in zip(to_means, evidence.windows, strict=True):
+        row[-length:] = 1 / length
+    power = (latest(0, longest) * 2.0).exp()
     measured: list[Any] = [
-        (graph.constant(to_means, F64) @ latest).reshape(0, num_windows, num_filters, len(fast)),
+        (graph.constant(to_means, F64) @ power).reshape(0, num_windows, num_filters, len(fast)),
         floor.reshape(0, num_filters, len(fast)),
         None,
         graph.constant(np.ones(len(fast)), BOOL),
         None,
     ]
     if slow:
-        latest = windows(rows[1], first, range(len(evidence.step_matrix)))
-        measured[2] = graph.constant(evidence.step_matrix.T, F64) @ (latest - latest.slice(0, 1, 1))
+        means = latest(1, len(evidence.step_matrix))
+        measured[2] = graph.constant(evidence.step_matrix.T, F64) @ (means - means.slice(0, 1, 1))
         measured[4] = graph.constant(np.ones(len(slow)), BOOL)
     pooled: Any = evidence.pooled(*measured)
     columns, is_usable = pooled
     score = machine(scaled(columns, classifier.scaler), classifier.head, F64)
     scores = graph.concat(of_hops, graph.where(is_usable, score, math.nan), axis=0)
     mean = windows(scores, first, range(MEAN_HOPS)).mean(1)
-    after = [x.slice(-num, END, 0).reshape(-1) for x, (num, _) in zip(rows, shapes, strict=True)]
-    after = [scores.slice(1 - MEAN_HOPS, END, 0), *after]
-    return graph.where(mean.isfinite(), mean, NOTHING_YET), graph.concat(*after, axis=0)
+    after = [scores.slice(1 - MEAN_HOPS, END, 0)]
+    for before, own, (num, _) in zip(kept, made, shapes, strict=True):
+        after.append(before.slice(own.length(0), END, 0).reshape(-1))
+        after.append(own.slice(-num, END, 0).reshape(-1))
+    return graph.where(mean.isfinite(), mean, NOTHING_YET), after
 
 
 # Rules and alarms ------------------------------------------------------------------------------

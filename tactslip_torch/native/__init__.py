@@ -1,4 +1,4 @@
-"""The door to the native engine (``engine.cpp``), through ctypes.
+"""The door to the native engine (``engine.cpp`` and its neighbours), through ctypes.
 
 The library lies beside this file if the package was installed, or is built at the first use, into
 this folder or the user's cache. Without it (no compiler, or the environment has
@@ -105,6 +105,27 @@ class _BristleRun(ctypes.Structure):
         ("gamma", ctypes.c_double),
         *((name, ctypes.c_void_p) for name in (
             "table", "pressure", "states", "bristles", "arm", "load", "out")),
+    )  # fmt: skip
+
+
+class _Onset(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in (
+            "num_fast", "num_slow", "num_filters", "num_windows", "num_steps", "num_columns",
+            "hop", "context", "memory", "step_length")),
+        *((name, ctypes.c_void_p) for name in (
+            "fast", "slow", "windows", "filters", "steps", "fast_knee", "slow_knee", "slope",
+            "offset", "quadratic", "linear")),
+        ("constant", ctypes.c_double),
+    )  # fmt: skip
+
+
+class _OnsetHops(ctypes.Structure):
+    _fields_ = (
+        ("samples", ctypes.c_void_p),
+        *((name, ctypes.c_int64) for name in (
+            "is_float", "channel_stride", "num_hops", "num_before")),
+        *((name, ctypes.c_void_p) for name in ("rows", "listened", "score")),
     )  # fmt: skip
 
 
@@ -441,6 +462,72 @@ def _check_floats(array: Array) -> None:
         raise ValueError(f"the native engine takes float32 and float64, got {array.dtype}")
 
 
+class OnsetEngine(_Kept):
+    """Scores of hops by the native engine, as ``onset/evidence.py`` defines them; float64.
+
+    Args:
+        fast: indices of the fast channels.
+        slow: of the slow ones.
+        windows: over how many blocks levels are taken, ascending.
+        memory: blocks that a score rests on.
+        filters: a block with its context to the outputs of all filters.
+        steps: means of the last blocks to steps.
+        knees: of the filters and of the steps.
+        scaling: factor and offset of each column, which is then clipped to [-1, 1].
+        head: quadratic part (or empty), linear part and constant.
+
+    Shape:
+        - filters: ``[context + hop, B, hop]``; steps: ``[b, D]``
+        - quadratic: ``[K, K]``; linear: ``[K]``
+
+    Raises:
+        OSError: if the engine is not available.
+    """
+
+    def __init__(
+        self,
+        *,
+        fast: Sequence[int],
+        slow: Sequence[int],
+        windows: Sequence[int],
+        memory: int,
+        filters: Array,
+        steps: Array,
+        knees: tuple[Sequence[float], Sequence[float]],
+        scaling: tuple[Array, Array],
+        head: tuple[Array, Array, float],
+    ) -> None:
+        super().__init__()
+        length, num_filters, hop = filters.shape
+        quadratic, linear, constant = head
+        arrays = filters, steps, *knees, *scaling, quadratic, linear
+        places = [self._array(each, np.float64) if len(each) else None for each in arrays]
+        self._of = _Onset(
+            len(fast), len(slow), num_filters, len(windows), steps.shape[1], len(linear),
+            hop, length - hop, memory, len(steps),
+            *(self._array(each, np.int64) for each in (fast, slow, windows)), *places, constant,
+        )  # fmt: skip
+
+    def __call__(self, samples: Array, rows: Array, listened: Array) -> Array:
+        """The scores of some hops, NaN without evidence; the last rows are written.
+
+        Shape:
+            - samples: ``[C, context + k * hop]``, float32 or float64
+            - rows: ``[blocks before + k, F * B + S]``, contiguous
+            - listened: ``[C]``, bool, channels that are not left out
+            - output: ``[k]``
+        """
+        address, is_float, _, stride, _ = _samples_of(samples[:, None])
+        num = (samples.shape[1] - self._of.context) // self._of.hop
+        score = np.empty(num)
+        call = _OnsetHops(
+            address, is_float, stride, num, len(rows) - num, rows.ctypes.data, listened.ctypes.data, score.ctypes.data,
+        )  # fmt: skip
+        if self._library.tactslip_onset(self._level, ctypes.byref(self._of), ctypes.byref(call)):
+            raise MemoryError("the native engine found no memory to work in")
+        return score
+
+
 def carry_bristles(
     table: Array,
     pressure: Array,
@@ -538,6 +625,7 @@ def _loaded() -> ctypes.CDLL | str:
     pointer, number = ctypes.c_void_p, ctypes.c_int
     library.tactslip_features.argtypes = (number, pointer, pointer, pointer)
     library.tactslip_bristles.argtypes = (number, pointer)
+    library.tactslip_onset.argtypes = (number, pointer, pointer)
     return library
 
 

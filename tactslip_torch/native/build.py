@@ -24,7 +24,7 @@ REMEDY = (
     "(features and simulation are then several times slower)"
 )
 _HERE = Path(__file__).parent
-_SOURCES = ("engine.h", "vectors.h", "engine.cpp", "bristles.cpp", "door.cpp")
+_SOURCES = ("engine.h", "vectors.h", "engine.cpp", "bristles.cpp", "onset.cpp", "door.cpp")
 _FLAGS = [
     *(
         "-O3",
@@ -78,7 +78,8 @@ def build_library(folder: Path) -> Path:
         there = Path(name)
         jobs = [(["door.cpp"], "door.o")]
         for level in (2, 3, 4) if _is_x86() else (1,):
-            for source, entry in (("engine", "features"), ("bristles", "bristles")):
+            entries = {"engine": "features", "bristles": "bristles", "onset": "onset"}
+            for source, entry in entries.items():
                 define = f"-D{entry.upper()}_ENTRY={entry}_v{level}"
                 jobs.append(
                     ([f"{source}.cpp", define, *_march(compiler, level)], f"{source}{level}.o")

@@ -10,12 +10,14 @@
 
 typedef int Bristles(const BristleRun*);
 typedef int Features(const Plan*, const Machine*, const Bins*);
+typedef int OnsetScores(const Onset*, const OnsetHops*);
 
 #if defined(__x86_64__)
 #include <cpuid.h>
 
 extern "C" Bristles bristles_v2, bristles_v3, bristles_v4;
 extern "C" Features features_v2, features_v3, features_v4;
+extern "C" OnsetScores onset_v2, onset_v3, onset_v4;
 #define OF_LEVEL(name) (level >= 4 ? name##_v4 : level == 3 ? name##_v3 : name##_v2)
 
 static bool has(unsigned bits, unsigned wanted) { return (bits & wanted) == wanted; }
@@ -36,6 +38,7 @@ EXPORT int tactslip_level() {
 #else
 extern "C" Bristles bristles_v1;
 extern "C" Features features_v1;
+extern "C" OnsetScores onset_v1;
 #define OF_LEVEL(name) (level, name##_v1)
 
 EXPORT int tactslip_level() { return 1; }
@@ -45,3 +48,6 @@ EXPORT int tactslip_features(int level, const Plan* plan, const Machine* machine
   return OF_LEVEL(features)(plan, machine, bins);
 }
 EXPORT int tactslip_bristles(int level, const BristleRun* run) { return OF_LEVEL(bristles)(run); }
+EXPORT int tactslip_onset(int level, const Onset* onset, const OnsetHops* hops) {
+  return OF_LEVEL(onset)(onset, hops);
+}

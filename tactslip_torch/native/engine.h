@@ -81,3 +81,22 @@ struct BristleRun {
   const double *arm, *load;        // [2 steps, L]
   double* out;                     // [3, steps / every, L]
 };
+
+// Evidence of onsets, and the machine on it: OnsetClassifier.
+struct Onset {
+  int64_t num_fast, num_slow, num_filters, num_windows, num_steps, num_columns;
+  int64_t hop, context, memory, step_length;  // samples, samples, blocks, blocks
+  const int64_t *fast, *slow, *windows;       // channels; blocks, ascending
+  const double *filters, *steps;  // [context + hop, filters, hop], [step_length, steps]
+  const double *fast_knee, *slow_knee, *slope, *offset, *quadratic, *linear;  // quadratic may be null
+  double constant;
+};
+
+// Hops to be scored, and the memory of blocks, to which theirs are written.
+struct OnsetHops {
+  const void* samples;  // from `context` before the first hop; those of a channel lie side by side
+  int64_t is_float, channel_stride, num_hops, num_before;  // blocks that are there
+  double* rows;             // [before + hops, fast * filters + slow]
+  const uint8_t* listened;  // [channels]
+  double* score;            // [hops], NaN without evidence
+};

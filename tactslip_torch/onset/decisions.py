@@ -450,21 +450,19 @@ class Decider:
         if bins.score.shape[-1]:
             made = np.stack([getattr(bins, name).numpy() for name in _OF_BINS])
             known = np.concatenate([known, made], -1)
-        number = self._hop + np.arange(scores.shape[-1])
+        number = np.arange(self._hop, self._hop + scores.shape[-1])
         samples = (number + 1) * onset.evidence.hop_samples
         last = (samples - self._first) // settings.hop_samples
         last[samples < max(self._frame, self._first)] = -1
         at = last - self._first_known
-        began_s, score, llr, stated, statistic, is_valid = known.take(at, -1)
-        if len(at):
+        said = known.take(at, -1)
+        if len(at) and at[-1]:
             known, self._first_known = known[..., at[-1] :].copy(), int(last[-1])
         self._known, self._hop = known, self._hop + len(number)
-        dtype = bins.score.numpy().dtype
-        score, llr, stated, statistic = (
-            torch.from_numpy(entry.astype(dtype)) for entry in (score, llr, stated, statistic)
-        )
+        began_s, of_bin = said[0], said[1:5].astype(bins.score.numpy().dtype)
+        score, llr, stated, statistic = torch.from_numpy(of_bin).unbind()
         by_onset = scores >= onset.threshold
-        is_high = by_onset | (statistic.numpy() >= dtype.type(settings.threshold))
+        is_high = by_onset | (of_bin[3] >= of_bin.dtype.type(settings.threshold))
         rows = is_high.reshape(len(self._latches), len(number)).tolist()
         is_alarm, is_on, self._latches = self._latched(rows, 1.0, self._latches)
         available_s = samples / self._rate
@@ -477,7 +475,7 @@ class Decider:
             llr,
             stated,
             statistic,
-            torch.from_numpy(is_valid > 0),
+            torch.from_numpy(said[5] > 0),
             is_alarm.reshape(scores.shape),
             is_on.reshape(scores.shape),
             onset_score,

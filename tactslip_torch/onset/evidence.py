@@ -32,6 +32,7 @@ from torch import Tensor
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.native import BackendName, OnsetEngine, backend_of
 from tactslip_torch.onset.rules import NOTHING_YET
 
 Array = NDArray[Any]
@@ -50,7 +51,6 @@ STEPS_S = (
     (0.100, 0.100, 0.400),
 )
 """Length of the latest stretch, that of the one it is compared with, and how far back it ends."""
-_FEW_HOPS = 8  # that are scored one by one
 MEAN_HOPS = 3
 """Over which the score is averaged: a knock is over sooner than a slip begins."""
 _LEAST_RISE = 1e-6  # of a floor over that of silence; below, a channel is stuck
@@ -61,12 +61,10 @@ class Blocks(NamedTuple):
 
     Attributes:
         power: of each fast channel and filter, mean square and knee, ``[F, B, m]``.
-        log_power: half its log.
         mean: of each slow channel, ``[S, m]``.
     """
 
     power: Tensor
-    log_power: Tensor
     mean: Tensor
 
 
@@ -165,32 +163,22 @@ class OnsetEvidence:
 
     @cached_property
     def filter_matrix(self) -> Array:
-        """A block with its context to the outputs of all filters: ``[context + hop, B * hop]``."""
+        """A block with its context to the outputs of all filters: ``[context + hop, B, hop]``."""
         hop, length = self.hop_samples, self.context + 1
         matrix = np.zeros((self.context + hop, len(self._filters), hop))
         for place in range(hop):
             matrix[place : place + length, :, place] = self._filters[:, ::-1].T
-        return matrix.reshape(len(matrix), -1)
-
-    @cached_property
-    def step_spans(self) -> list[list[int]]:
-        """``STEPS_S`` in blocks."""
-        return [[self.blocks_in(seconds) for seconds in step] for step in STEPS_S]
+        return matrix
 
     @cached_property
     def step_matrix(self) -> Tensor:
         """Means of the last blocks to steps: ``[b, D]``."""
-        spans = self.step_spans
+        spans = [[self.blocks_in(seconds) for seconds in step] for step in STEPS_S]
         matrix = np.zeros((max(back + length for _, length, back in spans), len(spans)))
         for row, (latest, length, back) in zip(matrix.T, spans, strict=True):
             row[len(row) - latest :] += 1 / latest
             row[len(row) - back - length : len(row) - back] -= 1 / length
         return torch.from_numpy(matrix)
-
-    @cached_property
-    def channels(self) -> tuple[Array, Array]:
-        """Fast and slow ones."""
-        return np.array(self.hand.fast, np.int64), np.array(self.hand.slow, np.int64)
 
     @cached_property
     def _power_of_silence(self) -> Array:
@@ -210,23 +198,11 @@ class OnsetEvidence:
         x = samples.double()
         hop, context = self.hop_samples, self.context
         frames = x[list(self.hand.fast)].unfold(-1, context + hop, hop)  # [F, k, context + hop]
-        heard = (frames - frames[..., :1]) @ torch.from_numpy(self.filter_matrix)
+        heard = (frames - frames[..., :1]) @ torch.from_numpy(self.filter_matrix).flatten(1)
         square = heard.unflatten(-1, (len(self.fast_knee), hop)).square().mean(-1)  # [F, k, B]
         power = square.mT + torch.from_numpy(self._power_of_silence)[:, None]
         mean = x[list(self.hand.slow), context:].unfold(-1, hop, hop).mean(-1)
-        return Blocks(power, 0.5 * power.log(), mean)
-
-    def block_arrays(self, samples: Array) -> list[Array]:
-        """``blocks`` in arrays: of one block quicker than small tensors."""
-        hop, context = self.hop_samples, self.context
-        fast, slow = (samples.take(channels, 0).astype(np.float64) for channels in self.channels)
-        frames = torch.from_numpy(fast).unfold(-1, context + hop, hop).numpy()
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is left out later
-            heard = (frames - frames[..., :1]) @ self.filter_matrix  # [F, k, B * hop]
-            square = (heard * heard).reshape(*heard.shape[:2], len(self.fast_knee), hop)
-            power = (square.sum(-1) / hop + self._power_of_silence).swapaxes(1, 2)
-            mean = slow[:, context:].reshape(len(slow), frames.shape[1], hop).sum(-1) / hop
-        return [power, 0.5 * np.log(power), mean]
+        return Blocks(power, mean)
 
     def blocks_of_recording(self, samples: Tensor) -> Blocks:
         """Of a whole recording ``[C, T]``: those that have their context."""
@@ -247,14 +223,13 @@ class OnsetEvidence:
             - masked: ``[C]``, bool
             - output: ``[k, K]`` and ``[k]``, bool
         """
-        power, log_power, mean = blocks
+        power, mean = blocks
         num, windows = power.shape[-1] - self.memory + 1, self.windows
         level = torch.stack([_moving_mean(power, n)[..., -num:] for n in windows], -1)
-        floor = _moving_mean(log_power[..., : -windows[-1]], self.memory - windows[-1])
-        means = {n: _moving_mean(mean, n) for span in self.step_spans for n in span[:2]}
-        steps = torch.stack(  # [S, k, D]
-            [means[n][:, -num:] - means[m][:, -num - k : -k] for n, m, k in self.step_spans], -1
-        )
+        logs = power[..., : -windows[-1]].log() * 0.5
+        floor = _moving_mean(logs, self.memory - windows[-1])
+        rows = mean.unfold(-1, len(self.step_matrix), 1)[:, -num:]
+        steps = (rows - rows[..., :1]) @ self.step_matrix  # [S, k, D]
         heard = torch.ones(len(self.hand), dtype=torch.bool) if masked is None else ~masked
         return self.pooled(
             level.permute(2, 3, 1, 0),
@@ -402,22 +377,30 @@ class OnsetStream:
 
     Args:
         classifier: that scores.
+        backend: ``"auto"`` takes the native engine where it can be used.
+
+    Raises:
+        ValueError: for an unknown backend, or one that cannot be used here.
     """
 
-    def __init__(self, classifier: OnsetClassifier) -> None:
+    def __init__(self, classifier: OnsetClassifier, backend: BackendName = "auto") -> None:
+        evidence = classifier.evidence
         self._classifier = classifier
-        self._score = _HopScore(classifier)
+        self._engine = _engine_of(classifier) if backend_of(backend) == "native" else None
         self._hop = 0  # of the next score
         self._skipped = 0  # samples before those that are held
         self._held: Array | None = None
-        self._blocks: list[Array] = []
+        self._all = np.ones(len(evidence.hand), bool)
+        # half the log powers of blocks, and behind them the means
+        width = len(evidence.hand.fast) * len(evidence.fast_knee) + len(evidence.hand.slow)
+        self._rows, self._num_rows = np.empty((4 * evidence.memory, width)), 0
         self._scores = np.full(MEAN_HOPS - 1, math.nan)
 
     @property
     def state_bytes(self) -> int:
         """Memory of what is remembered."""
-        held = [] if self._held is None else [self._held]
-        return sum(int(x.nbytes) for x in held + self._blocks)
+        held = 0 if self._held is None else self._held.nbytes
+        return int(self._rows.nbytes + held)
 
     def push(self, samples: Tensor, masked: Tensor | None = None) -> Tensor:
         """The scores of the hops that these samples complete.
@@ -426,104 +409,67 @@ class OnsetStream:
             - samples: ``[C, n]``; masked: ``[C]``, bool
             - output: ``[k]``, as ``OnsetClassifier.score_recording`` has them
         """
-        evidence, x = self._classifier.evidence, samples.detach().numpy()
+        evidence, x = self._classifier.evidence, np.ascontiguousarray(samples.detach())
         hop, context, memory = evidence.hop_samples, evidence.context, evidence.memory
         held = x if self._held is None else np.concatenate([self._held, x], -1)
         num = (self._skipped + held.shape[-1]) // hop
-        score = np.append(self._scores, np.full(num - self._hop, math.nan))
+        score = np.full(MEAN_HOPS - 1 + num - self._hop, math.nan)
+        score[: MEAN_HOPS - 1] = self._scores
         first = max(self._hop, -(-context // hop))  # block that has its context
-        if num > first:
-            start = first * hop - context - self._skipped
-            blocks = evidence.block_arrays(held[:, start : num * hop - self._skipped])
-            if self._blocks:
-                pairs = zip(self._blocks, blocks, strict=True)
-                blocks = [np.concatenate([old[..., 1 - memory :], new], -1) for old, new in pairs]
-            known = blocks[0].shape[-1] - memory + 1
-            if known > _FEW_HOPS:
-                with torch.no_grad():
-                    made = Blocks(*map(torch.from_numpy, blocks))
-                    score[-known:] = self._classifier.score(made, masked)
-            elif known > 0:
-                score[-known:] = self._score(blocks, known, masked)
-            if known > 1:
-                blocks = [x[..., -memory:].copy() for x in blocks]
-            self._blocks, first = blocks, num
+        for start in range(first, num, memory):
+            stop = min(start + memory, num)
+            begin = start * hop - context - self._skipped
+            made = self._score(held[:, begin : stop * hop - self._skipped], stop - start, masked)
+            score[MEAN_HOPS - 1 + start - self._hop :][: len(made)] = made
+        first = max(first, num)
         self._hop, surplus = num, max(first * hop - context - self._skipped, 0)
         self._held = held[:, surplus:].copy()
         self._skipped += min(surplus, held.shape[-1])
         self._scores = score[1 - MEAN_HOPS :]
         return torch.from_numpy(_mean_of_hops(score))
 
+    def _score(self, x: Array, num: int, masked: Tensor | None) -> Array:
+        """Scores of the next hops, at most ``memory``, NaN without evidence; from their samples."""
+        evidence, memory = self._classifier.evidence, self._classifier.evidence.memory
+        if self._num_rows + num > len(self._rows):
+            kept = memory - 1
+            self._rows[:kept] = self._rows[self._num_rows - kept : self._num_rows].copy()
+            self._num_rows = kept
+        rows = self._rows[max(self._num_rows + 1 - memory, 0) : self._num_rows + num]
+        self._num_rows += num
+        if self._engine is not None:
+            listened = self._all if masked is None else ~masked.numpy()
+            return self._engine(x, rows, listened)
+        with torch.no_grad():
+            made, num_filters = evidence.blocks(torch.from_numpy(x)), len(evidence.fast_knee)
+            logs = (made.power.log() * 0.5).flatten(0, 1)
+            known = torch.from_numpy(rows)
+            known[-num:] = torch.cat([logs, made.mean]).T
+            score = torch.full((num,), math.nan, dtype=torch.float64)
+            if (silent := memory - 1 - (len(rows) - num)) < num:
+                logs, means = known.T.split([len(logs), len(made.mean)])
+                power = (2.0 * logs).exp().unflatten(0, (-1, num_filters))
+                score[max(silent, 0) :] = self._classifier.score(Blocks(power, means), masked)
+            return score.numpy()
 
-class _HopScore:
-    """``OnsetClassifier.score`` of a few hops, in plain arrays: quicker than small tensors.
 
-    Args:
-        classifier: that scores.
-    """
-
-    def __init__(self, classifier: OnsetClassifier) -> None:
-        evidence, scaler, head = classifier.evidence, classifier.scaler, classifier.head
-        windows, self._memory = evidence.windows, evidence.memory
-        self._of_windows = np.zeros((windows[-1], len(windows)))  # blocks to means
-        for number, length in enumerate(windows):
-            self._of_windows[-length:, number] = 1 / length
-        num_floor = evidence.memory - windows[-1]
-        self._of_floor = np.full(num_floor, 1 / num_floor)
-        self._of_steps, self._slow_knee = evidence.step_matrix.numpy(), np.array(evidence.slow_knee)
-        self._silence = np.log(evidence.fast_knee)
-        self._channels = evidence.channels
-        self._all = [np.ones(len(channels), bool) for channels in self._channels]
-        width = (scaler.maximum - scaler.minimum).numpy()
-        self._slope = np.divide(2.0, width, out=np.zeros_like(width), where=width > 0)
-        self._offset = np.where(width > 0, -1.0, 0.0) - self._slope * scaler.minimum.numpy()
-        self._quadratic = None if head.is_linear else head.quadratic.numpy()
-        self._linear, self._constant = head.linear.numpy(), float(head.constant)
-
-    def __call__(self, blocks: list[Array], num: int, masked: Tensor | None) -> list[float]:
-        """The last scores, of as many hops."""
-        heard = self._all if masked is None else [~masked.numpy()[c] for c in self._channels]
-        first = blocks[0].shape[-1] - self._memory - num + 1
-        with np.errstate(invalid="ignore"):
-            return [
-                self._of_hop(*(x[..., start : start + self._memory] for x in blocks), *heard)
-                for start in range(first, first + num)
-            ]
-
-    def _of_hop(
-        self, power: Array, log_power: Array, mean: Array, fast: Array, slow: Array
-    ) -> float:
-        """Of the blocks that it rests on, and the channels that are listened to."""
-        level = power[..., -len(self._of_windows) :] @ self._of_windows  # [F, B, W]
-        floor = log_power[..., : len(self._of_floor)] @ self._of_floor  # [F, B]
-        loudness = 0.5 * np.log(level).swapaxes(1, 2)
-        rises = (loudness - floor[:, None]).reshape(len(floor), -1)
-        in_use = ((floor - self._silence).max(1) > _LEAST_RISE) & fast & np.isfinite(rises.sum(1))
-        if not (num := np.count_nonzero(in_use)):
-            return math.nan
-        if num < len(in_use):
-            rises = rises[in_use]
-        columns = [rises.sum(0) / num]
-        if len(in_use) > 1:
-            columns += [rises.max(0), rises.min(0)]
-        if len(slow):
-            latest = mean[:, -len(self._of_steps) :]
-            steps = (latest - latest[:, :1]) @ self._of_steps
-            size = np.log(np.abs(steps) + self._slow_knee)
-            told = slow & np.isfinite(size.sum(1))  # size, way: [S, D]
-            way = np.sign(steps) * (size - np.log(self._slow_knee))
-            if not (num := np.count_nonzero(told)):
-                size = way = np.zeros((1, size.shape[1]))
-            elif num < len(told):
-                size, way = size[told], way[told]
-            for each in (size, way):
-                columns.append(each.sum(0) / len(each))
-                if len(told) > 1:
-                    columns += [each.max(0), each.min(0)]
-        z = np.concatenate(columns) * self._slope + self._offset
-        z = np.minimum(np.maximum(z, -1.0), 1.0)
-        pull = self._linear if self._quadratic is None else self._quadratic @ z + self._linear
-        return float(pull @ z) + self._constant
+def _engine_of(classifier: OnsetClassifier) -> OnsetEngine:
+    evidence, scaler, head = classifier.evidence, classifier.scaler, classifier.head
+    width = (scaler.maximum - scaler.minimum).numpy()
+    slope = np.divide(2.0, width, out=np.zeros_like(width), where=width > 0)
+    offset = np.where(width > 0, -1.0, 0.0) - slope * scaler.minimum.numpy()
+    quadratic = np.empty((0, 0)) if head.is_linear else head.quadratic.numpy()
+    return OnsetEngine(
+        fast=evidence.hand.fast,
+        slow=evidence.hand.slow,
+        windows=evidence.windows,
+        memory=evidence.memory,
+        filters=evidence.filter_matrix,
+        steps=evidence.step_matrix.numpy(),
+        knees=(evidence.fast_knee, evidence.slow_knee),
+        scaling=(slope, offset),
+        head=(quadratic, head.linear.numpy(), float(head.constant)),
+    )
 
 
 def _over_channels(values: Tensor, in_use: Tensor, num: Tensor) -> list[Tensor]:

@@ -199,7 +199,8 @@ class StreamingDetector:
         self._held = np.empty((len(self.detector.pool.hand), 0), _NUMPY[self._wide])
         self._start_of_held = 0  # its first sample's place in the stream
         self._number = 0  # of the next decision on a bin
-        self._onset = None if self.settings.onset is None else OnsetStream(self.settings.onset)
+        onset, backend = self.settings.onset, self.detector.extractor.backend
+        self._onset = None if onset is None else OnsetStream(onset, backend)
         self._no_bins = self._nothing = self._decide(-1)
         if self._onset is not None:
             self._nothing = self._decider.join(self._no_bins, torch.empty(0, dtype=torch.float64))
