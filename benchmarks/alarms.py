@@ -13,10 +13,8 @@ is kept, so a run that was stopped resumes. Puts its tables into docs/onset.md.
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import cycle, islice
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -34,7 +32,6 @@ from benchmarks.harness import (
     Report,
     Table,
     code_digest,
-    on_threads,
     percent,
     say,
     trained,
@@ -42,8 +39,7 @@ from benchmarks.harness import (
 )
 from benchmarks.peers import rockets
 from benchmarks.subjects import Array, Trained, composed
-from tactslip_torch import AlarmSettings, FeaturePool, Prediction, SlipDetector, StreamingDetector
-from tactslip_torch.data.splits import PAPER_SCENE
+from tactslip_torch import AlarmSettings, FeaturePool, Prediction, SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector
 from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.onset.events import EventRules, LatencyParts, pooled_metrics, recording_events
@@ -110,7 +106,6 @@ class Sizes:
         cycles: of each material, pulse and knock.
         peer_recordings: of training, to whose bins MiniRocket's ridge is fitted.
         num_kernels: of MiniRocket; 0 leaves it out, which halves the time of its seed.
-        rounds: of timed pushes.
     """
 
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
@@ -125,7 +120,6 @@ class Sizes:
     cycles: int = 4
     peer_recordings: int = 60
     num_kernels: int = 0
-    rounds: int = 4000
 
 
 class Alarms(Benchmark[Sizes]):
@@ -136,13 +130,11 @@ class Alarms(Benchmark[Sizes]):
     about = "alarms of +exp=onset within the default budget, on recordings that set nothing"
     page, markers, has_headings = "docs/onset.md", "onset", False
     sizes = Sizes()
-    quick = Sizes(
-        (0,), (*QUICK_TRAINING, *QUICK_STREAMS), (0.1,), (30.0,), 1, 3, num_kernels=168, rounds=5
-    )
+    quick = Sizes((0,), (*QUICK_TRAINING, *QUICK_STREAMS), (0.1,), (30.0,), 1, 3, num_kernels=168)
     libraries = ("aeon",)
 
     def measure(self, job: Job[Sizes]) -> dict[str, Any]:
-        """Of every seed what the stage tells; of the first also pulses and pushes."""
+        """Of every seed what the stage tells; of the first also pulses."""
         found: dict[str, Any] = {"seeds": {}}
         for seed in job.sizes.seeds:
             kept = job.folder / f"alarm-{seed}.json"
@@ -180,7 +172,6 @@ class Alarms(Benchmark[Sizes]):
             method.pop("metadata", None)
         if is_first:
             found["pulses"] = _pulses(detector, stage, found, job.sizes)
-            found["push"] = _push(detector, stage, job.sizes)
         return found
 
     def tables(self, numbers: Report) -> dict[str, Table]:
@@ -206,15 +197,6 @@ class Alarms(Benchmark[Sizes]):
             ),
             "Slips among confounders, held out": Table(_scene_slips(seeds)),
         }
-        if "push" in first:
-            push = first["push"]
-            found["A push of one hop"] = Table(
-                [
-                    {"hop": kind} | {name: f"{1e3 * seconds:.3f}" for name, seconds in of.items()}
-                    for kind, of in push.items()
-                ],
-                "Milliseconds of CPU time of one thread.",
-            )
         if "pulses" in first:
             found["Weak pulses and strong knocks"] = Table(
                 _pulse_rows(first["pulses"]),
@@ -415,35 +397,6 @@ def _pulses(
                 }
             rows.append(row)
     return rows
-
-
-def _push(
-    detector: SlipDetector, stage: CalibratedAlarm, sizes: Sizes
-) -> dict[str, dict[str, float]]:
-    """Seconds of CPU of a push of one hop, without and with a bin that it completes."""
-    live = StreamingDetector(detector, AlarmSettings.of(detector))
-    hop, of_bins = live.settings.decision_samples, live.settings.hop_samples
-    recording = next(one for one in stage.streams.ids if one.scene == PAPER_SCENE)
-    pieces = stage.streams.load(recording).samples.T.contiguous().split(hop)[:-1]
-    warm = round(2.0 / live.hop_s)
-    for piece in pieces[:warm]:
-        live.push(piece)
-    behind = warm * hop - round(live.look_ahead_s * detector.pool.sample_rate_hz)
-    behind -= detector.pool.bin_samples  # samples from the end of the first bin
-    seconds: dict[str, list[float]] = {"evidence and rule": [], "with a bin": []}
-    with on_threads(1):
-        for piece in islice(cycle(pieces[warm:]), sizes.rounds):
-            started = time.thread_time()
-            live.push(piece)
-            spent = time.thread_time() - started
-            is_bin = (behind + hop) // of_bins > behind // of_bins
-            seconds["with a bin" if is_bin else "evidence and rule"].append(spent)
-            behind += hop
-    return {
-        kind: {name: float(np.quantile(own, q)) for name, q in (("p50", 0.5), ("p99", 0.99))}
-        for kind, own in seconds.items()
-        if own
-    }
 
 
 @dataclass(frozen=True, eq=False)

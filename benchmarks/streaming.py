@@ -1,16 +1,25 @@
 """How fast a stream is watched, and in what memory: ``python -m benchmarks.streaming``.
 
 Pushes to ``StreamingDetector`` by their size and by the hop of decisions, beside the naive way, a
-bin with all its context for every decision; and the resident memory along an hour of stream.
+bin with all its context for every decision; the CPU time of a hop with an onset classifier, in
+Python and in the C host; and the resident memory along an hour of stream.
 """
 
 from __future__ import annotations
 
+import ctypes
 import gc
+import shutil
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
-from itertools import cycle
+from itertools import cycle, islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -39,9 +48,12 @@ from benchmarks.subjects import (
     MainJobDetector,
     alarm_settings,
     endless,
+    onset_settings,
     stream_samples,
 )
-from tactslip_torch import SlipDetector, StreamingDetector
+from tactslip_torch import AlarmSettings, SlipDetector, StreamingDetector
+from tactslip_torch.deploy.export import export_detector
+from tactslip_torch.onset.decisions import KEY
 
 HOP, PUSH = 20, 200
 """The settings that the limit is about: a decision every 10 ms, pushes of 100 ms."""
@@ -59,6 +71,7 @@ class Sizes:
         rounds: of every way.
         watched_s: of the stream, while the memory is looked at.
         settled_s: of the stream, until the memory has to stay where it is.
+        onset_hops: pushes of a hop of the onset classifier.
     """
 
     recordings: int = 8
@@ -67,6 +80,7 @@ class Sizes:
     rounds: int = 20
     watched_s: float = 3600.0
     settled_s: float = 300.0
+    onset_hops: int = 6000
 
 
 class Streaming(Benchmark[Sizes]):
@@ -79,7 +93,8 @@ class Streaming(Benchmark[Sizes]):
         "the main job selects on 1 thread; times faster than the stream runs"
     )
     sizes = Sizes()
-    quick = Sizes(1, pushes=(20, 200), hops=(20, 100), rounds=2, watched_s=6.0, settled_s=2.0)
+    quick = Sizes(1, pushes=(20, 200), hops=(20, 100), rounds=2, watched_s=6.0, settled_s=2.0,
+                  onset_hops=400)  # fmt: skip
 
     def measure(self, job: Job[Sizes]) -> dict[str, Any]:
         """Seconds of pushes by way, and resident memory."""
@@ -107,18 +122,27 @@ class Streaming(Benchmark[Sizes]):
             {"way": kind, "hop": hop, "push": push, **timings[f"{kind} {hop} {push}"].summary()}
             for kind, hop, push in ways
         ]
+        say(f"streaming: {sizes.onset_hops} hops of an onset classifier")
+        with on_threads(1), torch.no_grad():
+            hops = _hops(detector, samples, sizes.onset_hops)
         say(f"streaming: {sizes.watched_s:g} s of stream in a fresh process")
         memory = in_fresh_process(f"benchmarks.{self.name}:watch", seconds=sizes.watched_s)
-        return {"rows": rows, "memory": memory, "settled_s": sizes.settled_s}
+        return {"rows": rows, "hops": hops, "memory": memory, "settled_s": sizes.settled_s}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Limits, speed and memory."""
         main = next(r for r in numbers["rows"] if (r["way"], r["hop"], r["push"]) == _MAIN)
-        growth = _growth_mb(numbers)
+        growth, hops = _growth_mb(numbers), numbers["hops"]
         goals = [
             limit(f"load at hop {_ms(HOP)} ms, pushes of {_ms(PUSH)} ms", 1 / _times(main).median,
                   1 / LEAST_TIMES, "of a core"),
             limit("resident memory, growth after it has settled", growth, MOST_GROWTH_MB, "MB"),
+            *(
+                limit(f"a hop of the onset classifier, {name}", 1e6 * hops[host]["hop"][quantile],
+                      most_us, "us")
+                for host, name, quantile, most_us in _HOP_LIMITS
+                if host in hops
+            ),
         ]  # fmt: skip
         speed = [
             {
@@ -139,6 +163,19 @@ class Streaming(Benchmark[Sizes]):
         return {
             "Limits": limits(goals),
             "Speed": Table(speed, "naive: a bin with all its context for every decision."),
+            "Hops of an onset classifier": Table(
+                [
+                    {
+                        "host": host,
+                        "push": kind,
+                        "p50 us": number(1e6 * of["p50"]),
+                        "p99 us": number(1e6 * of["p99"]),
+                    }
+                    for host, kinds in hops.items()
+                    for kind, of in kinds.items()
+                ],
+                "CPU time of one thread, pushes of 5 ms; every fifth completes a bin too.",
+            ),
             "Memory": listed("memory", held),
         }
 
@@ -155,6 +192,71 @@ class Streaming(Benchmark[Sizes]):
 
 
 _MAIN = ("stream", HOP, PUSH)
+_FIRST_TIMED = 300  # hop, when evidence has its floor
+_HOP_LIMITS = (("Python", "Python, p99", "p99", 300.0), ("C", "C host, median", "p50", 100.0))
+
+
+def _hops(
+    detector: SlipDetector, samples: Array, num: int
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Seconds of CPU of pushes of a hop, those that complete a bin apart; by host."""
+    settings = onset_settings(detector, samples)
+    assert settings.onset is not None
+    hop = settings.decision_samples
+    live = StreamingDetector(detector, settings, dtype=torch.float32)
+    pieces = islice(endless(samples, hop), num)
+    first = detector.pool.bin_samples + detector.look_ahead  # samples before the first decision
+    hosts: dict[str, Callable[[Array], object]] = {"Python": live.push}
+    with TemporaryDirectory() as folder:
+        if push := _c_host(detector, settings, Path(folder)):
+            hosts["C"] = push
+        seconds: dict[str, dict[str, list[float]]] = {
+            host: {"hop": [], "hop and bin": []} for host in hosts
+        }
+        for place, piece in enumerate(pieces):
+            seen = (place + 1) * hop
+            had, has = ((x - first) // settings.hop_samples for x in (seen - hop, seen))
+            for host, push in hosts.items():
+                started = time.thread_time()
+                push(piece)
+                spent = time.thread_time() - started
+                if place >= _FIRST_TIMED:
+                    seconds[host]["hop and bin" if has > had else "hop"].append(spent)
+    return {
+        host: {
+            kind: {name: float(np.quantile(own, q)) for name, q in (("p50", 0.5), ("p99", 0.99))}
+            for kind, own in kinds.items()
+        }
+        for host, kinds in seconds.items()
+    }
+
+
+def _c_host(
+    detector: SlipDetector, settings: AlarmSettings, folder: Path
+) -> Callable[[Array], object] | None:
+    """Pushes of the C host, which is built; None where there is no compiler."""
+    if not (shutil.which("cc") and shutil.which("make")):
+        return None
+    told = copy(detector)
+    told.info = {**detector.info, KEY: settings.to_dict()}
+    path = export_detector(told, folder, ["stream"])[0]
+    words = [f"BUILD={folder}", f"PYTHON={sys.executable}", f"{folder}/libslip.so"]
+    source = Path(__file__).parents[1] / "export" / "c"
+    subprocess.run(["make", "-C", source, *words], check=True, stdout=subprocess.DEVNULL)
+    library = ctypes.CDLL(f"{folder}/libslip.so")
+    library.slip_open.restype = ctypes.c_void_p
+    pointer, size = ctypes.c_void_p, ctypes.c_size_t
+    library.slip_push.argtypes = (pointer, pointer, size, pointer)
+    error, found = ctypes.create_string_buffer(1024), ctypes.create_string_buffer(4096)
+    handle = library.slip_open(str(path).encode(), settings.decision_samples, error)
+    if not handle:
+        raise RuntimeError(error.value.decode())
+
+    def push(samples: Array) -> None:
+        if library.slip_push(handle, samples.ctypes.data, len(samples), found) < 0:
+            raise RuntimeError("the C host failed")
+
+    return push
 
 
 def watch(seconds: float) -> dict[str, Any]:

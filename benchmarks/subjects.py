@@ -29,10 +29,11 @@ from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.kernels import KernelSum, Polynomial, kernel_from_dict
+from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm, kernel_from_dict
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import KEY
+from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.simulate import SimulatedRecordings
@@ -152,6 +153,19 @@ def alarm_settings(hop: int) -> AlarmSettings:
     """Usual settings of a stream; what they say of a bin does not matter here."""
     rule = Cusum(drift=0.1, evidence=min(1.0, hop / 100), ceiling=10.0)
     return AlarmSettings(hop, Platt(1.0, 0.0), rule, 8.0, target_per_hour=1.0)
+
+
+def onset_settings(detector: SlipDetector, samples: Array) -> AlarmSettings:
+    """Those of an alarm with an onset classifier, its numbers drawn; samples ``[T, C]``."""
+    settings, pool = alarm_settings(50), detector.pool
+    plain = OnsetEvidence(pool.hand, pool.sample_rate_hz, 10, (1e-4,) * 4, (1e-3,) * 6)
+    columns, _ = plain.columns(plain.blocks_of_recording(torch.from_numpy(samples.T)))
+    draw = np.random.default_rng(0).standard_normal
+    quadratic = draw((plain.num_columns,) * 2) / plain.num_columns
+    numbers = quadratic + quadratic.T, draw(plain.num_columns), np.array(0.0)
+    head = QuadraticForm(*map(torch.from_numpy, numbers))
+    onset = OnsetClassifier(plain, FeatureScaler.fit(columns), head, threshold=1e9)
+    return replace(settings, onset=onset)
 
 
 # -------------------------------------------------------------------------- trained detectors

@@ -521,7 +521,8 @@ class OnsetEngine(_Kept):
         num = (samples.shape[1] - self._of.context) // self._of.hop
         score = np.empty(num)
         call = _OnsetHops(
-            address, is_float, stride, num, len(rows) - num, rows.ctypes.data, listened.ctypes.data, score.ctypes.data,
+            address, is_float, stride, num, len(rows) - num,
+            rows.ctypes.data, listened.ctypes.data, score.ctypes.data,
         )  # fmt: skip
         if self._library.tactslip_onset(self._level, ctypes.byref(self._of), ctypes.byref(call)):
             raise MemoryError("the native engine found no memory to work in")
