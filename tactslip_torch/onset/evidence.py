@@ -268,12 +268,13 @@ class OnsetEvidence:
         if num_slow := len(self.hand.slow):
             knee = torch.tensor(self.slow_knee, dtype=torch.float64)[:, None]
             size = (steps.abs() + knee).log()
-            told = size.sum(1).isfinite() & slow
-            rows = told.unsqueeze(1)
-            num = rows.type_as(size).sum(-1).clamp(min=1.0)
             way = steps.sign() * (size - knee.log())
-            for each in (size, way):
-                columns += _over_channels(each, rows, num)[: 3 if num_slow > 1 else 1]
+            both = torch.cat([size.unsqueeze(1), way.unsqueeze(1)], 1)  # [k, 2, D, S]
+            told = size.sum(1).isfinite() & slow
+            rows = told.unsqueeze(1).unsqueeze(1)
+            num = rows.type_as(size).sum(-1).clamp(min=1.0)
+            pools = _over_channels(both, rows, num)[: 3 if num_slow > 1 else 1]
+            columns.append(torch.cat(pools, -1).flatten(-2))
         return torch.cat(columns, -1), in_use.any(-1)
 
     def to_dict(self) -> dict[str, Any]:
