@@ -449,7 +449,8 @@ def finish(drawing: Figure, report: Report, about: str, path: Path) -> None:
 # -------------------------------------------------------------------------------------- files
 def keep_numbers(report: Report, path: Path) -> None:
     """Write a report as JSON, whole or not at all, and say where."""
-    write_text(path, json.dumps(report, indent=1, allow_nan=False) + "\n")
+    text = json.dumps(report, indent=1, allow_nan=False) + "\n"
+    write_text(path, text.replace(f"{ROOT}/", "./"))  # no paths of this machine
     print(f"\nnumbers in {path}")
 
 
