@@ -32,7 +32,7 @@ from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import calibration_of
 from tactslip_torch.own_files import FORGED, load_table, save_table
 from tactslip_torch.signals.filtering import Align, ChannelFilter
-from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
+from tactslip_torch.signals.wavelet import SpectrumMethod
 from tactslip_torch.training.plan import Plan, TrainingPass, plan_detector, solve_metadata
 from tactslip_torch.training.recipe import FeatureSelection, Recipe
 
@@ -58,7 +58,6 @@ POOLING = ("mean", "std", "min", "max")
 PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 _FOLDS = 5  # of validation without groups
 _BLOCK = 50  # windows that lose the same channels in a second copy (``recipe.drop_channels``)
-_MOST_LEVELS = 4  # of the paper
 _UNCALIBRATED = Platt(2.0, 0.0)  # (1 + score) / 2 in the middle, for targets of -1 and 1
 
 Array = NDArray[Any]
@@ -114,15 +113,12 @@ class _OfWindows(BaseEstimator):  # type: ignore[misc]  # scikit-learn has no an
                 f"and {after} behind; give longer ones, filtered ones with filtered=True, or "
                 "frames={} for no filter"
             )
-        level = self.level
-        if level is None:
-            level = min(_MOST_LEVELS, highest_level(num, self.wavelet))
         pool = FeaturePool(
             hand,
             float(self.sample_rate_hz),
             bin_samples=num,
             wavelet=self.wavelet,
-            level=level,
+            level=self.level,
             spectrum=self.spectrum,
             backend=self.backend,
         )
@@ -292,9 +288,8 @@ class TactileFeatures(TransformerMixin, _OfWindows):  # type: ignore[misc]
             layer = ChannelPooling.fit(self.hand_, described.names, features, self.pooling)
             if self.use == "both":
                 layer = layer.with_channels(described.names)
-            place = {name: index for index, name in enumerate(self._pool.names)}
             self._layer = layer
-            self._columns = self._pool.select([place[name] for name in layer.inputs])
+            self._columns = self._pool.select(self._pool.places(layer.inputs))
         return self
 
     def transform(self, X: ArrayLike | Tensor) -> Array:
@@ -515,8 +510,7 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
             selected = [features._columns.selected[i] for i in chosen]
         else:
             layer = layer.select(chosen)
-            place = {name: index for index, name in enumerate(pool.names)}
-            selected = [place[name] for name in layer.inputs]
+            selected = pool.places(layer.inputs)
             if not any(name.is_pooled for name in layer.names):
                 layer = None
         scaler, head = self._selection.scaler, self._head

@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import lru_cache
@@ -173,6 +173,23 @@ def check_number(name: str, value: Any, *, least: float | None = None, whole: bo
     kind = "whole number" if whole else "finite number"
     wanted = f"a positive {kind}" if least is None else f"a {kind} of at least {least:g}"
     raise ValueError(f"{name} must be {wanted}, got {value!r}")
+
+
+def check_choice(name: str, value: Any, known: Iterable[Any]) -> None:
+    """Refuse a value that is none of those known.
+
+    Raises:
+        ValueError: that names it and them.
+
+    Example:
+        >>> check_choice("frame.counter", "int8", ("uint8", None))
+        Traceback (most recent call last):
+        ValueError: frame.counter must be one of uint8, null, got 'int8'
+    """
+    choices = tuple(known)
+    if value not in choices:
+        wanted = ", ".join("null" if choice is None else str(choice) for choice in choices)
+        raise ValueError(f"{name} must be one of {wanted}, got {value!r}")
 
 
 @contextmanager
@@ -388,43 +405,16 @@ def bar(
     """``items`` with a progress bar on standard error that shows rate and time left."""
     if not show:
         return items
-    if total is None and isinstance(items, Sized):
-        total = len(items)
     shown: Iterable[Any] = Progress(
         items, desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", dynamic_ncols=True
     )
     return shown
 
 
-class Ticker:
-    """A bar that is moved by hand, as of work on several threads.
-
-    Args:
-        what: is done.
-        unit: of a step.
-        total: number of steps, at most.
-        show: whether to draw it.
-    """
-
-    def __init__(self, what: str, unit: str, total: int, *, show: bool = True) -> None:
-        self._bar = Progress(
-            desc=f"{what:{LEAD}}",
-            total=total,
-            unit=f" {unit}",
-            dynamic_ncols=True,
-            smoothing=0,
-            disable=not show,
-        )
-
-    def __enter__(self) -> Ticker:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._bar.close()
-
-    def tick(self) -> None:
-        """A step is done."""
-        self._bar.update()
+def steps(what: str, unit: str, total: int, *, show: bool = True) -> Progress:
+    """A bar of at most so many steps for a ``with``, moved by its ``update``, from any thread."""
+    options = {"dynamic_ncols": True, "smoothing": 0, "disable": not show}
+    return Progress(desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", **options)
 
 
 _function: Callable[[Any], Any] | None = None

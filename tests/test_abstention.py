@@ -150,7 +150,7 @@ def test_thresholds_are_those_of_machines_refitted_without_the_bins_own(left_out
     ("values", "message"),
     [
         (("much", "recording"), "coverage must lie between 0 and 1, such as 0.95, got 'much'"),
-        ((0.9, "finger"), "coverage_by must be recording or group, got 'finger'"),
+        ((0.9, "finger"), "coverage_by must be one of recording, group, got 'finger'"),
     ],
 )
 def test_settings_that_are_none_are_refused(values, message):

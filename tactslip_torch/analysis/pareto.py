@@ -54,7 +54,7 @@ from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.runtime import Ticker, bar, check_number, in_parts, one_thread
+from tactslip_torch.runtime import bar, check_number, in_parts, one_thread, steps
 from tactslip_torch.signals.filtering import Align
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.plan import (
@@ -480,11 +480,11 @@ class ParetoSearch:
 
     def _all(self, jobs: Sequence[Callable[[], list[Candidate]]]) -> list[list[Candidate]]:
         """What each job finds, in their order; every job is done by one thread."""
-        with Ticker("search, groups", "step", len(jobs)) as ticker:
+        with steps("search, groups", "step", len(jobs)) as shown:
 
             def work(job: Callable[[], list[Candidate]]) -> list[Candidate]:
                 found = job()
-                ticker.tick()
+                shown.update()
                 return found
 
             return in_parts(work, jobs)

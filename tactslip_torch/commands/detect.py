@@ -54,7 +54,7 @@ from tactslip_torch.report.onset import (
     write_onsets,
 )
 from tactslip_torch.report.style import csv_writer
-from tactslip_torch.runtime import Ticker, plain
+from tactslip_torch.runtime import plain, steps
 from tactslip_torch.training.experiment import save_config, versions
 
 FORMAT = "tactslip_torch onsets 1"
@@ -111,11 +111,11 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
     content = _origin(context) | {"events": None, "recordings": [], "failed": []}
     known: list[RecordingEvents] = []
     stems = [path.stem for path in paths]
-    with Ticker("onsets", "s of signal", sum(_num_pieces(path, context) for path in paths)) as bar:
+    with steps("onsets", "s of signal", sum(_num_pieces(path, context) for path in paths)) as bar:
         for path in paths:
             name = path.stem if stems.count(path.stem) == 1 else path.name
             try:
-                entry, events = _detect_in(path, name, context, bar.tick)
+                entry, events = _detect_in(path, name, context, bar.update)
             except (ValueError, OSError) as error:
                 content["failed"].append({"file": path.name, "error": one_line(error)})
                 continue
@@ -138,7 +138,7 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
 
 
 def _detect_in(
-    path: Path, name: str, context: _DetectionContext, tick: Callable[[], None]
+    path: Path, name: str, context: _DetectionContext, tick: Callable[[], object]
 ) -> tuple[dict[str, Any], RecordingEvents | None]:
     """One recording, also drawn: its entry, and its events where the truth is known."""
     detector, config, hand = context.detector, context.config, context.detector.pool.hand

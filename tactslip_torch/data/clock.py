@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import grey_closing, grey_opening
 
 GapRule = Literal["refuse", "missing", "bridge"]
-GAP_RULES: tuple[str, ...] = get_args(GapRule)
 
 _Numbers = NDArray[np.float64]
 _MOST_FOR_STEP = 1 << 18  # times that the step is found from

@@ -18,14 +18,13 @@ from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from tactslip_torch.data.clock import (
-    GAP_RULES,
     Clock,
     Gap,
     GapRule,
@@ -45,8 +44,8 @@ from tactslip_torch.data.formats import (
 from tactslip_torch.data.formats._reading import MM_S
 from tactslip_torch.data.labels import slip_by_speed
 from tactslip_torch.data.manifest import (
-    MOMENTS,
-    STRETCHES,
+    SPANS,
+    TIMES,
     Entry,
     Listing,
     Problem,
@@ -55,9 +54,9 @@ from tactslip_torch.data.manifest import (
     manifest_of,
     read_manifest,
 )
-from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.data.recording import MOMENTS, STRETCHES, Recording, RecordingId
 from tactslip_torch.hand import KNOWN_KINDS, Adapting, Channel, HandLayout
-from tactslip_torch.runtime import check_number, in_processes
+from tactslip_torch.runtime import check_choice, check_number, in_processes
 from tactslip_torch.signals.resampling import resample
 
 log = logging.getLogger(__name__)
@@ -143,7 +142,7 @@ def on_time(
         missing_s: further stretches without samples, of the file.
     """
     problems = []
-    for name in STRETCHES:
+    for name in SPANS:
         for start, end in getattr(truth, name):
             if start >= duration_s or (end > duration_s + slack_s and end != math.inf):
                 span = f"{start:g}-{'end' if end == math.inf else format(end, 'g')} s"
@@ -161,7 +160,7 @@ def on_time(
     onsets = truth.onsets_s
     cut: dict[str, Any] = {
         name: tuple((start, min(end, duration_s)) for start, end in getattr(truth, name))
-        for name in STRETCHES
+        for name in SPANS
     }
     if not cut["sliding_s"]:
         stops = [*onsets, duration_s, *(start for start, _ in truth.non_slip_s)]
@@ -181,7 +180,7 @@ def scaled(truth: Truth, factor: float) -> Truth:
         name: tuple(moment * factor for moment in getattr(truth, name))
         for name in ("onsets_s", "annotated_onsets_s")
     }
-    for name in STRETCHES:
+    for name in SPANS:
         spans = getattr(truth, name)
         changes[name] = tuple((start * factor, end * factor) for start, end in spans)
     return replace(truth, **changes)
@@ -244,7 +243,7 @@ class _Part(NamedTuple):
         if self.own is None:
             return Truth()
         told = self.own.recording
-        return Truth(**{name: getattr(told, name) for name in (*MOMENTS, *STRETCHES)})
+        return Truth(**{name: getattr(told, name) for name in TIMES})
 
 
 def look(path: Path, stream: Stream, stated_hz: float | None = None) -> _Part:
@@ -383,7 +382,9 @@ class EvenSamples(Samples):
         most_bridged: gaps of at most so many samples are crossed by a straight line; others are
             NaN.
         rows: of the file, that are wanted; ``None`` for all.
-        level: that is taken off each of those, ``[C, 1]``.
+
+    Attributes:
+        level: that is taken off each channel, ``[C, 1]``, if any is.
     """
 
     def __init__(
@@ -392,12 +393,11 @@ class EvenSamples(Samples):
         clock: Clock,
         most_bridged: int = 0,
         rows: Sequence[int] | None = None,
-        level: Tensor | None = None,
     ) -> None:
         self.num_samples, self.dtype = clock.num_samples, samples.dtype
         self.num_channels = samples.num_channels if rows is None else len(rows)
         self._inner, self._most, self._wanted = samples, most_bridged, rows
-        self._level = level
+        self.level: Tensor | None = None
         self._gaps = clock.gaps
         edges = [(gap.start, gap.missing) for gap in clock.gaps]
         self._starts, missing = np.array([(0, 0), *edges]).T
@@ -424,7 +424,7 @@ class EvenSamples(Samples):
                 within = torch.from_numpy(~is_there & (behind == number))
                 found[:, within] = self._line(gap, torch.from_numpy(ticks)[within])
         found = found if self._wanted is None else found[list(self._wanted)]
-        return found if self._level is None else found - self._level
+        return found if self.level is None else found - self.level
 
     def _line(self, gap: Gap, ticks: Tensor) -> Tensor:
         """The straight line across a gap, at those ticks of it."""
@@ -467,7 +467,8 @@ def _of_hand(
             f"{path} has nothing finite in its column {part.rows[broken[0]] + 1} to tare on from "
             f"{tare_s[0]:g} to {tare_s[1]:g} s; give another tare_s"
         )
-    return EvenSamples(found, clock, most_bridged, part.rows, level)
+    samples.level = level
+    return samples
 
 
 def _tare_of(value: object, name: str) -> Stretch | None:
@@ -737,8 +738,7 @@ class FileRecordings:
                 "data.reading.speed=NAME"
             )
         self._tare_s = _tare_of(tare_s, "data.tare_s")
-        if gaps not in GAP_RULES:
-            raise ValueError(f"data.gaps must be one of {', '.join(GAP_RULES)}, got {gaps!r}")
+        check_choice("data.gaps", gaps, get_args(GapRule))
         check_number("data.skip_s", skip_s, least=0)
         check_number("data.slide_s", slide_s, least=0)
         check_number("data.bridge_ms", bridge_ms)
@@ -940,15 +940,11 @@ class FileRecordings:
             torch.cat([part[:, :num_samples] for part in self._read(one, windows)]),
             self.sample_rate_hz,
             recording.material,
-            times.speeds_mm_s,
-            times.onsets_s,
-            times.sliding_s,
-            times.annotated_onsets_s,
-            times.non_slip_s,
-            own.recording.provenance if own else {"simulated": False, "file": one.entry.file},
-            slip_s=times.slip_s,
+            **{name: getattr(times, name) for name in (*MOMENTS, *STRETCHES)},
+            provenance=own.recording.provenance
+            if own
+            else {"simulated": False, "file": one.entry.file},
             units=self.units,
-            released_s=times.released_s,
         )
 
     def _read(self, one: _File, windows: Sequence[tuple[float, float]] | None) -> Iterator[Tensor]:

@@ -18,7 +18,7 @@ from tactslip_torch.data.formats import (
     format_of,
     named_format,
 )
-from tactslip_torch.data.manifest import MOMENTS, NAMES, STRETCHES, write_table
+from tactslip_torch.data.manifest import NAMES, TIMES, write_table
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
 
 MANIFEST = NAMES[0]
@@ -150,7 +150,7 @@ class RecordingFolder:
 
     def _truth(self, recording: RecordingId) -> dict[str, Any]:
         times = self.source.timeline(recording)
-        return {name: getattr(times, name) for name in (*MOMENTS, *STRETCHES)}
+        return {name: getattr(times, name) for name in TIMES}
 
     def check(self) -> None:
         """Refuse names that files cannot have, and to replace a file that is not ours.

@@ -23,6 +23,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tactslip_torch.runtime import check_choice
+
 Layout = Literal["whole_slide", "half_second"]
 OnsetSource = Literal["annotated", "exact"]
 Assign = Literal["whole", "majority", "last"]
@@ -64,11 +66,7 @@ class LabelRule:
 
     def __post_init__(self) -> None:
         for name, kinds in (("layout", Layout), ("onsets", OnsetSource), ("assign", Assign)):
-            if getattr(self, name) not in get_args(kinds):
-                raise ValueError(
-                    f"labels.{name} must be one of {', '.join(get_args(kinds))}, "
-                    f"got {getattr(self, name)!r}"
-                )
+            check_choice(f"labels.{name}", getattr(self, name), get_args(kinds))
         for name in ("bin_ms", "hop_ms", "speed_over"):
             value = getattr(self, name)
             if value is not None and not value > 0:

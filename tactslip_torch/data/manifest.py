@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple, cast
 import yaml  # type: ignore[import-untyped]
 
 from tactslip_torch.data.formats import is_there
-from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.recording import MOMENTS, STRETCHES, RecordingId
 from tactslip_torch.runtime import whole_file
 
 _Cell = str | list["_Cell"]
@@ -185,9 +185,10 @@ def _column(text: str) -> str:
 
 Stretch = tuple[float, float]
 Label = Literal["slip", "non-slip"]
-MOMENTS = ("onsets_s", "annotated_onsets_s", "speeds_mm_s")
-STRETCHES = ("sliding_s", "slip_s", "non_slip_s", "missing_s", "released_s")
-_TRUTH_COLUMNS = (*MOMENTS, *STRETCHES, "label")
+SPANS = (*STRETCHES, "missing_s")
+TIMES = (*MOMENTS, *SPANS)
+"""What a ``Truth`` says beside its label."""
+_TRUTH_COLUMNS = (*TIMES, "label")
 _LABELS: dict[str, Label] = {"slip": "slip", "nonslip": "non-slip", "noslip": "non-slip"}
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _SPAN = re.compile(rf"({_NUMBER})\s*(?:-|\N{{EN DASH}}|\.\.|to)\s*({_NUMBER}|end)")
@@ -269,7 +270,7 @@ def _contradictions(truth: Truth) -> list[str]:
             found.append(
                 f"{len(values)} {name} for {len(truth.onsets_s)} onsets; give one for each"
             )
-    for name in STRETCHES:
+    for name in SPANS:
         for start, end in getattr(truth, name):
             is_moment = name == "released_s" and start == end  # all let go at once
             if not (0 <= start < end or is_moment):
@@ -286,7 +287,7 @@ def _contradictions(truth: Truth) -> list[str]:
 def _overlaps(truth: Truth) -> list[str]:
     """Stretches that cannot both be, of a truth whose numbers are fine one by one."""
     found = []
-    for name in STRETCHES:
+    for name in SPANS:
         for clash in _clashes(getattr(truth, name)):
             found.append(f"{name}: {clash} overlap or stand in the wrong order")
     for clash in _clashes((*truth.sliding_s, *truth.slip_s), truth.non_slip_s):

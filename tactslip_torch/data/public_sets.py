@@ -128,7 +128,7 @@ def authors_raw(
         problems.append(Problem(entry.file, what))
     order = list(stems.values())
     entries.sort(key=lambda entry: (order.index(entry.recording.material), entry.recording))
-    listing = _without_twins(Listing(tuple(entries), tuple(problems)))
+    listing = Listing(tuple(entries), tuple(problems))
     rows = HandLayout.paper24().to_rows() if channels is None else channels
     return _set_of(listing, root, manifest, {"channels": rows, **options})
 
@@ -194,7 +194,7 @@ def _listed(
         else:
             truth = Truth(label=label) if label else None
             entries.append(Entry(file, file, RecordingId(material, int(trial), scene), truth))
-    return _without_twins(Listing(tuple(entries), tuple(problems)))
+    return Listing(tuple(entries), tuple(problems))
 
 
 def _without_twins(listing: Listing) -> Listing:
@@ -211,6 +211,7 @@ def _set_of(
     listing: Listing, root: str | Path, manifest: str | None, options: Mapping[str, Any]
 ) -> FileRecordings:
     """The recordings of a listing, better told by a manifest if there is one."""
+    listing = _without_twins(listing)
     if manifest is not None:
         told = read_manifest(manifest_of(Path(root), manifest), Path(root))
         listing = better_told(listing, told)

@@ -41,6 +41,11 @@ class RecordingId:
         return f"{self.material}/{self.cycle}{scene}{session}"
 
 
+MOMENTS = ("onsets_s", "annotated_onsets_s", "speeds_mm_s")
+STRETCHES = ("sliding_s", "slip_s", "non_slip_s", "released_s")
+"""What a ``Recording`` says of its time: numbers, one of each slide, and pairs of start and end."""
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """One trial: raw samples and the truth about them.

@@ -8,7 +8,7 @@ order, not on who saw them, and on no random state.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,8 +23,7 @@ def bin_keys(recording: str, num_bins: int) -> Tensor:
 
     The smaller, the sooner a bin is in a ``BinSample``.
     """
-    keys = [_key(recording, index) >> 11 for index in range(num_bins)]
-    return torch.tensor(keys, dtype=torch.float64) * 2.0**-53
+    return _uniform((recording, index) for index in range(num_bins))
 
 
 @dataclass(frozen=True)
@@ -50,6 +49,12 @@ class SampledBins:
     recording_names: tuple[str, ...]
     bin_index: Tensor
     sample_weight: Tensor
+
+    @property
+    def keys(self) -> Tensor:
+        """What ``bin_keys`` says of each of them, ``[n]``, float64."""
+        places = zip(self.recording.tolist(), self.bin_index.tolist(), strict=True)
+        return _uniform((self.recording_names[recording], index) for recording, index in places)
 
 
 @dataclass
@@ -197,6 +202,11 @@ class BinSample:
     def _check_width(self, width: int) -> None:
         if self._width() not in (None, width):
             raise ValueError(f"the sample has bins of {self._width()} features, got {width}")
+
+
+def _uniform(places: Iterable[tuple[str, int]]) -> Tensor:
+    keys = [_key(*place) >> 11 for place in places]
+    return torch.tensor(keys, dtype=torch.float64) * 2.0**-53
 
 
 def _key(recording: str, index: int) -> int:

@@ -13,7 +13,7 @@ at a mean of 0, the mode of values equal but for rounding) they may differ.
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import Any, Literal, get_args
 
@@ -32,6 +32,7 @@ from tactslip_torch.features.bank import (
     pool_names,
 )
 from tactslip_torch.features.descriptors import DESCRIPTORS
+from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import (
     bounded_gradient,
     full_precision,
@@ -42,13 +43,14 @@ from tactslip_torch.features.ops import (
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.native import BackendName
 from tactslip_torch.own_files import MOST_BIN_SAMPLES
-from tactslip_torch.runtime import for_each
+from tactslip_torch.runtime import check_choice, for_each
 from tactslip_torch.signals.filtering import check_samples
 from tactslip_torch.signals.wavelet import (
     SpectrumMethod,
     Wavelet,
     WaveletFilters,
     as_wavelet,
+    highest_level,
     spectrum_matrix,
     wavelet_steps,
 )
@@ -67,6 +69,8 @@ VALIDITY = (
 """``FeaturePool.validity`` of the channels in use, in words for people."""
 LARGEST_SAMPLE = torch.finfo(torch.float64).max / 64
 """Volts; what is larger counts as Inf, because its branches and spectra may leave float64."""
+MOST_LEVELS = 4
+"""Wavelet levels of the paper."""
 _FEW_BINS = 4  # so few are done here: another thread would take longer to start
 _CHUNK = {"native": 32, "torch": 16}  # bins of a thread at a time, whose memory fits the cache
 
@@ -92,7 +96,7 @@ class FeaturePool(nn.Module):
         sample_rate_hz: of the bins.
         bin_samples: length of a bin; 100 (50 ms at 2 kHz) in the paper.
         wavelet: its name or, of one without a name, its filters (or their ``to_dict``).
-        level: number of wavelet levels.
+        level: number of wavelet levels; ``None``: as many as the bin allows, at most 4.
         spectrum: ``"reference"`` (the authors') or ``"clean"`` (ours).
         arithmetic: ``"double"``, or ``"native"`` to compute in the dtype of the bins.
         backend: ``"auto"`` takes the native one where it can be used (``native.why_not``).
@@ -121,7 +125,7 @@ class FeaturePool(nn.Module):
         *,
         bin_samples: int = 100,
         wavelet: str | WaveletFilters | Mapping[str, Any] = "rbio2.2",
-        level: int = 4,
+        level: int | None = MOST_LEVELS,
         spectrum: SpectrumMethod = "reference",
         arithmetic: Arithmetic = "double",
         backend: BackendName = "auto",
@@ -134,14 +138,13 @@ class FeaturePool(nn.Module):
                 f"bins have at most {MOST_BIN_SAMPLES} samples, got {bin_samples}; take shorter "
                 "bins (labels.bin_ms) or a lower rate (data.resample_hz)"
             )
-        if arithmetic not in get_args(Arithmetic):
-            raise ValueError(
-                f"arithmetic must be one of {', '.join(get_args(Arithmetic))}, got {arithmetic!r}"
-            )
+        check_choice("arithmetic", arithmetic, get_args(Arithmetic))
         self.hand = hand
         self.sample_rate_hz = float(sample_rate_hz)
         self.bin_samples = bin_samples
         self.wavelet = as_wavelet(wavelet)
+        if level is None:
+            level = min(MOST_LEVELS, highest_level(bin_samples, self.wavelet))
         self.level = level
         self.spectrum: SpectrumMethod = spectrum
         self.arithmetic: Arithmetic = arithmetic
@@ -173,6 +176,15 @@ class FeaturePool(nn.Module):
         pool.selected = tuple(self.selected[i] for i in chosen)
         _ = pool.plan  # refuses an empty one
         return pool
+
+    def places(self, names: Iterable[FeatureName]) -> list[int]:
+        """Where features of these names are among ``names``.
+
+        Raises:
+            KeyError: if there is none of a name.
+        """
+        place = {name: index for index, name in enumerate(self.names)}
+        return [place[name] for name in names]
 
     @property
     def maps(self) -> LinearMaps:

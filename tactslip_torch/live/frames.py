@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from tactslip_torch.live.sinks import Array, Block, Event
-from tactslip_torch.runtime import check_number
+from tactslip_torch.runtime import check_choice, check_number
 
 COUNTER = "counter"
 """The column of a line of text that counts lines."""
@@ -92,9 +92,7 @@ class Frames:
             "checksum": (*_CHECKSUMS, None),
         }
         for key, known in choices.items():
-            if (value := getattr(self, key)) not in known:
-                wanted = ", ".join("null" if each is None else each for each in known)
-                raise ValueError(f"frame.{key} must be one of {wanted}, got {value!r}")
+            check_choice(f"frame.{key}", getattr(self, key), known)
         if type(self.skip) is not int or self.skip < 0:
             raise ValueError(f"frame.skip must be a number of bytes, got {self.skip!r}")
         if self.length is not None and (type(self.length) is not int or self.length < 1):

@@ -25,8 +25,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,13 +32,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from tactslip_torch.data.folder import has_truth
 from tactslip_torch.data.formats._mcap import RECORDING
 from tactslip_torch.data.formats._messages import HEADER, TOPIC, Types, kind_of
 from tactslip_torch.data.formats._reading import header_of, needs, text_of
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.live.sinks import Block, FileSink, alarm_text
+from tactslip_torch.live.sinks import Block, FileSink, alarm_text, truth_changes
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.runtime import whole_file
@@ -94,23 +91,19 @@ class McapLog(FileSink):
         dtype: torch.dtype = torch.float32,
         is_live: bool = False,
     ) -> None:
-        if path.suffix != ".mcap":
-            raise ValueError(f"{path} must end in .mcap")
+        super().__init__(path, ".mcap", sample_rate_hz, is_live=is_live)
         library = needs("mcap.writer", "writing .mcap")
         none = torch.empty(len(hand), 0, dtype=dtype)
         known = recording or Recording(none, sample_rate_hz, "unknown", (), (), (), units=units)
         self._header = header_of(replace(known, samples=none), hand, {})
-        self._rate, self._is_live = sample_rate_hz, is_live
         self._has_onset = settings.onset is not None
-        self._start_ns: int | None = None
-        self._num, self._last_s, self._is_even = 0, 0.0, True
+        self._num, self._is_even = 0, True
         self._types = Types()
         topics = {f"/slip/{name}": kind for name, kind in _KINDS.items()}
         if not self._has_onset:
             del topics["/slip/onset_score"]
         self._kinds = {TOPIC: kind_of(self._header), **topics}
         self._prefix, self._stored = self._of_samples(len(hand)), np.dtype(self._header["dtype"])
-        self._stack = ExitStack()
         temporary = self._stack.enter_context(whole_file(path))
         file = self._stack.enter_context(temporary.open("wb"))
         self._writer = library.Writer(file, chunk_size=_CHUNK)
@@ -123,24 +116,14 @@ class McapLog(FileSink):
         layout = foxglove_layout(hand, settings, known.units)
         with whole_file(path.with_suffix(".foxglove.json")) as beside:
             beside.write_text(json.dumps(layout, indent=1) + "\n", encoding="utf-8")
-        if recording is not None and has_truth(recording):
-            slides = sorted((*recording.sliding_s, *recording.slip_s))
-            self._write("truth", 0.0, data=any(start <= 0 for start, _ in slides))
-            for start, end in slides:
-                self._write("truth", start, data=True)
-                self._write("truth", end, data=False)
+        for time_s, is_slip in truth_changes(recording):
+            self._write("truth", time_s, data=is_slip)
 
     def samples(self, first: int, block: Block) -> None:
         """Write a message for each sample."""
-        if block.time_s is not None:
-            times_s, self._is_even = block.time_s, False
-        else:
-            times_s = (first + np.arange(len(block.samples))) / self._rate
-            if self._is_live and self._start_ns is None:
-                self._start_ns = time.time_ns()
-        self._is_even &= first == self._num
+        times_s = self._times_of(first, block)
+        self._is_even &= first == self._num and block.time_s is None
         self._num = first + len(block.samples)
-        self._last_s = float(times_s[-1]) if len(times_s) else self._last_s
         rows = np.asarray(block.samples, self._stored, order="C")
         channel = self._channels[TOPIC]
         for time_s, row in zip(times_s.tolist(), rows, strict=True):
@@ -211,7 +194,7 @@ class McapLog(FileSink):
         self._write("events", time_s, stamp=self._clock(time_s), level=level, **words)
 
     def _ns(self, time_s: float) -> int:
-        return max((self._start_ns or 0) + round(time_s * 1e9), 0)
+        return max(round((self._start_s or 0.0) * 1e9) + round(time_s * 1e9), 0)
 
     def _clock(self, time_s: float) -> Any:
         seconds, rest = divmod(self._ns(time_s), 10**9)

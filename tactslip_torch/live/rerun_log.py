@@ -8,8 +8,6 @@ a disc whose area is its part of all shares (``channel_shares``): orange towards
 from __future__ import annotations
 
 import math
-import time
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +16,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactslip_torch.data.folder import has_truth
 from tactslip_torch.data.formats._reading import needs
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.live.sinks import Block, FileSink, alarm_text
+from tactslip_torch.live.sinks import Block, FileSink, alarm_text, truth_changes
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.onset.rules import NOTHING_YET
@@ -85,23 +82,19 @@ class RerunLog(FileSink):
         recording: Recording | None = None,
         is_live: bool = False,
     ) -> None:
-        if path.suffix != ".rrd":
-            raise ValueError(f"{path} must end in .rrd")
+        super().__init__(path, ".rrd", detector.pool.sample_rate_hz, is_live=is_live)
         self._rr: Any = needs("rerun", "writing .rrd", "rerun")
-        self._detector, self._is_live = detector, is_live
-        self._hand, self._rate = detector.pool.hand, detector.pool.sample_rate_hz
+        self._detector, self._hand = detector, detector.pool.hand
         self._thresholds = {"statistic": settings.threshold}
         if settings.onset is not None:
             self._thresholds["onset_score"] = settings.onset.threshold
-        self._start_s: float | None = None
         self._waiting: list[tuple[Array, Array]] = []  # times and samples
-        self._last_s, self._last_sent_s = 0.0, -math.inf
+        self._last_sent_s = -math.inf
         self._whole = detector.context_before + detector.pool.bin_samples + detector.look_ahead
         self._unused = detector.context_after - detector.look_ahead  # samples behind these
         self._recent = np.empty((0, len(self._hand)))
         self._every = max(round(_SHARES_S * self._rate), 1)  # samples from one hand to the next
         self._until = self._whole  # samples to the next
-        self._stack = ExitStack()
         temporary = self._stack.enter_context(whole_file(path))
         self._to: Any = self._rr.RecordingStream("tactslip", recording_id=path.stem)
         self._stack.callback(self._to.disconnect)
@@ -110,21 +103,15 @@ class RerunLog(FileSink):
         self._to.set_log_tick_enabled(False)
         self._to.save(temporary, default_blueprint=self._blueprint(units))
         self._draw_hand()
-        if recording is not None and has_truth(recording):
-            slides = sorted((*recording.sliding_s, *recording.slip_s))
-            times = [0.0, *(time_s for slide in slides for time_s in slide)]
-            self._send("slip/truth", times, [[0.0], *[[1.0], [0.0]] * len(slides)])
+        if changes := truth_changes(recording):
+            times, is_slip = zip(*changes, strict=True)
+            self._send("slip/truth", times, np.array(is_slip)[:, None])
 
     def samples(self, first: int, block: Block) -> None:
         """Keep them, to be sent by the tenth of a second, and draw the hand as often."""
         if not len(block.samples):
             return
-        times_s = block.time_s
-        if times_s is None:
-            times_s = (first + np.arange(len(block.samples))) / self._rate
-            if self._is_live and self._start_s is None:
-                self._start_s = time.time()
-        self._last_s = float(times_s[-1])
+        times_s = self._times_of(first, block)
         self._waiting.append((times_s, block.samples))
         if self._last_s - self._last_sent_s >= _SENT_S:
             self._send_samples()

@@ -8,14 +8,19 @@ from __future__ import annotations
 import json
 import math
 import socket
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self, TextIO
 
+import numpy as np
 from numpy.typing import NDArray
 
+from tactslip_torch.data.folder import has_truth
+from tactslip_torch.data.recording import Recording
 from tactslip_torch.onset.decisions import Alarm, Decisions
 
 Array = NDArray[Any]
@@ -242,6 +247,20 @@ class Callback:
         """Nothing is left to be told."""
 
 
+def listener_at(host: str, port: int) -> socket.socket:
+    """A socket that listens there, at any free port for 0.
+
+    Raises:
+        OSError: that names the place, if the port is taken.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        reason = error.strerror or error
+        raise OSError(f"cannot listen at {host}:{port}: {reason}; give another port") from None
+
+
 class LineServer:
     """A port on which programs connect to read lines. One that does not read is cut off.
 
@@ -258,12 +277,7 @@ class LineServer:
     """
 
     def __init__(self, host: str, port: int) -> None:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        try:
-            self._listener = socket.create_server((host, port), family=family)
-        except OSError as error:
-            reason = error.strerror or error
-            raise OSError(f"cannot listen at {host}:{port}: {reason}; give another port") from None
+        self._listener = listener_at(host, port)
         self._listener.setblocking(False)
         self.host, self.port = host, int(self._listener.getsockname()[1])
         self._readers: dict[socket.socket, bytearray] = {}
@@ -294,9 +308,35 @@ class LineServer:
 
 
 class FileSink(ABC):
-    """A sink whose file gets its name when it is closed; a ``with`` that raises leaves none."""
+    """A sink whose file gets its name when it is closed; a ``with`` that raises leaves none.
 
-    _stack: ExitStack
+    Args:
+        path: of the file.
+        ending: that it must have.
+        sample_rate_hz: of the stream.
+        is_live: whether the first sample is of now, where nobody tells times; else it is at 0.
+
+    Raises:
+        ValueError: if the path has another ending.
+    """
+
+    def __init__(self, path: Path, ending: str, sample_rate_hz: float, *, is_live: bool) -> None:
+        if path.suffix != ending:
+            raise ValueError(f"{path} must end in {ending}")
+        self._rate, self._is_live = sample_rate_hz, is_live
+        self._start_s: float | None = None  # since 1970, of the time 0 of a live stream
+        self._last_s = 0.0  # of the last sample
+        self._stack = ExitStack()
+
+    def _times_of(self, first: int, block: Block) -> Array:
+        """When the samples of a block were taken, ``[n]``, on the clock of the stream."""
+        times_s = block.time_s
+        if times_s is None:
+            times_s = (first + np.arange(len(block.samples))) / self._rate
+            if self._is_live and self._start_s is None:
+                self._start_s = time.time()
+        self._last_s = float(times_s[-1]) if len(times_s) else self._last_s
+        return times_s
 
     def __enter__(self) -> Self:
         return self
@@ -312,6 +352,17 @@ class FileSink(ABC):
     @abstractmethod
     def close(self) -> None:
         """Write what is left and give the file its name."""
+
+
+def truth_changes(recording: Recording | None) -> list[tuple[float, bool]]:
+    """Whether a recording slips from 0 s on, and from each change on; empty if nobody said."""
+    if recording is None or not has_truth(recording):
+        return []
+    slides = sorted((*recording.sliding_s, *recording.slip_s))
+    changes = [(0.0, any(start <= 0 for start, _ in slides))]
+    for start, end in slides:
+        changes += [(start, True), (end, False)]
+    return changes
 
 
 def alarm_text(alarm: Alarm) -> str:

@@ -20,11 +20,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from tactslip_torch.data.file_recordings import hand_file
-from tactslip_torch.data.folder import file_facts
-from tactslip_torch.data.formats import Reading, open_file, pieces
+from tactslip_torch.data.formats import Reading, pieces
 from tactslip_torch.data.formats._reading import needs
 from tactslip_torch.live.frames import FrameReader, Frames
-from tactslip_torch.live.sinks import Block, Event, Source
+from tactslip_torch.live.sinks import Block, Event, Source, listener_at
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.runtime import check_number
 
@@ -120,19 +119,19 @@ class _ByteSource(ABC):
                 is_told = True
 
     def _read(self, connection: _Connection) -> Generator[Block | Event, None, str]:
-        heard_s, is_silent = time.monotonic(), False
+        came_s, is_silent = time.monotonic(), False
         try:
             while not self._stopped.is_set():
                 data = connection.read()
                 if data is None:
                     return "the other side has closed the connection"
                 if data:
-                    heard_s = time.monotonic()
+                    came_s = time.monotonic()
                     if is_silent:
                         is_silent = False
                         yield Event("connected", f"{self.name}: samples come again")
                     yield from self._reader.feed(data)
-                elif not is_silent and time.monotonic() - heard_s > SILENT_S:
+                elif not is_silent and time.monotonic() - came_s > SILENT_S:
                     is_silent = True
                     self._reader.forget()
                     yield Event("waiting", f"{self.name}: connected, no sample for {SILENT_S:g} s")
@@ -289,11 +288,7 @@ class TcpListener(_ByteSource):
     """
 
     def __init__(self, host: str, port: int, frames: Frames, detector: SlipDetector) -> None:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        try:
-            self._listener = socket.create_server((host, port), family=family)
-        except OSError as error:
-            raise OSError(f"cannot listen at {host}:{port}: {_reason(error)}") from None
+        self._listener = listener_at(host, port)
         self.port = self._listener.getsockname()[1]
         super().__init__(f"listen:{host}:{self.port}", frames, detector)
         self._peer, self._is_told = "", False
@@ -384,11 +379,11 @@ class FileInTime:
         how, units = reading or Reading(), str(detector.info.get("units", "V"))
         self._given = (path, pool.hand, self._rate, how, units, tare_s)
         self._stopped = threading.Event()
-        with open_file(path, how) as opened:
-            self.simulated = bool(file_facts(path, opened.archived)["simulated"])
-            self.recording = opened.archived and opened.archived.recording
         with hand_file(*self._given) as opened:
+            self.recording = opened.archived and opened.archived.recording
             self.dtype = opened.samples.dtype
+        known = self.recording.provenance if self.recording else {}
+        self.simulated = bool(known.get("simulated"))
 
     def close(self) -> None:
         """End the iteration."""

@@ -24,6 +24,8 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
+from tactslip_torch.runtime import check_choice
+
 Align = Literal["centred", "causal", "trailing"]
 """Which part of its frame's polynomial a sample takes, and where the frame lies.
 
@@ -76,8 +78,7 @@ def reach(window_length: int, align: Align) -> tuple[int, int]:
         >>> reach(51, "centred"), reach(51, "causal"), reach(51, "trailing")
         ((25, 25), (50, 0), (50, 0))
     """
-    if align not in get_args(Align):
-        raise ValueError(f"align must be one of {', '.join(get_args(Align))}, got {align!r}")
+    check_choice("align", align, get_args(Align))
     half = window_length // 2
     return (half, half) if align == "centred" else (2 * half, 0)
 

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
-from tactslip_torch.features.bin_sample import SampledBins, bin_keys
+from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.calibration import ABSTENTION as ABSTAIN
 from tactslip_torch.model.calibration import Abstention, fit_platt
@@ -245,9 +245,7 @@ class Statistics:
                 sums.update(name, *gathered.bins[name])
         # of the sampled bins those that were trained on
         fraction = torch.tensor(plan.fractions, dtype=torch.float64)[sample.is_slip.long()]
-        most = int(sample.bin_index.max()) + 1
-        keys = torch.stack([bin_keys(name, most) for name in sample.recording_names])
-        kept = (fraction >= 1) | (keys[sample.recording, sample.bin_index] < fraction)
+        kept = (fraction >= 1) | (sample.keys < fraction)
         rehearsal = KnownBins(
             plan.selection(sample.features[kept]),
             sample.is_slip[kept],

@@ -37,7 +37,7 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.native import BackendName, backend_of
 from tactslip_torch.report.metrics import merged_answers, merged_metrics, summed_metrics
-from tactslip_torch.runtime import LEAD, Progress, __version__, whole_file
+from tactslip_torch.runtime import LEAD, Progress, __version__, check_choice, whole_file
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
 from tactslip_torch.training.datamodule import FeatureMaker
@@ -81,8 +81,6 @@ def merged_results(
     }
 
 
-MOST_LEVELS = 4
-"""Wavelet levels of the paper, and of ``features.level=null`` at most."""
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
@@ -119,18 +117,24 @@ def feature_maker(
         ValueError: if a kind of channel has no frame, a statistic is unknown, a bin
             allows no such level, or a value is none that exists.
     """
-    if dtype not in DTYPES:
-        raise ValueError(f"features.dtype must be one of {', '.join(DTYPES)}, got {dtype!r}")
+    check_choice("features.dtype", dtype, DTYPES)
     if pooling is not None:
         statistics_of(pooling, len(source.hand))
     lengths = frame_lengths(source.hand, frames)
     bin_samples = round(rule.bin_ms * source.sample_rate_hz / 1000)
+    highest = highest_level(bin_samples, wavelet)
+    if level is not None and (not isinstance(level, int) or not 1 <= level <= highest):
+        raise ValueError(
+            f"features.level must lie in 1..{highest} for bins of {bin_samples} samples and "
+            f"features.wavelet={wavelet}, got {level!r}; give fewer levels, longer bins "
+            "(labels.bin_ms), or null for as many as there can be"
+        )
     pool = FeaturePool(
         source.hand,
         source.sample_rate_hz,
         bin_samples=bin_samples,
         wavelet=wavelet,
-        level=_checked_level(level, bin_samples, wavelet),
+        level=level,
         spectrum=spectrum,
         arithmetic="native" if dtype == "float32" else "double",
         backend=backend,
@@ -163,20 +167,6 @@ def frame_lengths(hand: HandLayout, frames: Mapping[str, int | None]) -> list[in
                 f"channels unfiltered, got {length!r}"
             )
     return [int(lengths[channel.kind] or 1) for channel in hand.channels]
-
-
-def _checked_level(level: int | None, bin_samples: int, wavelet: str) -> int:
-    """``features.level`` for bins of such a length."""
-    highest = highest_level(bin_samples, wavelet)
-    if level is None:
-        return min(MOST_LEVELS, highest)
-    if not isinstance(level, int) or not 1 <= level <= highest:
-        raise ValueError(
-            f"features.level must lie in 1..{highest} for bins of {bin_samples} samples and "
-            f"features.wavelet={wavelet}, got {level!r}; give fewer levels, longer bins "
-            "(labels.bin_ms), or null for as many as there can be"
-        )
-    return level
 
 
 def features_of(

@@ -564,13 +564,11 @@ class SimpleStatistics:
     """
 
     def __init__(self, pool: FeaturePool) -> None:
-        place = {name: index for index, name in enumerate(pool.names)}
-
         def of(channels: tuple[int, ...], component: str, descriptor: str) -> list[int]:
-            names = (
-                FeatureName(pool.hand.names[c], component, "time", descriptor) for c in channels
+            hand = pool.hand.names
+            return pool.places(
+                FeatureName(hand[c], component, "time", descriptor) for c in channels
             )
-            return [place[name] for name in names]
 
         self.num_samples = pool.bin_samples
         slow, fast = pool.hand.slow, pool.hand.fast
@@ -767,10 +765,10 @@ class PooledNumber:
         names = [pool.names[place] for place in places.tolist()]
         features = sample.features[:: -(-len(sample.features) // CONSTANT_BINS)][:, places]
         layer = ChannelPooling.fit(pool.hand, names, features, ["mean", "std"])
-        columns = layer(sample.features[:, _places(pool, layer)].double())
+        columns = layer(sample.features[:, pool.places(layer.inputs)].double())
         rule = best_threshold(columns, sample.is_slip, sample.sample_weight)
         layer = layer.select([rule.index])
-        return cls(layer, tuple(_places(pool, layer)), replace(rule, index=0))
+        return cls(layer, tuple(pool.places(layer.inputs)), replace(rule, index=0))
 
     @property
     def name(self) -> FeatureName:
@@ -800,7 +798,7 @@ class PooledNumber:
         }
         layer = ChannelPooling.from_dict(pool.hand, plain, constants)
         rule = FeatureThreshold(0, plain["threshold"], plain["sign"])
-        return cls(layer, tuple(_places(pool, layer)), rule)
+        return cls(layer, tuple(pool.places(layer.inputs)), rule)
 
 
 Method = LogisticRegression | RandomForest | PooledNumber
@@ -879,8 +877,3 @@ class Baselines:
     def from_dict(cls, pool: FeaturePool, plain: Mapping[str, Any]) -> Baselines:
         """The baselines that ``to_dict`` kept."""
         return cls(pool, PooledNumber.from_dict(pool, plain[POOLED_NUMBER]))
-
-
-def _places(pool: FeaturePool, layer: ChannelPooling) -> list[int]:
-    place = {name: index for index, name in enumerate(pool.names)}
-    return [place[name] for name in layer.inputs]

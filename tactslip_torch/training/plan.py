@@ -47,7 +47,7 @@ from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
-from tactslip_torch.runtime import SeenBatches, Ticker, bar, content_digest, for_each
+from tactslip_torch.runtime import SeenBatches, bar, check_choice, content_digest, for_each, steps
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.recipe import (
     FeatureSelection,
@@ -287,11 +287,11 @@ def choose_model(
     folds = [frozenset([group]) for group in groups]
     if is_nested := is_nested and len(groups) > 2:
         folds += [frozenset(pair) for pair in itertools.combinations(groups, 2)]
-    with Ticker("validation, groups left out", "step", len(folds), show=show) as ticker:
+    with steps("validation, groups left out", "step", len(folds), show=show) as shown:
 
         def leave_out(fold: frozenset[int]) -> None:
             bins.leave_out(fold, structures, recipe.penalties_ascending)
-            ticker.tick()
+            shown.update()
 
         for_each(leave_out, folds)
     edge = _extend_grid(bins)
@@ -990,8 +990,7 @@ class Abstaining:
     def __post_init__(self) -> None:
         if self.coverage is not None:
             check_coverage(self.coverage)
-        if self.left_out not in get_args(LeftOut):
-            raise ValueError(f"coverage_by must be recording or group, got {self.left_out!r}")
+        check_choice("coverage_by", self.left_out, get_args(LeftOut))
 
     def settle(self, plan: Plan, sample: SampledBins) -> Plan:
         """The plan with thresholds; as it is, and with a warning, where there are too few."""

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from tactslip_torch.data.splits import Split
-from tactslip_torch.features.bin_sample import SampledBins, bin_keys
+from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.ops import signed_log
 from tactslip_torch.model.calibration import Platt, fit_platt
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine, held_out_scores
@@ -238,12 +238,7 @@ def tuning_bins(
         weights: of sampled bins, ``[n]``; the total of each class is kept.
         most: bins of each group and class.
     """
-    keys = torch.zeros(len(sample.is_slip), dtype=torch.float64)
-    for place, name in enumerate(sample.recording_names):
-        own = sample.recording == place
-        index = sample.bin_index[own]
-        keys[own] = bin_keys(name, int(index.max()) + 1)[index]
-    order = keys.argsort(stable=True)
+    order = sample.keys.argsort(stable=True)
     strata = (2 * sample.group + sample.is_slip)[order]
     kept = [order[strata == stratum][:most] for stratum in strata.unique()]
     rows = torch.cat(kept).sort().values

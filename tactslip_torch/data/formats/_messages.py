@@ -332,7 +332,7 @@ class _TopicSamples:
         self.topic, self.names = self._of.topic, self._of.names
         self.checksum = 0
         num_columns = self._of.rows(first.content)[0].shape[1]
-        self._spool = Spool(num_columns, "f4" if self._of.is_small else "f8", stack)
+        self.spool = Spool(num_columns, "f4" if self._of.is_small else "f8", stack)
         self._logged, self._stamps, self._counts = (array("q") for _ in range(3))
         self._named: list[Any] = []  # the times that ``how`` names
 
@@ -343,7 +343,7 @@ class _TopicSamples:
             Refused: if it is damaged or holds other channels than the first.
         """
         rows, stamp, named = self._of.rows(message.content)
-        self._spool.add(rows)
+        self.spool.add(rows)
         self.checksum = zlib.crc32(message.content, self.checksum)
         self._logged.append(message.log_time)
         self._counts.append(len(rows))
@@ -352,16 +352,12 @@ class _TopicSamples:
         if self._of.is_timed:
             self._named.append(named)
 
-    def rows(self) -> NDArray[Any]:
-        """All samples ``[T, C]`` in the order of the file."""
-        return self._spool.array()
-
     def ordered(self) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
         """All samples ``[T, C]`` in the order of their times, and these in seconds.
 
         No times if nobody asks for them, or of a single block where nobody gives the rate.
         """
-        rows, times, counts = self.rows(), self._message_times(), np.array(self._counts)
+        rows, times, counts = self.spool.array(), self._message_times(), np.array(self._counts)
         if (np.diff(times) < 0).any():
             order = np.argsort(times, kind="stable")
             starts = np.cumsum(counts) - counts  # the first row of each message
@@ -447,7 +443,7 @@ def opened_messages(
         if checksum is not None and checksum != checksum_text(topic.checksum if topic else 0):
             raise ValueError("the messages fail their checksum")
         nothing = np.empty((0, header["shape"][0]))
-        return opened_from(header, path, topic.rows() if topic else nothing)
+        return opened_from(header, path, topic.spool.array() if topic else nothing)
     topic, others = _read_topic(messages, how, stack)
     if topic is not None:
         rows, seconds = topic.ordered()

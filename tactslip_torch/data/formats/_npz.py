@@ -27,15 +27,14 @@ from numpy.typing import NDArray
 from tactslip_torch.data.formats._choice import Array, choose, why_not_numbers
 from tactslip_torch.data.formats._reading import (
     FORM,
-    MOMENTS,
     MOST_CHANNELS,
-    STRETCHES,
     Opened,
     Reading,
     Refused,
     check_plausible,
     opened_from,
 )
+from tactslip_torch.data.recording import MOMENTS, STRETCHES
 
 _LOCAL_HEADER = struct.Struct("<26xHH")  # of a ZIP member: lengths of its name and extra field
 _MOST_BESIDE = 16 * 2**20  # bytes of a member of ours that is read whole: names, numbers, JSON

@@ -22,9 +22,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactslip_torch.data.recording import Recording
+from tactslip_torch.data.recording import MOMENTS, STRETCHES, Recording
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.runtime import check_number
+from tactslip_torch.runtime import check_choice, check_number
 
 # Limits, and faults in one line -----------------------------------------------------------------
 
@@ -170,19 +170,18 @@ class Reading:
             if (value := getattr(self, name)) is not None or name != "sample_rate_hz":
                 check_number(f"reading.{name}", value)
         check_number("reading.samples_per_row", self.samples_per_row, whole=True)
-        units, columns, mark = get_args(TimeUnit), self.channels, self.delimiter
-        speeds, orders = get_args(SpeedUnit), get_args(RowOrder)
+        check_choice("reading.time_unit", self.time_unit, SECONDS)
+        check_choice("reading.speed_unit", self.speed_unit, MM_S)
+        check_choice("reading.row_order", self.row_order, (*get_args(RowOrder), None))
+        columns, mark = self.channels, self.delimiter
         is_list = isinstance(columns, Sequence) and not isinstance(columns, str) and bool(columns)
         is_mark = mark is None or (isinstance(mark, str) and len(mark) == 1)
         for name, is_right, wanted in (
-            ("time_unit", self.time_unit in units, f"one of {', '.join(units)}"),
             ("samples", isinstance(self.samples, str | None), "the name of an array or topic"),
             ("time_first", self.time_first in (True, False, None), "true, false or null"),
             ("isolate", isinstance(self.isolate, bool), "true or false"),
             ("time", self.time is None or _is_column(self.time), "a name, a number or null"),
             ("speed", self.speed is None or _is_column(self.speed), "a name, a number or null"),
-            ("speed_unit", self.speed_unit in speeds, f"one of {', '.join(speeds)}"),
-            ("row_order", self.row_order in (*orders, None), f"one of {', '.join(orders)}, null"),
             ("delimiter", is_mark, "one character"),
             (
                 "channels",
@@ -435,8 +434,6 @@ FORM = "tactslip_torch recording 1"
 MOST_HEADER = 16 * 2**20
 """Bytes of header text; a longer one is no header of ours."""
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
-MOMENTS = ("speeds_mm_s", "onsets_s", "annotated_onsets_s")
-STRETCHES = ("sliding_s", "non_slip_s", "slip_s", "released_s")
 
 
 def header_of(recording: Recording, hand: HandLayout, key: Mapping[str, Any]) -> dict[str, Any]:
