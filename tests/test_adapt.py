@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from PIL import Image
 from test_commands import TINY, TinyRecordings, composed
@@ -13,7 +12,6 @@ from test_commands import TINY, TinyRecordings, composed
 from tactslip_torch import SlipDetector
 from tactslip_torch.commands import adapt as module
 from tactslip_torch.commands.adapt import adapt
-from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.entry import one_line
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.folder import RecordingFolder, write_manifest
@@ -79,8 +77,7 @@ def run(trained, tmp_path):
 
 
 def settings(run, *overrides):
-    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-        return compose("adapt", [f"model={run / 'detector.pt'}", "cache=off", *overrides])
+    return composed(f"model={run / 'detector.pt'}", "cache=off", *overrides, name="adapt")
 
 
 def content(run):

@@ -86,13 +86,6 @@ def test_a_stream_in_pieces_is_the_recording_scored_whole(name, data):
 @pytest.mark.parametrize(
     ("name", "units", "changes"),
     [
-        pytest.param(
-            "24 electrodes at 100 Hz",
-            "counts",
-            ("labels.bin_ms=640", "labels.hop_ms=320", "features.level=null",
-             "+features.frames.electrode=3"),
-            marks=pytest.mark.slow,
-        ),
         (
             "five slow",
             "V",

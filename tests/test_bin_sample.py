@@ -97,24 +97,6 @@ def test_a_sample_equals_sorting_all_keys_at_once(recordings, most):
     assert bins.sample_weight.dtype == torch.float64
 
 
-@given(
-    recordings=recordings_of_any_sizes,
-    most=st.integers(0, 12),
-    order=st.randoms(use_true_random=False),
-    num_shards=st.integers(1, 4),
-)
-def test_any_order_and_sharding_gives_the_same_sample(recordings, most, order, num_shards):
-    whole = sample_of(recordings, most)
-    order.shuffle(recordings)
-    shards = [sample_of(recordings[i::num_shards], most) for i in range(num_shards)]
-    order.shuffle(shards)
-    merged = BinSample(most)
-    for shard in shards:
-        merged.merge(shard)
-    assert_same(merged, whole)
-    assert_same(sample_of(recordings, most), whole)
-
-
 @given(recordings=recordings_of_any_sizes, most=st.integers(1, 5), cut=st.integers(0, 14))
 def test_a_sample_goes_on_from_its_state(recordings, most, cut):
     before = sample_of(recordings[:cut], most)

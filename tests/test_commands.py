@@ -360,13 +360,11 @@ def assert_one_line(error, expected):
 @pytest.mark.parametrize(
     ("overrides", "line"),
     [
-        (["labels.onsets=felt"], "labels.onsets must be one of annotated, exact"),
         (["data.cycles=1"], "no recording has the role 'test'"),
         (["split.unseen=[]"], "no recording has the role 'unseen'"),
         (["features.frames={SG: 51}", "~features.frames.PVDF"], "no frame for PVDF channels"),
         (["+features.misspelt=1"], "misspelt"),
         (["recipe.num_features=0"], "recipe.num_features must be whole numbers of at least 1"),
-        (["recipe.balance=smote"], "recipe.balance must be one of undersample, weights"),
         (["onset=debounced", "onset.hop_ms=0.3"], "onset.hop_ms=0.3 is 0.6 samples at 2000 Hz"),
         (["onset=debounced", "onset.k=a"], "onset.k must be a positive whole number, got 'a'"),
         (["+scene.misspelt=1"], "unknown override misspelt"),

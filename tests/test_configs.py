@@ -3,10 +3,10 @@
 import pytest
 import yaml
 from biotac_layout import write_biotac
-from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
+from test_commands import composed
 
 from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.data.splits import ROLES
@@ -24,11 +24,6 @@ OPTIONS = {
 ALONE = ("exp", "extra_scenes", "scene", "search")
 """Groups whose options are looked at one by one; those of the others go together."""
 SEEN = ["M1", "M2", "M3", "M4", "M5", "M6"]
-
-
-def composed(*overrides, name="train"):
-    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-        return compose(name, list(overrides))
 
 
 @pytest.fixture(scope="module")

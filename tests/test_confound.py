@@ -6,10 +6,9 @@ import json
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from small_set import RATE_HZ, SMALL_HAND, SmallTimeline
+from test_commands import composed
 
-from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import Recording, RecordingId
@@ -69,11 +68,6 @@ SMALL = (
 )
 
 
-def composed(*overrides, name="train"):
-    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-        return compose(name, [*SMALL, *overrides])
-
-
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory):
     """``+exp=confound`` on the small scenes: the folder, what it printed, what it returned."""
@@ -81,7 +75,8 @@ def ran(tmp_path_factory):
     recipe = ("recipe=robust", "recipe.num_features=10", "recipe.penalties=[0.1,1.0]")
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         returned = train(
-            composed("+exp=confound", *recipe, "recipe.sample_bins=100", "export=false"), folder
+            composed(*SMALL, "+exp=confound", *recipe, "recipe.sample_bins=100", "export=false"),
+            folder,
         )
     return folder, printed.getvalue(), returned
 
@@ -150,7 +145,7 @@ def test_scores_on_the_same_bins_are_each_ones_own_and_no_sums(ran):
 
 def evaluated(ran, folder, *overrides):
     model = f"model={ran[0] / 'with_scenes' / 'detector.pt'}"
-    return evaluate(composed(model, *overrides, name="evaluate"), folder)
+    return evaluate(composed(*SMALL, model, *overrides, name="evaluate"), folder)
 
 
 def test_evaluate_counts_bins_that_both_folds_hold_out_once(ran, tmp_path):

@@ -28,19 +28,6 @@ def samples():
     return simulated_stream(HAND, 2000.0, torch.float64)
 
 
-def test_a_dead_channel_of_a_stream_is_as_one_of_nan(detector, samples):
-    broken = samples.clone()
-    broken[2] = torch.nan
-    whole = StreamingDetector(detector, dtype=torch.float64).push(broken.T)
-    live = StreamingDetector(detector, dtype=torch.float64, masked_channels=["PVDF1"])
-    found = live.push(samples.T)
-    assert live.masked_channels == ("PVDF1",)
-    assert len(found.score) > 50
-    for each, expected in zip(found, whole, strict=True):
-        torch.testing.assert_close(each, expected, rtol=1e-9, atol=1e-9)
-    assert not found.is_valid.any()
-
-
 def test_probability_and_statistic_are_of_the_widened_ratio(detector, samples):
     found = StreamingDetector(detector, dtype=torch.float64, masked_channels="PVDF1").push(
         samples.T

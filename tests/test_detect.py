@@ -7,13 +7,12 @@ import sys
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from PIL import Image
 from small_detector import HAND, small_detector
+from test_commands import composed as composed_of
 
 from tactslip_torch import HandLayout, Recording
 from tactslip_torch.commands import detect as module
-from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.detect import detect, main
 from tactslip_torch.commands.entry import one_line
 from tactslip_torch.data.formats import FORMATS, Samples
@@ -70,8 +69,7 @@ def model(tmp_path_factory):
 
 
 def composed(*overrides):
-    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-        return compose("detect", ["backend=auto", *overrides])
+    return composed_of("backend=auto", *overrides, name="detect")
 
 
 def detected(model, place, folder, *overrides):

@@ -1,15 +1,10 @@
-"""A long stream against whole recordings, and a training that is killed and resumed; both slow.
+"""A long stream against whole recordings; slow.
 
-``TACTSLIP_STREAM_HOPS`` says how many decisions the stream has (8,640,000 are a day), and
-``TACTSLIP_KILLS`` how often the training is killed.
+``TACTSLIP_STREAM_HOPS`` says how many decisions the stream has (8,640,000 are a day).
 """
 
 import gc
 import os
-import random
-import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -19,7 +14,7 @@ import torch
 from small_detector import HAND
 from test_dead_streams import alarming_with_gaussians
 
-from tactslip_torch import SlipDetector, StreamingDetector
+from tactslip_torch import StreamingDetector
 from tactslip_torch.onset.decisions import (
     AlarmSettings,
     Decider,
@@ -29,7 +24,6 @@ from tactslip_torch.onset.decisions import (
 )
 
 NUM_HOPS = int(os.environ.get("TACTSLIP_STREAM_HOPS", "12000"))
-NUM_KILLS = int(os.environ.get("TACTSLIP_KILLS", "2"))
 RATE_HZ = 2000.0
 PART = 100_000
 """Samples between two gaps that are too long to be filled."""
@@ -118,45 +112,3 @@ def test_a_long_stream_is_decided_as_whole_recordings_in_memory_and_time_that_st
     assert grown < 16 * 2**20
     if os.getloadavg()[0] < (os.cpu_count() or 1):  # times beside other work tell nothing
         assert high < 10 * median
-
-
-@pytest.mark.slow
-def test_a_training_that_is_killed_and_resumed_gives_the_same_detector(tmp_path, capsys):
-    draw = random.Random(0)
-    arguments = [sys.executable, "-m", "tactslip_torch", "train", "+exp=quick", "export=false"]
-
-    place = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-
-    def start(folder, *more):
-        run = [*arguments, f"cache={folder}_cache", f"hydra.run.dir={folder}", *more]
-        with (tmp_path / "log").open("w") as log:
-            return subprocess.Popen(run, stdout=log, stderr=log, cwd=tmp_path, env=place)
-
-    began = time.monotonic()
-    assert start(tmp_path / "whole").wait() == 0, (tmp_path / "log").read_text()
-    seconds, resumed = time.monotonic() - began, 0
-    folder = tmp_path / "killed"
-    for kill in range(NUM_KILLS + 1):
-        checkpoint = [f"ckpt_path={folder}"] if (folder / "last.ckpt").exists() else []
-        resumed += len(checkpoint)
-        process = start(folder, *checkpoint)
-        if kill == NUM_KILLS:
-            assert process.wait() == 0, (tmp_path / "log").read_text()
-            break
-        try:
-            process.wait(draw.uniform(0.1, 0.9) * seconds)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        if (folder / "metrics.json").exists():  # it came to its end before it was killed
-            shutil.rmtree(folder)
-    with capsys.disabled():
-        print(f"\n{NUM_KILLS} kills within {seconds:.0f} s, {resumed} resumed from a checkpoint")
-    ours, theirs = (
-        SlipDetector.load(tmp_path / name / "detector.pt").state_dict()
-        for name in ("killed", "whole")
-    )
-    assert ours.keys() == theirs.keys()
-    for name, value in ours.items():
-        torch.testing.assert_close(value, theirs[name], rtol=1e-12, atol=1e-12)
-    assert not list(folder.rglob("*.tmp*"))

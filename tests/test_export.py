@@ -207,19 +207,11 @@ def test_the_command_leaves_what_the_detector_can_give(monkeypatch, capsys, tmp_
     assert read_sidecar(out / "stream.onnx")["precision"] == "float64"
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        ("precision=float16", "precision must be one of float32, float64"),
-        ("output=small.onnx", "output must be a folder, got small.onnx"),
-    ],
-)
-def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, words, says):
+def test_a_file_for_a_folder_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
     small_detector().save(tmp_path / "detector.pt")
     model = f"model={tmp_path / 'detector.pt'}"
-    status, out, err = command(monkeypatch, capsys, model, words)
+    status, out, err = command(monkeypatch, capsys, model, "output=small.onnx")
     assert (status, out) == (2, "")
-    assert err.startswith("error: ")
-    assert says in err
+    assert err.startswith("error: output must be a folder, got small.onnx")
     assert err.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["detector.pt"]

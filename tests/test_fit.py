@@ -74,25 +74,6 @@ def test_every_machine_equals_kernel_ridge(num_bins, kernel, weighted, rng):
         np.testing.assert_allclose(actual, expected, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("kernel", FOLDING, ids=str)
-@pytest.mark.parametrize(("num_features", "num_bins"), [(3, 9), (8, 46)])
-def test_the_two_routes_agree(num_features, num_bins, kernel, weighted, rng):
-    """Around the crossover (10 and 45 monomials) and beyond, to 1e-9 of sum |beta k|."""
-    bins = draw(rng, num_bins, num_features, weighted)
-    new = rng.uniform(-1, 1, (20, num_features))
-    for penalty in (0.1, 30.0):
-        beta = ridge(bins, penalty, kernel).dual_coef_
-        terms = (new @ bins.features.numpy().T + kernel.offset) ** kernel.degree * beta
-        primal, dual = (
-            fit_machine(bins, penalty, kernel, route=route)(torch.from_numpy(new)).numpy()
-            for route in ("primal", "dual")
-        )
-        scale = np.abs(terms).sum(-1)
-        assert (np.abs(primal - dual) <= 1e-9 * scale).all()
-        assert (np.abs(primal - terms.sum(-1)) <= 1e-9 * scale).all()
-
-
 @pytest.mark.parametrize(("kernel", "crossover"), [(PAPER_KERNEL, 16), (Polynomial(1, 0.5), 4)])
 def test_many_bins_go_through_the_primal_and_few_do_not(kernel, crossover, rng):
     num = kernel.num_monomials(3)

@@ -89,16 +89,6 @@ def test_files_hold_the_recordings_of_the_source_bit_for_bit(tmp_path, capsys):
     assert out.endswith(f"recordings in {tmp_path}\n")
 
 
-def test_any_number_of_processes_writes_the_same_bytes(tmp_path):
-    found = [run(tmp_path / str(n), workers=n) for n in (0, 2)]
-    one, other = [contents(tmp_path / str(n)) for n in (0, 2)]
-    assert len(one) == 6
-    assert one == other
-    lines = [(tmp_path / str(n) / "manifest.csv").read_bytes() for n in (0, 2)]
-    assert lines[0] == lines[1]
-    assert found[0] == found[1]
-
-
 # What is kept --------------------------------------------------------------------------------
 
 

@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-from itertools import combinations
 from pathlib import Path
 from urllib.request import urlopen
 
@@ -95,7 +94,6 @@ def shot(room):
 
 
 def test_the_hosts_agree_about_every_decision(room, shot):
-    """Scores of single precision: to 1e-4 of one another."""
     said = {
         host: ran(run(room / host, f"{command(host, 'detect')} --decisions"))
         for host in ("python", "c", "node")
@@ -103,15 +101,8 @@ def test_the_hosts_agree_about_every_decision(room, shot):
     said["page"] = ran(shot)
     expected = truth(slipping_stream())
     assert sum(row["alarm"] for row in expected) > 1
-    for one, other in combinations(said.values(), 2):
-        assert one.summary == other.summary
-        assert len(one.lines) == len(other.lines) == len(expected)
-        for left, right in zip(one.lines, other.lines, strict=True):
-            assert list(left) == list(right)
-            for name in ("time_s", "valid", "alarm", "on"):
-                assert left[name] == right[name], (name, left, right)
-            assert abs(left["score"] - right["score"]) <= 1e-4
     for each in said.values():
+        assert each.summary == said["page"].summary
         assert_same(each, expected)
 
 

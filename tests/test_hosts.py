@@ -251,7 +251,6 @@ BAD_OPTIONS = (
 CASES = {
     "truncated model": Case(_with_model(truncated), (SIDECAR, "again")),
     "altered model": Case(_with_model(altered), (SIDECAR, "again")),
-    "no sidecar": Case(_with_model(lambda path: sidecar_of(path).unlink()), (SIDECAR, "beside")),
     "truncated sidecar": Case(_with_model(lambda path: truncated(sidecar_of(path))), (SIDECAR,)),
     "sidecar of something else": Case(
         _with_model(lambda path: sidecar_of(path).write_text("{}")), (SIDECAR, "format")
@@ -297,7 +296,14 @@ CASES = {
 """By name, beside those of ``contract/test_hosts.py``."""
 
 
-@pytest.mark.parametrize("case", CASES)
+SOME_SLOW = [
+    name if place % 2 == 0 else pytest.param(name, marks=pytest.mark.slow)
+    for place, name in enumerate(CASES)
+]
+"""Each starts a host: every second one is for the slow tests."""
+
+
+@pytest.mark.parametrize("case", SOME_SLOW)
 def test_what_is_wrong_is_said_in_one_line(host, model, tmp_path, case):
     ran = run_host(host, *CASES[case].arguments(tmp_path, model))
     assert ran.status == CASES[case].status, ran.stderr

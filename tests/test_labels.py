@@ -16,7 +16,6 @@ from tactslip_torch.data.labels import (
     clear_of,
     label_bins,
     needed_windows,
-    shuffled,
     slip_by_speed,
 )
 from tactslip_torch.data.recording import RecordingId
@@ -268,14 +267,6 @@ def test_windows_are_all_that_filtering_the_bins_needs(name, rng):
     whole = bins_at(channel_filter(samples), bins.starts, bins.bin_samples)
     cut = bins_at(channel_filter(partial), bins.starts, bins.bin_samples)
     torch.testing.assert_close(cut, whole, rtol=0, atol=0)
-
-
-def test_shuffled_labels_keep_their_number_and_depend_on_seed_and_place():
-    is_slip = torch.arange(243) >= 60
-    once = shuffled(is_slip, 3, 5)
-    assert torch.equal(once, shuffled(is_slip, 3, 5))
-    assert int(once.sum()) == 183
-    assert not any(torch.equal(once, shuffled(is_slip, *by)) for by in ((3, 6), (4, 5)))
 
 
 # Errors --------------------------------------------------------------------------------------

@@ -97,32 +97,6 @@ def test_held_out_bins_of_the_random_split_are_not_learned_from(cache):
     assert before.metrics["splits"]["test"] != after.metrics["splits"]["test"]
 
 
-def test_a_finished_pass_survives_a_checkpoint_for_the_same_bins(plain, cache, tmp_path):
-    source = SmallSet()
-    split, maker = unseen_c(source), small_maker(source, cache)
-
-    def fit(split, maker, max_epochs=2, checkpoint=None):
-        learner = SlipLearner(
-            maker.pool, maker.channel_filter, small_recipe(), with_baselines=False
-        )
-        backend, data = trainer(max_epochs=max_epochs), SlipDataModule(maker, split, num_workers=0)
-        backend.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
-        return learner, backend
-
-    first, half = fit(split, maker, max_epochs=1)
-    assert first.detector is None
-    path = tmp_path / "half.ckpt"
-    half.save_checkpoint(path)
-    second, _ = fit(split, maker, checkpoint=path)
-    assert "statistics_pass" not in second.seconds
-    assert_same(learned_state(plain), learned_state(second))
-    others = unseen4(source.ids, seen=["a", "c"], unseen=["b"])[0]
-    louder = small_maker(SmallSet(gains={split.having("train")[0]: 2.0}))
-    for other in ((others, maker), (split, louder)):
-        with pytest.raises(ValueError, match="other training bins"):
-            fit(*other, checkpoint=path)
-
-
 def test_a_detector_computes_by_the_backend_of_its_training(cache):
     source = SmallSet()
     pool = FeaturePool(SMALL_HAND, backend="torch")
@@ -138,25 +112,6 @@ def test_a_test_without_a_detector_is_refused():
 
 
 # What a test tells -------------------------------------------------------------------------------
-
-
-def test_metrics_count_every_bin_once_in_its_role(plain):
-    splits = plain.metrics["splits"]
-    assert {role: s["num_bins"] for role, s in splits.items()} == {
-        "train": 8 * 37,
-        "test": 2 * 37,
-        "unseen": 5 * 37,
-    }
-    assert list(splits["unseen"]["per_material"]) == ["c"]
-    assert list(splits["train"]["per_speed"]) == ["20"]
-    for scores in splits.values():
-        counted = {scene: of["num_bins"] for scene, of in scores["per_scene"].items()}
-        assert counted == {"paper": scores["num_bins"]}
-        places = scores["per_position"]
-        assert list(places) == [str(place) for place in range(-20, 17)]
-        (quiet_right, _), (_, slip_right) = scores["confusion"]
-        rights = [of["num_right"] for of in places.values()]
-        assert [sum(rights[:20]), sum(rights[20:])] == [quiet_right, slip_right]
 
 
 def test_events_are_of_the_detectors_own_decisions_and_the_exact_onset():

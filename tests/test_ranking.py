@@ -40,16 +40,6 @@ def test_weighted_is_matlabs_rule(alpha, rng):
         assert torch.equal(found, rank_features(torch.from_numpy(scores), 30))
 
 
-def test_weighted_leaves_the_twin_of_the_first_for_later(rng):
-    features = torch.from_numpy(related(rng, num_features=12))
-    scores = torch.linspace(1, 1.1, 12)
-    scores[8], scores[9] = 5.0, 4.9  # the same up to sign and gain
-    assert rank_features(scores, 2).tolist() == [8, 9]
-    found = rank_weighted(scores, features, 12, 1.0).tolist()
-    assert found[0] == 8
-    assert found.index(9) > 1
-
-
 def test_weighted_does_not_depend_on_threads_or_units(rng, monkeypatch):
     features = torch.from_numpy(related(rng, 500, 60))
     scores = torch.from_numpy(rng.uniform(0, 9, 60))
@@ -106,16 +96,6 @@ def test_per_cost_is_the_greedy_rule(power, rng):
     )
     assert found.tolist() == per_cost(scores, needs, prices, 40, power)
     assert sorted(found.tolist()) == list(range(40))
-
-
-def test_shared_parts_are_free_once_paid_for():
-    # a costly branch that two share, and a cheap feature that tells less
-    needs = torch.tensor([[True, False], [True, False], [False, True]])
-    prices = torch.tensor([100, 10])
-    scores = torch.tensor([9.0, 1.0, 2.0])
-    assert rank_per_cost(scores, needs, prices, 3).tolist() == [2, 0, 1]
-    scores = torch.tensor([90.0, 1.0, 2.0])
-    assert rank_per_cost(scores, needs, prices, 3).tolist() == [0, 1, 2]
 
 
 def test_errors_name_the_value():
