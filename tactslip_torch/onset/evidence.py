@@ -320,14 +320,7 @@ class OnsetClassifier:
             - samples: ``[C, T]``
             - output: ``[T // hop_samples]``, float64
         """
-        evidence = self.evidence
-        num = samples.shape[-1] // evidence.hop_samples
-        score = torch.full((MEAN_HOPS - 1 + num,), math.nan, dtype=torch.float64)
-        if (silent := evidence.first_hop) < num:
-            with torch.no_grad():
-                made = self.score(evidence.blocks_of_recording(samples))
-                score[MEAN_HOPS - 1 + silent :] = made
-        return torch.from_numpy(_mean_of_hops(score.numpy()))
+        return OnsetStream(self).push(samples)
 
     def to_dict(self) -> dict[str, Any]:
         """The classifier as plain JSON types, without hand and sample rate."""
