@@ -9,8 +9,8 @@ from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import (
     Split,
     confound,
+    evaluated_once,
     have_same_bins,
-    judged_once,
     leave_one_material_out,
     leave_one_session_out,
     random_bins,
@@ -163,13 +163,13 @@ def test_one_detector_meets_a_recording_once_in_each_role(rivals):
     folds = confounded() if rivals else plain
     assert have_same_bins(folds) == rivals
     assert have_same_bins([*folds, Split("again", folds[1].roles)])
-    kept = judged_once(folds)
+    kept = evaluated_once(folds)
     pairs = [pair for fold in kept for pair in fold.roles.items()]
     assert len(pairs) == len(set(pairs)) < sum(len(fold.roles) for fold in folds)
     assert set(pairs) == {pair for fold in folds for pair in fold.roles.items()}
-    assert judged_once([*folds, folds[0]]) == kept  # nothing is left of the last one
+    assert evaluated_once([*folds, folds[0]]) == kept  # nothing is left of the last one
     by_bin = random_bins(recordings(), seen=SEEN) * 2
-    assert judged_once(by_bin) == by_bin  # their draws hang on all of their recordings
+    assert evaluated_once(by_bin) == by_bin  # their draws hang on all of their recordings
 
 
 # Errors --------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
-from tactslip_torch.data.splits import Split, judged_once
+from tactslip_torch.data.splits import Split, evaluated_once
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.report.results import print_results, write_results
@@ -62,7 +62,7 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     results: dict[str, dict[str, Any]] = {}
     with feature_cache(config.cache) as cache:
         maker = features_of(detector, source, rule, cache)
-        once = judged_once(folds)
+        once = evaluated_once(folds)
         for fold in once:
             learner = SlipLearner(maker.pool, maker.channel_filter, detector=detector)
             place = folder if len(once) == 1 else folder / fold.name  # each its own logs

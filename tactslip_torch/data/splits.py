@@ -223,7 +223,7 @@ def have_same_bins(folds: Sequence[Split]) -> bool:
     return len(set(held_out)) < len(held_out) or len(set(unseen)) < len(unseen)
 
 
-def judged_once(folds: Sequence[Split]) -> list[Split]:
+def evaluated_once(folds: Sequence[Split]) -> list[Split]:
     """The folds for one and the same detector: each recording once in each of its roles.
 
     A recording stays in the first fold that gives it the role; folds that lose all are left out.

@@ -150,7 +150,7 @@ class Frames:
         return kind(self, channels, sample_rate_hz, begins_inside, now)
 
 
-class _Tally:
+class _Notices:
     """Counts something, to be told in one line, again only after longer and longer times.
 
     Args:
@@ -207,8 +207,8 @@ class FrameReader:
         self._rows: list[Array] = []
         self._items: list[Block | Event] = []
         self._garbage, self._lacking = (
-            _Tally("garbage", "byte", now),
-            _Tally("missing", "frame", now),
+            _Notices("garbage", "byte", now),
+            _Notices("missing", "frame", now),
         )
         self._is_good = True  # what came last
 
