@@ -48,6 +48,7 @@ def test_sensors_die_and_come_back_in_the_middle_of_a_stream(detector, samples):
     parts = []
     for third, dead in zip(thirds, ([], ["SG1", "PVDF2"], []), strict=True):
         live.masked_channels = dead
+        assert live.masked_channels == tuple(dead)
         parts.append(live.push(third))
     assert [bool(part.is_valid.all()) for part in parts] == [True, False, True]
     assert not parts[1].is_valid.any()
