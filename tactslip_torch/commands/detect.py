@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, one_line
 from tactslip_torch.data.file_recordings import hand_file
-from tactslip_torch.data.folder import file_facts, has_truth, recording_files
+from tactslip_torch.data.folder import file_facts, recording_files
 from tactslip_torch.data.formats import Reading, open_file, pieces
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.live.mcap_log import McapLog
@@ -200,7 +200,7 @@ def _detect_in(
             raise ValueError(f"{path} has {samples.num_samples} samples, too few for a decision")
     entry["decisions"] = {"number": counts.num_decisions, "invalid": counts.num_invalid}
     entry["alarms"], entry["truth"], events = counts.alarms, None, None
-    if archived and has_truth(archived.recording):
+    if archived and archived.recording.has_truth:
         entry, events = _with_truth(entry, archived.recording, counts, stream)
     if config.figure:
         alarms = [(alarm["alarm_s"], alarm["onset_s"]) for alarm in entry["alarms"]]

@@ -19,7 +19,7 @@ from tactslip_torch.data.formats import (
     named_format,
 )
 from tactslip_torch.data.manifest import NAMES, TIMES, write_table
-from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
+from tactslip_torch.data.recording import RecordingId, RecordingSource
 
 MANIFEST = NAMES[0]
 
@@ -69,12 +69,6 @@ def file_facts(path: Path, archived: Archived | None) -> dict[str, Any]:
         "scene": scene if recording else None,
         "simulated": bool(recording.provenance.get("simulated")) if recording else None,
     }
-
-
-def has_truth(recording: Recording) -> bool:
-    """Whether it says where slip is and where not; one that nobody annotated does not."""
-    is_told = recording.onsets_s or recording.non_slip_s or recording.slip_s
-    return bool(is_told or recording.provenance.get("simulated"))
 
 
 class Written(NamedTuple):

@@ -127,6 +127,12 @@ class Recording:
         )
 
     @property
+    def has_truth(self) -> bool:
+        """Whether it says where slip is and where not; one that nobody annotated does not."""
+        is_told = self.onsets_s or self.non_slip_s or self.slip_s
+        return bool(is_told or self.provenance.get("simulated"))
+
+    @property
     def duration_s(self) -> float:
         """Length in seconds."""
         return self.samples.shape[-1] / self.sample_rate_hz

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple, Protocol, Self, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.folder import has_truth
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.onset.decisions import Alarm, Decisions
 
@@ -356,7 +355,7 @@ class FileSink(ABC):
 
 def truth_changes(recording: Recording | None) -> list[tuple[float, bool]]:
     """Whether a recording slips from 0 s on, and from each change on; empty if nobody said."""
-    if recording is None or not has_truth(recording):
+    if recording is None or not recording.has_truth:
         return []
     slides = sorted((*recording.sliding_s, *recording.slip_s))
     changes = [(0.0, any(start <= 0 for start, _ in slides))]
