@@ -68,17 +68,17 @@ def test_an_envelope_of_pieces_has_every_extreme_in_order(num_samples, num_segme
 
 @pytest.mark.parametrize("view", [(0.0, 1.2), (0.5, 0.8)])
 def test_traces_take_what_is_in_view_and_the_status_it_begins_with(rng, view):
-    """Of pieces of any length; ``b`` and ``a`` are two of three channels."""
+    """Of pieces of any length."""
     samples, times = rng.standard_normal((3, 4000)), 0.065 + HOP_S * np.arange(190)
     columns = np.stack([rng.random(190), *(rng.random((3, 190)) < 0.5), rng.random(190)])
-    traces = Traces({"b": 2, "a": 0}, RATE_HZ, HOP_S, view)
+    traces = Traces("abc", RATE_HZ, HOP_S, view)
     for piece in pieces(rng, 4000, 300):
         traces.add_samples(samples[:, piece])
     for piece in pieces(rng, 190, 9):
         traces.add_decisions(times[piece], *columns[:, piece])
     first, last = (round(edge * RATE_HZ) for edge in view)
     np.testing.assert_allclose(traces.samples()[0], np.arange(first, last) / RATE_HZ)
-    np.testing.assert_array_equal(traces.samples()[1], samples[[2, 0], first:last])
+    np.testing.assert_array_equal(traces.samples()[1], samples[:, first:last])
     seen = (times > view[0] - 0.006) & (times < view[1])
     decided_s, decided = traces.decisions()
     np.testing.assert_allclose(decided_s, times[seen])
@@ -134,7 +134,7 @@ def test_decisions_are_counted_and_alarms_end_as_in_a_loop(seed, num):
 
 # The figure ------------------------------------------------------------------------------------
 TRUTH = {"onsets": [{"onset_s": 0.42}], "sliding_s": [(0.42, 1.1)]}
-ALARMS = [(0.5, 0.43), (1.25, 1.23)]
+ALARMS = [{"alarm_s": 0.5, "onset_s": 0.43}, {"alarm_s": 1.25, "onset_s": 1.23}]
 
 
 def traces_of(films, view=(0.0, 1.4), num_decisions=130):
@@ -142,7 +142,7 @@ def traces_of(films, view=(0.0, 1.4), num_decisions=130):
     times = np.round(0.07 + HOP_S * np.arange(num_decisions), 6)
     slip = (times >= 0.5) & (times < 1.2)
     valid, abstains = (times < 0.6) | (times >= 0.8), (times >= 0.9) & (times < 1.0)
-    names = {f"PVDF{i}": i - 1 for i in range(1, 1 + len(films))}
+    names = [f"PVDF{i}" for i in range(1, 1 + len(films))]
     traces = Traces(names, RATE_HZ, HOP_S, view)
     traces.add_samples(films)
     score = np.where(times < 0.2, math.nan, 2.0 * slip)  # not before there is a floor
@@ -161,7 +161,8 @@ def draw(drawn, tmp_path, films):
 
     def drawing(traces=None, *, alarms=ALARMS, truth=TRUTH, title="", **options):
         path, traces = tmp_path / "onsets.png", traces or traces_of(films)
-        onset_figure(traces, path, alarms=alarms, truth=truth, title=title, **options)
+        entry = {"alarms": alarms, "truth": truth}
+        onset_figure(traces, entry, path, title=title, **options)
         assert_png(path)
         return drawn[-1]
 

@@ -408,6 +408,7 @@ def written(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TinyRecordings, "load", watched)
         patch.setattr(command, "time_in_fresh_process", played)
+        patch.setattr(TinyRecordings, "units", "N", raising=False)
         found = run(folder, *EASY, "cache=off")
     return folder, found, read
 
@@ -444,6 +445,7 @@ def test_one_that_fails_in_the_fresh_process_gives_way_to_the_next(written):
     detector = SlipDetector.load(folder / "detector.pt")
     assert [str(name) for name in detector.selected_names] == found["chosen"]["selected"]
     assert detector.info["train_materials"] == ["A", "B"]
+    assert detector.info["units"] == "N"
 
 
 def test_unseen_materials_are_never_read_and_test_cycles_by_the_chosen_one_alone(written):

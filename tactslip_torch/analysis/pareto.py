@@ -39,7 +39,6 @@ from tactslip_torch.deploy.bins import bin_graph
 from tactslip_torch.deploy.check import session_of
 from tactslip_torch.features.bank import make_plan
 from tactslip_torch.features.bin_sample import SampledBins
-from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.groups import Channels, Components, allowed, of_fingers
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import Arithmetic, FeaturePool
@@ -57,6 +56,7 @@ from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.runtime import bar, check_number, in_parts, one_thread, steps
 from tactslip_torch.signals.filtering import Align
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.training.experiment import training_origin
 from tactslip_torch.training.plan import (
     Structure,
     TrainingPass,
@@ -630,15 +630,11 @@ class ParetoSearch:
             training = plan.training_bins(statistics.sample.bins())
             head = fit_machine(training, plan.penalty, plan.kernel)
             bins = f"{self.search.bins} training bins of each material and class"
-        trained = self.fold.having("train")
-        info = plan.metadata | {
+        info = plan.metadata | training_origin(self.source, self.fold)
+        info |= {
             "fitted_to": bins,
             "solve": solve_metadata(head),
-            "simulated": self.source.is_simulated,
-            "split": self.fold.name,
             "features_dtype": "float32" if candidate.arithmetic == "native" else "float64",
-            "train_materials": sorted({recording.material for recording in trained}),
-            "train_recordings": {str(r): cache_key(self.source.key(r)) for r in trained},
         }
         facts = self.pool.facts() | {"arithmetic": candidate.arithmetic}
         pool = FeaturePool(self.pool.hand, **facts)

@@ -153,10 +153,9 @@ def _detect_in(
         stream = StreamingDetector(
             detector, context.settings, dtype=samples.dtype, masked_channels=masked
         )
-        drawn = {name: row for row, name in enumerate(hand.names)}
         kinds = [channel.kind for channel in hand.channels]
         view = view_of(config.view, entry["duration_s"])
-        traces = Traces(drawn, rate, stream.hop_s, view, context.units, kinds)
+        traces = Traces(hand.names, rate, stream.hop_s, view, context.units, kinds)
         truth = archived.recording if archived else None
         counts = DecisionCounts(first_releases(truth.onsets_s, truth.released_s) if truth else ())
         logs: list[Sink] = []
@@ -203,19 +202,10 @@ def _detect_in(
     if archived and archived.recording.has_truth:
         entry, events = _with_truth(entry, archived.recording, counts, stream)
     if config.figure:
-        alarms = [(alarm["alarm_s"], alarm["onset_s"]) for alarm in entry["alarms"]]
         title = onsets_title(entry, of_simulated=bool(detector.info.get("simulated")))
-        path = context.folder / f"{name}_onsets.png"
-        onset = context.settings.onset
-        onset_figure(
-            traces,
-            path,
-            alarms=alarms,
-            delays_s=[alarm.get("delay_s") for alarm in entry["alarms"]],
-            truth=entry["truth"],
-            onset_threshold=None if onset is None else onset.threshold,
-            title=title,
-        )
+        place, onset = context.folder / f"{name}_onsets.png", context.settings.onset
+        threshold = None if onset is None else onset.threshold
+        onset_figure(traces, entry, place, onset_threshold=threshold, title=title)
     return entry, events
 
 

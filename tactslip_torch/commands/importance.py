@@ -31,7 +31,6 @@ from tactslip_torch.commands.entry import entry_point, leave_results
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import ROLES, Split
 from tactslip_torch.features.bin_sample import BinSample
-from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.selection import t_scores
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.detector import SlipDetector
@@ -39,7 +38,13 @@ from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.report.importance import best_table, sensors_csv, sensors_figure, sensors_table
 from tactslip_torch.runtime import bar, check_number, one_thread
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
-from tactslip_torch.training.experiment import DTYPES, feature_cache, save_config, versions
+from tactslip_torch.training.experiment import (
+    feature_cache,
+    features_of,
+    save_config,
+    training_origin,
+    versions,
+)
 from tactslip_torch.training.recipe import Recipe, sample_groups, sample_weight, scaled_selection
 
 FORMAT = "tactslip_torch sensors 1"
@@ -136,15 +141,12 @@ def _trained(model: Path, cache: Any) -> Trained:
             f"{found} has no fold {detector.info.get('split')!r}, of which {model.name} is; keep "
             "both files of a training together"
         )
-    keys = {str(recording): cache_key(source.key(recording)) for recording in fold.having("train")}
-    if keys != detector.info.get("train_recordings"):
+    if training_origin(source, fold)["train_recordings"] != detector.info.get("train_recordings"):
         raise ValueError(
             f"the training recordings of {found} are not those that {model.name} was trained on; "
             "keep both files of a training together, and its data unchanged"
         )
-    dtype = DTYPES[detector.info.get("features_dtype", "float64")]
-    rule, filters = instantiate(config.labels), detector.channel_filter
-    maker = FeatureMaker(source, detector.pool, filters, rule, cache, dtype)
+    maker = features_of(detector, source, instantiate(config.labels), cache)
     return Trained(detector, source, fold, instantiate(config.recipe, _convert_="all"), maker)
 
 

@@ -25,7 +25,6 @@ from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split, have_same_bins
 from tactslip_torch.deploy.check import GraphKind
 from tactslip_torch.deploy.export import export_detector, read_sidecar
-from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.pooling import pooled_names
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
@@ -45,6 +44,7 @@ from tactslip_torch.training.experiment import (
     make_trainer,
     merged_results,
     save_config,
+    training_origin,
     write_tensorboard,
 )
 from tactslip_torch.training.learner import SlipLearner
@@ -338,24 +338,9 @@ def _save_statistics(
 
 def _origin(config: DictConfig, data: SlipDataModule) -> dict[str, Any]:
     """What a detector says of where it comes from."""
-    source, trained = data.maker.source, data.split.having("train")
-    return {
-        "simulated": source.is_simulated,
-        **_units(source),
-        "experiment": config.name,
-        "seed": config.seed,
-        "split": data.split.name,
-        "features_dtype": config.features.dtype,
-        "train_materials": sorted({recording.material for recording in trained}),
-        "train_sessions": sorted({r.session or "1" for r in trained}),
-        "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
-    }
-
-
-def _units(source: RecordingSource) -> dict[str, str]:
-    """The unit of samples, where it is not volts."""
-    units = getattr(source, "units", "V")  # sources that do not say record volts
-    return {} if units == "V" else {"units": units}
+    settings = {"experiment": config.name, "seed": config.seed}
+    origin = training_origin(data.maker.source, data.split)
+    return origin | settings | {"features_dtype": config.features.dtype}
 
 
 def _baselines(detector: SlipDetector) -> dict[str, Scorer]:

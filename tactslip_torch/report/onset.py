@@ -112,7 +112,7 @@ class Traces:
     """Gathers samples and decisions of a recording; its memory does not grow with the length.
 
     Args:
-        channels: what is drawn: row in the samples, by name.
+        channels: names of the rows of the samples, which are drawn in this order.
         sample_rate_hz: of the samples.
         hop_s: distance of two decisions.
         view: start and end of what is drawn, in seconds.
@@ -122,7 +122,7 @@ class Traces:
 
     def __init__(
         self,
-        channels: Mapping[str, int],
+        channels: Sequence[str],
         sample_rate_hz: float,
         hop_s: float,
         view: tuple[float, float],
@@ -143,7 +143,7 @@ class Traces:
         """Take the next samples, ``[C, n]``."""
         first, stop = (max(edge - self._num_samples, 0) for edge in (self._first, self._stop))
         self._num_samples += samples.shape[1]
-        self._samples.add(samples[list(self.channels.values()), first:stop])
+        self._samples.add(samples[:, first:stop])
 
     def add_decisions(
         self,
@@ -387,11 +387,9 @@ def write_onsets(content: Mapping[str, Any], folder: Path) -> None:
 @styled
 def onset_figure(
     traces: Traces,
+    entry: Mapping[str, Any],
     path: str | Path,
     *,
-    alarms: Segments = (),
-    delays_s: Sequence[float | None] = (),
-    truth: Mapping[str, Any] | None = None,
     onset_threshold: float | None = None,
     title: str,
 ) -> None:
@@ -401,10 +399,8 @@ def onset_figure(
 
     Args:
         traces: what was gathered of the recording.
+        entry: of ``onsets.json``, whose alarms and, where it is known, truth are marked.
         path: the PNG to write, replaced as a whole if it exists.
-        alarms: of each, when it was raised and when its slip is estimated to have begun.
-        delays_s: of each, how long after the true onset it came; ``None``: it found none.
-        truth: of an entry of ``onsets.json``; ``None`` if it is not known.
         onset_threshold: of the onset classifier; ``None``: there is none.
         title: of the figure; says what is simulated.
     """
@@ -413,6 +409,7 @@ def onset_figure(
     figure = new_figure(12.0, sum(heights) + 1.3, title)
     panels = figure.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights})
     first, last = traces.view
+    alarms, truth = entry["alarms"], entry["truth"]
     onsets = truth["onsets"] if truth else []
     onsets_s = [onset["onset_s"] for onset in onsets]
     first_s = [s for onset in onsets if (s := onset.get("first_release_s")) is not None]
@@ -433,7 +430,7 @@ def onset_figure(
         panels[3].axhline(onset_threshold, color=ALARM, linewidth=0.8, linestyle="--")
         panels[3].set_ylabel("onset score")
     panels[0].set_xlim(first, last)
-    raised_s, estimates_s = ([alarm[which] for alarm in alarms] for which in (0, 1))
+    raised_s, estimates_s = ([alarm[key] for alarm in alarms] for key in ("alarm_s", "onset_s"))
     for axes, times, name, style in (
         (panels[0], first_s, "first release", _RELEASE),
         (panels[0], onsets_s, "onset", _ONSET),
@@ -442,7 +439,7 @@ def onset_figure(
         (panels[2], estimates_s, "estimate", _ESTIMATE),
     ):
         _mark(axes, times, name, **style)
-    _tell_delays(panels[0], raised_s, delays_s)
+    _tell_delays(panels[0], alarms)
     panels[-1].set_xlabel("time, s")
     handles: list[Any] = [
         Line2D([], [], color=REST, linewidth=2, label="decided: no slip"),
@@ -483,24 +480,16 @@ def _draw_channels(axes: Axes, traces: Traces, slips: Segments) -> None:
     axes.set_ylabel(f"channels; distance of lanes: {told}")
 
 
-def _tell_delays(axes: Axes, times: Sequence[float], delays_s: Sequence[float | None]) -> None:
+def _tell_delays(axes: Axes, alarms: Sequence[Mapping[str, Any]]) -> None:
     """How late each alarm came, beside its line, where there is place for it."""
     first, last = axes.get_xlim()
-    told = [(t, d) for t, d in zip(times, delays_s, strict=False) if d is not None]
-    told = [(time, delay) for time, delay in told if first <= time <= last]
-    if len(told) > _MOST_DELAYS:
-        return
-    for time, delay in told:
-        text: dict[str, Any] = {"color": ALARM, "fontsize": 8, "va": "bottom"}
-        place = 4, 2  # points
-        axes.annotate(
-            f"{1000 * delay:+.0f} ms",
-            (time, 1.0),
-            xycoords=axes.get_xaxis_transform(),
-            xytext=place,
-            textcoords="offset points",
-            **text,
-        )
+    known = [alarm for alarm in alarms if alarm.get("delay_s") is not None]
+    told = [alarm for alarm in known if first <= alarm["alarm_s"] <= last]
+    style: dict[str, Any] = {"color": ALARM, "fontsize": 8, "va": "bottom"}
+    style |= {"xycoords": axes.get_xaxis_transform(), "textcoords": "offset points"}
+    for alarm in told if len(told) <= _MOST_DELAYS else ():
+        text = f"{1000 * alarm['delay_s']:+.0f} ms"
+        axes.annotate(text, (alarm["alarm_s"], 1.0), xytext=(4, 2), **style)
 
 
 def lane_height(lines: Iterable[Array]) -> float:
