@@ -101,8 +101,7 @@ def certify(config: DictConfig) -> dict[str, Any]:
 
 def _roles(config: DictConfig) -> dict[str, int]:
     """How many bins of which role, those to calibrate on first."""
-    checked = [config.evaluate] if isinstance(config.evaluate, str) else list(config.evaluate)
-    roles = [str(config.calibrate), *map(str, checked)]
+    roles = [str(config.calibrate), *map(str, config.evaluate)]
     if len(set(roles)) < len(roles) or not set(roles) <= set(ROLES):
         raise ValueError(
             f"calibrate and evaluate must be different roles of {', '.join(ROLES)}, got "

@@ -201,6 +201,7 @@ class Composed:
 
     Attributes:
         config: without Hydra's own section, unresolved.
+        folders: of the results, unresolved: ``hydra.run.dir``, and ``hydra.sweep.dir`` of a sweep.
         keys: those that may be set, in the order of their sections.
         groups: those that apply.
         head: what the command does.
@@ -218,7 +219,8 @@ class Composed:
             whole = loader.load_configuration(name, given, RunMode.RUN)
             files = loader.compute_defaults_list(name, given, RunMode.RUN).defaults
         OmegaConf.set_struct(whole, False)
-        whole.pop("hydra", None)
+        hydra: Any = OmegaConf.to_container(whole.pop("hydra"))
+        self.folders = {f"hydra.{of}.dir": str(hydra[of]["dir"]) for of in ("run", "sweep")}
         self.config: DictConfig = whole
         own = comments_of(conf_dir() / f"{name}.yaml")
         self.head, self.examples = own.head, own.examples
@@ -471,14 +473,10 @@ def _apart(command: str, name: str, arguments: Sequence[str]) -> tuple[list[str]
     return overrides, options
 
 
-def _folder_of(options: Sequence[str]) -> str | None:
+def _folder_of(arguments: Sequence[str]) -> str | None:
     """The user's own folder of configuration, ``--config-dir``."""
-    for place, option in enumerate(options):
-        if option.startswith("--config-dir="):
-            return option.partition("=")[2]
-        if option in ("--config-dir", "-cd") and place + 1 < len(options):
-            return options[place + 1]
-    return None
+    folder: str | None = get_args_parser().parse_known_args(arguments)[0].config_dir
+    return folder
 
 
 def _check_words(command: str, name: str, overrides: Sequence[str]) -> None:
@@ -839,22 +837,22 @@ def _wants_list(wanted: Any, kind: type) -> bool:
 # Folders ------------------------------------------------------------------------------------------
 
 
-def folder_problem(arguments: Sequence[str], default: str = "outputs") -> str | None:
+def folder_problem(composed: Composed, *, is_sweep: bool = False) -> str | None:
     """One line about a results folder that cannot be made; Hydra alone would show a trace.
 
     Args:
-        arguments: of the command line.
-        default: where results go if no argument says so; ``"."`` is not looked at.
+        composed: says where results go; ``"."`` is not looked at.
+        is_sweep: whether there are several runs.
 
     Example:
-        >>> folder_problem(["hydra.run.dir=/dev/null/recordings"])
+        >>> folder_problem(Composed("evaluate", ["hydra.run.dir=/dev/null/recordings"]))
         'cannot write to hydra.run.dir=/dev/null/recordings: Not a directory at /dev/null'
     """
-    given = {key.lstrip("+"): value for key, _, value in (a.partition("=") for a in arguments)}
-    name = "hydra.sweep.dir" if {"-m", "--multirun"} & set(arguments) else "hydra.run.dir"
-    if (wanted := given.get(name, default)) == ".":
+    name = "hydra.sweep.dir" if is_sweep else "hydra.run.dir"
+    wanted = composed.folders[name].partition("${")[0]  # what it holds of the configuration is new
+    if wanted == ".":
         return None
-    folder = Path(wanted.strip("'\"")).absolute()
+    folder = Path(wanted).absolute()
     nearest = next(place for place in (folder, *folder.parents) if place.exists())
     try:
         with tempfile.TemporaryDirectory(dir=nearest):

@@ -73,9 +73,8 @@ def entry_point(
         with stopping(), errors_in_one_line():
             arguments = sys.argv[1:]
             known, composed = checked(command, name, arguments)
-            own: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{name}.yaml"))
-            default = own["hydra"]["run"]["dir"].split("/")[0]
-            if problem := folder_problem(arguments, default):
+            is_sweep = bool({"-m", "--multirun"} & set(arguments))
+            if composed and (problem := folder_problem(composed, is_sweep=is_sweep)):
                 raise Mistake(problem)
 
             runs: list[_Run] = []

@@ -26,7 +26,7 @@ def conclusion(content: Mapping[str, Any]) -> str:
     if failed:
         row = failed[0]
         others = f" and {len(failed) - 1} more" if len(failed) > 1 else ""
-        value = "not finite" if row["found"] is None else number(row["found"])
+        value = "not finite" if row["found"] is None else f"{row['found']:.4g}"
         return f"Does not hold: {row['name']} is {value}, wanted {row['wanted']}{others}{kind}"
     margin = content["margin"]
     measured = ", as measured: this head has no bound" if content["head"]["bound"] is None else ""
@@ -35,20 +35,6 @@ def conclusion(content: Mapping[str, Any]) -> str:
         f"Holds: float32 decides as float64 does where |score| exceeds {margin['score']:.1e}, "
         f"{100 * margin['sd']:.2g} % of its standard deviation{measured}{evaluated}{kind}"
     )
-
-
-def number(value: object) -> str:
-    """A value as people read it: few digits, a dash for what is not there.
-
-    Example:
-        >>> number(1.23456e-7), number(0.25), number(1200), number(None), number("Cholesky")
-        ('1.2e-07', '0.25', '1200', '-', 'Cholesky')
-    """
-    if value is None:
-        return "-"
-    if isinstance(value, float) and value != 0:
-        return f"{value:.3g}" if 1e-2 <= abs(value) < 1e4 else f"{value:.1e}"
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 @styled

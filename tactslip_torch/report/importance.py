@@ -23,6 +23,7 @@ from tactslip_torch.report.style import (
     INK,
     VERMILION,
     csv_writer,
+    is_fast,
     kind_colours,
     lanes,
     marked,
@@ -283,7 +284,7 @@ def _hand(
         ramp = LinearSegmentedColormap.from_list("shade", ["#FFFFFF", colour])
         shown = axes.scatter(
             xs, ys, s=size, c=[values[row["name"]] for row in rows], cmap=ramp, vmin=limits[0],
-            vmax=limits[1], marker="o" if _is_fast(rows[0]) else "s", edgecolors=colour,
+            vmax=limits[1], marker="o" if is_fast(rows[0]) else "s", edgecolors=colour,
         )  # fmt: skip
         bar = axes.figure.colorbar(
             shown, ax=axes, location="bottom", shrink=0.6, aspect=40, pad=0.01
@@ -308,13 +309,9 @@ def _placed(rows: Sequence[Row]) -> list[tuple[tuple[float, float], Row]]:
     lines = math.ceil(len(rows) / columns)
     pitch = 0.86 / max(columns, lines, 2)
     placed = []
-    for number, row in enumerate(sorted(rows, key=_is_fast)):
+    for number, row in enumerate(sorted(rows, key=is_fast)):
         line, column = divmod(number, columns)
         in_line = min(columns, len(rows) - line * columns)
         at = pitch * (column - (in_line - 1) / 2), -pitch * (line - (lines - 1) / 2)
         placed.append((at, row))
     return placed
-
-
-def _is_fast(row: Row) -> bool:
-    return row.get("adapting", "fast" if row["kind"] == "PVDF" else "slow") == "fast"

@@ -28,6 +28,7 @@ from tactslip_torch.report.style import (
     INK,
     VERMILION,
     colours_of,
+    is_fast,
     lanes,
     legend_below,
     marked,
@@ -306,13 +307,11 @@ def _columns(channels: Channels) -> list[tuple[str, list[int], bool]]:
     """Kind, channels and whether in lanes: of every slow kind two columns, of every other one."""
     groups: dict[tuple[bool, str], list[int]] = {}
     for place, channel in enumerate(channels):
-        kind = channel["kind"]
-        is_fast = channel.get("adapting", "slow" if kind == "SG" else "fast") == "fast"
-        groups.setdefault((is_fast, kind), []).append(place)
+        groups.setdefault((is_fast(channel), channel["kind"]), []).append(place)
     return [
         (kind, places, in_lanes)
-        for (is_fast, kind), places in sorted(groups.items(), key=lambda item: item[0][0])
-        for in_lanes in ((True,) if is_fast else (False, True))
+        for (fast, kind), places in sorted(groups.items(), key=lambda item: item[0][0])
+        for in_lanes in ((True,) if fast else (False, True))
     ]
 
 

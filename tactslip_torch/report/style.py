@@ -188,3 +188,8 @@ def kind_colours(kinds: Iterable[str]) -> dict[str, str]:
     """A colour for each kind of channel: blue for PVDF, orange for SG, others what is left."""
     left = cycle(colour for colour in PALETTE if colour not in _KIND_COLOURS.values())
     return {kind: _KIND_COLOURS.get(kind) or next(left) for kind in dict.fromkeys(kinds)}
+
+
+def is_fast(channel: Mapping[str, str]) -> bool:
+    """Whether a channel of ``HandLayout.to_rows`` adapts fast; if it does not say, as its kind."""
+    return channel.get("adapting", "fast" if channel["kind"] == "PVDF" else "slow") == "fast"
