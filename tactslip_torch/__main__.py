@@ -62,11 +62,11 @@ def run(command: str, arguments: list[str]) -> None:
 
             asked = [each for each in arguments if each not in ("-h", "--help")]
             try:
-                _, composed = checked(command, name, asked)
+                _, composed = checked(command, asked)
             except Mistake as mistake:
                 print(f"error: {mistake}", file=sys.stderr)
                 raise SystemExit(2) from None
-            print(help_text(command, COMMANDS[command], composed or Composed(name)))
+            print(help_text(command, COMMANDS[command], composed or Composed(command)))
             return
         sys.argv = [f"tactslip {command}", *arguments]
         # as __main__, so that Lightning finds what to start again in further processes

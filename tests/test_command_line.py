@@ -183,7 +183,7 @@ def test_a_mistake_is_answered_in_one_line(line):
 )
 def test_a_text_is_a_list_of_one_where_a_list_is_wanted(line, key, value):
     command, *rest = typed(line)
-    _, composed = checked(command, FILES[command], rest)
+    _, composed = checked(command, rest)
     with_lists(composed.config, composed)
     found = composed.config
     for part in key.split("."):
@@ -207,7 +207,7 @@ def test_a_text_is_a_list_of_one_where_a_list_is_wanted(line, key, value):
 )
 def test_keys_that_something_takes_pass(line):
     command, *rest = typed(line)
-    checked(command, FILES[command], rest)
+    checked(command, rest)
 
 
 # Help --------------------------------------------------------------------------------------------
@@ -215,7 +215,7 @@ def test_keys_that_something_takes_pass(line):
 
 @pytest.mark.parametrize("command", CONFIGURED)
 def test_every_key_and_group_is_described(command):
-    composed = Composed(FILES[command])
+    composed = Composed(command)
     assert composed.head
     assert len(composed.examples) == 3
     assert [group.name for group in composed.groups if not group.description] == []
@@ -227,18 +227,17 @@ def test_every_key_and_group_is_described(command):
 @pytest.mark.slow
 @pytest.mark.parametrize("command", CONFIGURED)
 def test_examples_pass_and_keys_of_every_option_are_described(command):
-    name = FILES[command]
-    composed = Composed(name)
+    composed = Composed(command)
     for example in composed.examples:
         _, given, *rest = typed(example)
         assert given == command
-        checked(command, name, rest)
+        checked(command, rest)
     options = {g.name: g.options for g in composed.groups if g.name != "+exp"}
     if command != "train":  # what is looked at there
         options = {k: own for k, own in options.items() if k == "search"}
     for n in range(max(map(len, options.values()), default=1)):
         chosen = [f"{group}={own[n % len(own)]}" for group, own in options.items()]
-        keys = Composed(name, chosen).keys
+        keys = Composed(command, chosen).keys
         assert [key.name for key in keys if not key.description] == [], chosen
 
 

@@ -27,6 +27,7 @@ from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache, cached_property
 from pathlib import Path
+from types import UnionType
 from typing import Any, NamedTuple
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
@@ -195,7 +196,7 @@ class Composed:
     """A configuration as Hydra composes it, and what its files say of it.
 
     Args:
-        name: of the file in ``conf``.
+        command: as it is typed; its file in ``conf`` has ``_`` in place of ``-``.
         overrides: of the command line.
         folder: of configuration of the user's own, ``--config-dir``.
 
@@ -211,8 +212,10 @@ class Composed:
         HydraException: or another of Hydra's, if it cannot be composed.
     """
 
-    def __init__(self, name: str, overrides: Sequence[str] = (), folder: str | None = None) -> None:
-        given = list(overrides)
+    def __init__(
+        self, command: str, overrides: Sequence[str] = (), folder: str | None = None
+    ) -> None:
+        name, given = command.replace("-", "_"), list(overrides)
         if folder is not None:
             given.append(f"hydra.searchpath=[{Path(folder).absolute().as_uri()}]")
         with _loader() as loader:
@@ -396,12 +399,11 @@ class Mistake(ValueError):
     """A command line that cannot be carried out; its text is one line for the user."""
 
 
-def checked(command: str, name: str, arguments: Sequence[str]) -> tuple[list[str], Composed | None]:
+def checked(command: str, arguments: Sequence[str]) -> tuple[list[str], Composed | None]:
     """A command line in the order that Hydra wants, and its configuration.
 
     Args:
-        command: as it is typed, for messages.
-        name: of its file in ``conf``.
+        command: as it is typed.
         arguments: of the command line.
 
     Returns:
@@ -410,38 +412,48 @@ def checked(command: str, name: str, arguments: Sequence[str]) -> tuple[list[str
     Raises:
         Mistake: if it cannot be composed, or has a key that nothing takes.
     """
-    overrides, options = _apart(command, name, arguments)
+    overrides, options = _apart(command, arguments)
     given = {option.partition("=")[0] for option in options}
     if given & _ELSEWHERE:
         return [*overrides, *options], None
     folder = _folder_of(options)
     if folder is not None and not Path(folder).is_dir():
         raise Mistake(f"--config-dir {folder}: there is no such folder")
-    _check_words(command, name, overrides)
+    _check_words(command, overrides)
     if problem := unknown_choice(arguments):
         raise Mistake(problem)
     overrides = [_readable(override) for override in overrides]
     several = bool(given & {"-m", "--multirun"})
     first = [_first_of(override) for override in overrides] if several else overrides
     try:
-        composed = Composed(name, first, folder)
+        composed = Composed(command, first, folder)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
-        raise Mistake(_translated(command, name, first, error, folder)) from error
+        raise Mistake(_translated(command, first, error, folder)) from error
     for key in unknown_keys(composed):
-        raise Mistake(_no_key(command, name, first, key, composed))
+        raise Mistake(_no_key(command, first, key, composed))
     return [*overrides, *options], composed
 
 
 @cache
-def _plain(name: str) -> Composed:
+def _plain(command: str) -> Composed:
     """The configuration as the files have it."""
-    return Composed(name)
+    return Composed(command)
+
+
+def _composed_or_plain(
+    command: str, overrides: Sequence[str], folder: str | None = None
+) -> Composed:
+    """The configuration with these overrides or, if it cannot be composed, as the files have it."""
+    try:
+        return Composed(command, overrides, folder)
+    except (HydraException, OmegaConfBaseException):
+        return _plain(command)
 
 
 # Words ------------------------------------------------------------------------------------------
 
 
-def _apart(command: str, name: str, arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+def _apart(command: str, arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """Overrides, and options with their values: Hydra wants no option between overrides."""
     actions = get_args_parser()._option_string_actions
     overrides: list[str] = []
@@ -461,7 +473,7 @@ def _apart(command: str, name: str, arguments: Sequence[str]) -> tuple[list[str]
             option, found, value = argument.partition("=")
             if option not in actions:
                 key = option.lstrip("-").replace("-", "_")
-                near = _nearest(key, _names(_plain(name))) or "KEY"
+                near = _nearest(key, _names(_plain(command))) or "KEY"
                 if not found:
                     value = next((x for x in arguments[place + 1 :][:1] if x[:1] != "-"), "")
                 hint = f"write {near}={value or 'VALUE'}, without dashes"
@@ -479,7 +491,7 @@ def _folder_of(arguments: Sequence[str]) -> str | None:
     return folder
 
 
-def _check_words(command: str, name: str, overrides: Sequence[str]) -> None:
+def _check_words(command: str, overrides: Sequence[str]) -> None:
     """Refuse words that are no ``key=value``, and brackets and quotes that do not close.
 
     Raises:
@@ -501,7 +513,7 @@ def _check_words(command: str, name: str, overrides: Sequence[str]) -> None:
         if extra := _unclosed(word[::-1].translate(_MIRROR)):
             raise Mistake(f"{word} has a {extra} too many; write '{word.removesuffix(extra)}'")
         if not found:
-            raise Mistake(_no_value(command, name, word, overrides[place + 1 :]))
+            raise Mistake(_no_value(command, word, overrides[place + 1 :]))
         if not key.strip("+~ "):
             raise Mistake(f"{word} has no key; write KEY=VALUE, {_LIST_KEYS.format(command)}")
         if value.startswith("="):
@@ -527,9 +539,9 @@ def _unclosed(word: str) -> str:
     return quote or "".join(reversed(open_))
 
 
-def _no_value(command: str, name: str, word: str, rest: Sequence[str]) -> str:
+def _no_value(command: str, word: str, rest: Sequence[str]) -> str:
     """What to write in place of a word without ``=``."""
-    composed = _plain(name)
+    composed = _plain(command)
     if word in {option for group in composed.groups for option in group.options}:
         group = next(g.name for g in composed.groups if word in g.options)
         return f"{word} has no key; write {group}={word}"
@@ -613,16 +625,13 @@ def unknown_choice(arguments: Sequence[str]) -> str | None:
 
 
 def _translated(
-    command: str, name: str, overrides: Sequence[str], error: Exception, folder: str | None
+    command: str, overrides: Sequence[str], error: Exception, folder: str | None
 ) -> str:
     """What Hydra raised, in one line."""
     said = str(error)
     if found := re.search(r"Could not override '([^']+)'", said):
         added = [f"+{o}" if o.startswith(f"{found[1]}=") else o for o in overrides]
-        try:
-            composed = Composed(name, added, folder)
-        except (HydraException, OmegaConfBaseException):
-            composed = _plain(name)
+        composed = _composed_or_plain(command, added, folder)
         section = composed.known.get(found[1].rpartition(".")[0])
         if isinstance(section, dict) and not unknown_keys(composed):
             return f"{found[1]} has no default; write +{found[1]}=VALUE"
@@ -633,7 +642,7 @@ def _translated(
             return f"+exp is given twice; write '+exp=[{','.join(given)}]'"
         return f"+{group}={option} adds a group that is there already; write {group}={option}"
     if found := re.search(r"Could not (?:override|delete from config\.) '([^']+)'", said):
-        return _no_key(command, name, overrides, found[1])
+        return _no_key(command, overrides, found[1])
     if found := re.search(r"An item is already at '([^']+)'", said):
         (word,) = [o for o in overrides if o.startswith(f"+{found[1]}=")][:1] or [f"+{found[1]}"]
         return f"{word} adds a key that is there already; write {word.lstrip('+')}"
@@ -657,10 +666,10 @@ def _translated(
 
 
 def _no_key(
-    command: str, name: str, overrides: Sequence[str], key: str, composed: Composed | None = None
+    command: str, overrides: Sequence[str], key: str, composed: Composed | None = None
 ) -> str:
     """That a key is unknown: what is near it, or which option has it."""
-    groups = {group.name: group for group in _plain(name).groups}
+    groups = {group.name: group for group in _plain(command).groups}
     head, _, rest = key.partition(".")
     if rest and head in groups:
         having = [o for o in groups[head].options if rest in _keys_of(f"{head}/{o}")]
@@ -673,10 +682,7 @@ def _no_key(
             return f"{head}={chosen} has no key {key}; it is one of {others}"
     if composed is None:
         kept = [o for o in overrides if "." not in o.partition("=")[0] and _is_choice(o)]
-        try:
-            composed = Composed(name, kept)
-        except (HydraException, OmegaConfBaseException):
-            composed = _plain(name)
+        composed = _composed_or_plain(command, kept)
     names = _names(composed)
     if section := _scene_of(key):
         names = [f"{section}.{parameter}" for parameter in sorted(_scene_parameters())]
@@ -819,15 +825,10 @@ def with_lists(config: DictConfig, composed: Composed) -> None:
             OmegaConf.update(config, path, [value], merge=False)
 
 
-def _members(wanted: Any) -> tuple[Any, ...]:
-    """The types of a union, or the type alone."""
-    is_union = typing.get_origin(wanted) in (typing.Union, type(int | str))
-    return typing.get_args(wanted) if is_union else (wanted,)
-
-
 def _wants_list(wanted: Any, kind: type) -> bool:
     """Whether a type takes lists, and no value of a simple kind."""
-    members = _members(wanted)
+    is_union = typing.get_origin(wanted) in (typing.Union, UnionType)
+    members = typing.get_args(wanted) if is_union else (wanted,)
     is_simple = any(each in (kind, Any) or (kind is int and each is float) for each in members)
     is_simple |= any(typing.get_origin(each) is typing.Literal for each in members)
     lists = (list, tuple, Sequence)

@@ -72,7 +72,7 @@ def entry_point(
     def main() -> None:
         with stopping(), errors_in_one_line():
             arguments = sys.argv[1:]
-            known, composed = checked(command, name, arguments)
+            known, composed = checked(command, arguments)
             is_sweep = bool({"-m", "--multirun"} & set(arguments))
             if composed and (problem := folder_problem(composed, is_sweep=is_sweep)):
                 raise Mistake(problem)
