@@ -55,8 +55,7 @@ from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.runtime import bar, check_number, in_parts, one_thread, steps
 from tactslip_torch.signals.filtering import Align
-from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
-from tactslip_torch.training.experiment import training_origin
+from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule, training_origin
 from tactslip_torch.training.plan import (
     Structure,
     TrainingPass,

@@ -37,12 +37,11 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.report.importance import best_table, sensors_csv, sensors_figure, sensors_table
 from tactslip_torch.runtime import bar, check_number, one_thread
-from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule, training_origin
 from tactslip_torch.training.experiment import (
     feature_cache,
     features_of,
     save_config,
-    training_origin,
     versions,
 )
 from tactslip_torch.training.recipe import Recipe, sample_groups, sample_weight, scaled_selection

@@ -35,7 +35,7 @@ from tactslip_torch.runtime import is_first_process, whole_file
 from tactslip_torch.training.adaptation import FILE as STATISTICS
 from tactslip_torch.training.adaptation import Statistics
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
-from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.datamodule import SlipDataModule, training_origin
 from tactslip_torch.training.experiment import (
     common_metadata,
     feature_cache,
@@ -44,7 +44,6 @@ from tactslip_torch.training.experiment import (
     make_trainer,
     merged_results,
     save_config,
-    training_origin,
     write_tensorboard,
 )
 from tactslip_torch.training.learner import SlipLearner

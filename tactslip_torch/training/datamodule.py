@@ -376,3 +376,16 @@ class SlipDataModule(L.LightningDataModule):
 def _batch(maker: FeatureMaker, split: Split, recording: RecordingId | None) -> RecordingFeatures:
     made: RecordingFeatures = NOTHING if recording is None else maker(recording, split)
     return made
+
+
+def training_origin(source: RecordingSource, fold: Split) -> dict[str, Any]:
+    """What a detector's ``info`` says of what it is trained on; units only where not volts."""
+    trained, units = fold.having("train"), getattr(source, "units", "V")
+    return {
+        "simulated": source.is_simulated,
+        **({} if units == "V" else {"units": units}),
+        "split": fold.name,
+        "train_materials": sorted({recording.material for recording in trained}),
+        "train_sessions": sorted({recording.session or "1" for recording in trained}),
+        "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
+    }

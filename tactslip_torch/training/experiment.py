@@ -25,10 +25,8 @@ from torch.utils.tensorboard import SummaryWriter
 
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
-from tactslip_torch.data.splits import Split
 from tactslip_torch.features.cache import (
     FeatureCache,
-    cache_key,
     default_cache_folder,
     source_digest,
 )
@@ -177,19 +175,6 @@ def features_of(
     """The features of a detector, computed as in its training."""
     dtype = DTYPES[detector.info.get("features_dtype", "float64")]
     return FeatureMaker(source, detector.pool, detector.channel_filter, rule, cache, dtype)
-
-
-def training_origin(source: RecordingSource, fold: Split) -> dict[str, Any]:
-    """What a detector's ``info`` says of what it is trained on; units only where not volts."""
-    trained, units = fold.having("train"), getattr(source, "units", "V")
-    return {
-        "simulated": source.is_simulated,
-        **({} if units == "V" else {"units": units}),
-        "split": fold.name,
-        "train_materials": sorted({recording.material for recording in trained}),
-        "train_sessions": sorted({recording.session or "1" for recording in trained}),
-        "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
-    }
 
 
 @contextmanager
