@@ -4,10 +4,9 @@ A test tells of decisions on labelled bins as scores and as events. Bins of a st
 are a short stream: a rule makes alarms of the decisions, and these find a slip or do not. The
 detector was not made for these rules; they show what its errors would mean in use.
 
-Simple baselines, fitted on training bins and evaluated beside a detector.
-
-A result means little without what a simpler method reaches on the same bins. Four are fitted, with
-both classes balanced and each sampled bin weighted by the number of bins it stands for:
+A result means little without what a simpler method reaches on the same bins. So four ``Baselines``
+are fitted on training bins and evaluated beside the detector, with both classes balanced and each
+sampled bin weighted by the number of bins it stands for:
 
 - ``best_pooled_number``: the statistic over channels of one descriptor that separates the classes
   best, and its threshold;
