@@ -324,6 +324,9 @@ REFUSED = {
     "units": (lambda: recording(units="counts"), [], "a.npz is in counts, the detector was traine"),
     "threshold": (recording, ["threshold=high"], "threshold must be a finite number, got 'high'"),
     "reading": (recording, ["reading=3"], "reading must be of sample_rate_hz, time"),
+    "masked": (recording, ["masked_channels=[SG9]"], "masked_channels names the channel 'SG9', wh"),
+    "backend": (recording, ["backend=steam"], "steam"),
+    "mcap": (recording, ["mcap=a.mcap"], "mcap must be true or false, got 'a.mcap'"),
     "tare": (recording, ["tare_s=[0,a]"], "tare_s must be [start, end] in seconds, got [0, 'a']"),
     "view": (recording, ["view=3"], "view must be [start, end] in seconds, got 3"),
 }
