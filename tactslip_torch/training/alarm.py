@@ -102,8 +102,6 @@ _TOGETHER = 256  # streams decided at once
 _PUSHES = 200  # timed
 _FULL_S = 2.0  # of stream, until memories are full
 _OF_BINS = 0.5  # of what a budget allows, at most, that bins alone raise
-_AROUND_S = 0.25  # of a slip, in which its highest score lies
-_MOST_MISSED = 0.3  # share of slips at the highest threshold that is tried
 _SETTLE_S = 0.05  # behind what a decision rests on, as EventRules.settle_s
 
 
@@ -381,18 +379,6 @@ def _lead_s(
     return statistics.median(errors) if errors else 0.0
 
 
-def _threshold(settings: AlarmSettings) -> float:
-    """That of the onset classifier, if there is one, else that of bins."""
-    return settings.threshold if settings.onset is None else settings.onset.threshold
-
-
-def _at_threshold(settings: AlarmSettings, value: float) -> AlarmSettings:
-    """The settings with another such threshold."""
-    if settings.onset is None:
-        return replace(settings, threshold=value)
-    return replace(settings, onset=replace(settings.onset, threshold=value))
-
-
 # The stages behind a fit -------------------------------------------------------------------------
 
 
@@ -404,11 +390,10 @@ class CalibratedAlarm:
     onset classifier), *calibrate* (thresholds) and *test*; those of held-out materials test alone.
 
     A classifier of bins raises an alarm where its rule reaches a threshold at which it uses at most
-    half of every budget; the onset classifier gets the threshold that finds most slips of those at
-    which both together keep all of them. Recordings that calibrate are scored by an onset
-    classifier that was fitted without their material, so that budgets hold for new materials.
-    Baselines are thresholds on a score, at the onset classifier's hop, under the same budgets and
-    chosen alike.
+    half of every budget; the onset classifier gets the lowest threshold at which both together keep
+    all of them: slips of new materials may be weaker. Recordings that calibrate are scored by an
+    onset classifier that was fitted without their material, so that budgets hold for new materials.
+    Baselines are thresholds on a score, at the onset classifier's hop and under the same budgets.
 
     Args:
         streams: recordings, those trained on included or not; of the paper's scene, without
@@ -690,7 +675,6 @@ class CalibratedAlarm:
                 settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timings[name].hop_samples)
                 scored = self._scored(streams[name], settings, timings[name], self.budgets)
                 settings = replace(settings, threshold=self._lowest(scored, settings, "statistic"))
-                settings = self._finding_most(streams[name], settings, timings[name])
                 methods[name] = name, self._told(settings, scored)
         return methods
 
@@ -725,7 +709,6 @@ class CalibratedAlarm:
             if onset:
                 threshold = self._lowest(scored, settings, "onset_score")
                 settings = replace(settings, onset=replace(onset, threshold=threshold))
-                settings = self._finding_most(streams, settings, timing)
             settings = self._told(settings, scored)
             rows = settings.metadata["budget"]
             if all(row["alarms"] <= row["allowed"] for row in rows):
@@ -797,46 +780,6 @@ class CalibratedAlarm:
             for budget, scores in scored.items()
         )
 
-    def _finding_most(
-        self, streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
-    ) -> AlarmSettings:
-        """The settings with the threshold, no lower, that finds most slips of the protocol.
-
-        A lower one raises alarms before the first release, which find nothing. Of thresholds that
-        find as many, the highest: it has the fewest false alarms.
-        """
-        paper = [one for one in streams if one.recording.scene == PAPER_SCENE]
-        least = _threshold(settings)
-        around = list[NDArray[Any]]()  # each slip
-        for stream, made in decide(paper, settings, timing):
-            score = (made.statistic if settings.onset is None else made.onset_score).numpy()
-            time_s = made.available_s.numpy()
-            around += [
-                score[abs(time_s - onset_s) <= _AROUND_S] for onset_s in stream.times.onsets_s
-            ]
-        around = [score for score in around if score.max(initial=-math.inf) > least]
-        if not around:
-            return settings
-        values = np.unique(np.concatenate(around))
-        most_missed = np.quantile([score.max() for score in around], _MOST_MISSED)
-        values = values[(values > least) & (values <= most_missed)]
-        values = values[:: max(1, len(values) // _NUM_TRIED)]
-        latency = LatencyParts(
-            timing.look_ahead / timing.sample_rate_hz, timing.bin_samples / timing.sample_rate_hz
-        )
-        best, most = settings, -1
-        for value in (least, *values.tolist()):
-            tried = _at_threshold(settings, value)
-            events = [
-                event
-                for made in decide(paper, tried, timing)
-                for event in recording_events(watched(*made), EventRules(), latency).onsets
-            ]
-            found = sum(event.outcome == "found" for event in events)
-            if found >= most:
-                best, most = tried, found
-        return best
-
     def _told(self, settings: AlarmSettings, scored: Mapping[Budget, _Scores]) -> AlarmSettings:
         """The settings, with what their thresholds gave on the recordings that they were set on."""
         rows = list[dict[str, Any]]()
@@ -859,8 +802,9 @@ class CalibratedAlarm:
             if budget.scene == self.slip_free and not budget.is_share:
                 hours = [len(own) * settings.decision_samples for own in scores.is_quiet]
                 rate = alarm_rate(alarms, [own / self._rate_per_h for own in hours], self.level)
+                onset = settings.onset
                 calibrated = {
-                    "value": _threshold(settings),
+                    "value": settings.threshold if onset is None else onset.threshold,
                     "target_per_hour": budget.limit,
                     "rate": asdict(rate),
                 }
