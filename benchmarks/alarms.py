@@ -161,18 +161,9 @@ class Alarms(Benchmark[Sizes]):
         say(f"alarm, seed {seed}")
         found = stage(detector, peers)
         detector.save(folder / "detector.pt")
-        found["settings"].pop("onset")
-        found.pop("reliability")
-        for by_role in found["scenes"].values():  # of these no table has more than the whole
-            for role in by_role.keys() & ROLES.keys():
-                for events in by_role[role].values():
-                    for part in ("per_material", "per_scene"):
-                        events.pop(part, None)
-        for method in found["methods"].values():
-            method.pop("metadata", None)
         if is_first:
             found["pulses"] = _pulses(detector, stage, found, job.sizes)
-        return found
+        return _told(found)
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Goals, budgets, slips, weak pulses."""
@@ -243,6 +234,31 @@ class Alarms(Benchmark[Sizes]):
         right.set_xlabel("pulse of a release, V per N (trained at 0.05, 0.15 and 0.5)")
         right.set_title("slips found, %, held-out materials, default thresholds", fontsize=10)
         right.legend(frameon=False, fontsize=7)
+
+
+def _told(found: dict[str, Any]) -> dict[str, Any]:
+    """Of what the stage tells, what is told here."""
+    names = ("num_onsets", "found", "early", "missed", "delay_ms", "delay_first_ms")
+
+    def of_methods(by_method: Mapping[str, Any]) -> dict[str, Any]:
+        told = {}
+        for method, events in by_method.items():
+            slid_mm = events.get("per_speed", {}).get("40", {}).get("slid_mm")
+            told[method] = {name: events.get(name) for name in names}
+            told[method]["per_speed"] = {"40": {"slid_mm": slid_mm}}
+        return told
+
+    return {
+        "settings": {"metadata": {"budget": found["settings"]["metadata"]["budget"]}},
+        "methods": list(found["methods"]),
+        "budget": found["budget"],
+        "events": {role: of_methods(of) for role, of in found["events"].items()},
+        "scenes": {
+            scene: {"unseen": of_methods(by_role.get("unseen", {}))}
+            for scene, by_role in found["scenes"].items()
+        },
+        **({"pulses": found["pulses"]} if "pulses" in found else {}),
+    }
 
 
 def _budget_rows(seeds: Mapping[str, Any]) -> list[dict[str, Any]]:
