@@ -156,8 +156,12 @@ def alarm_settings(hop: int) -> AlarmSettings:
 
 
 def onset_settings(detector: SlipDetector, samples: Array) -> AlarmSettings:
-    """Those of an alarm with an onset classifier, its numbers drawn; samples ``[T, C]``."""
-    settings, pool = alarm_settings(50), detector.pool
+    """Those of an alarm with an onset classifier, its numbers drawn; samples ``[T, C]``.
+
+    The rule on bins is that of ``+exp=onset``, and seldom raises an alarm.
+    """
+    rule, pool = Cusum(drift=3.0, evidence=0.5, ceiling=600.0), detector.pool
+    settings = AlarmSettings(50, Platt(1.0, 0.0), rule, 400.0, target_per_hour=1.0)
     plain = OnsetEvidence(pool.hand, pool.sample_rate_hz, 10, (1e-4,) * 4, (1e-3,) * 6)
     columns, _ = plain.columns(plain.blocks_of_recording(torch.from_numpy(samples.T)))
     draw = np.random.default_rng(0).standard_normal
