@@ -402,7 +402,7 @@ def test_every_experiment_runs_fast(name, tmp_path):
     # the first recordings of these are of scenes without slip
     num = {"confound": 2, "deploy": 2, "onset": 7, "biotacsp_dos": 2}.get(name, 1)
     told = write_biotac(tmp_path / "biotac") if name == "biotacsp_dos" else []
-    if name == "deploy":
+    if name in ("deploy", "onset"):
         told = ["~recipe.scene_weights"]  # of scenes that one recording does not have
     _, metrics = run_train(tmp_path / "run", *overrides, *told, f"trainer.fast_dev_run={num}")
     assert metrics["splits"]
