@@ -17,110 +17,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.special import betaincinv, gammainccinv, gammaincinv
-from torch import Tensor
+from scipy.special import betaincinv, gammaincinv
 
-_NUM_RESAMPLES = 2000
 _TRIED_ONE_BY_ONE = 500  # thresholds, the highest
 _MOST_TRIED = 200_000  # values of a score, the highest
 _LEAST_QUIET = 20  # quiet decisions for each that may reach a threshold
-
-
-@dataclass(frozen=True)
-class AlarmRate:
-    """Alarms of some recordings, and where the rate they were drawn from may lie.
-
-    Attributes:
-        alarms: how many there were.
-        hours: in how many hours.
-        per_hour: their quotient.
-        low: lower end of the interval of the rate, an hour.
-        high: upper end; finite and positive even without an alarm.
-        level: how often such an interval is meant to hold the rate.
-    """
-
-    alarms: int
-    hours: float
-    per_hour: float
-    low: float
-    high: float
-    level: float
-
-
-def poisson_interval(count: float, level: float = 0.95) -> tuple[float, float]:
-    """The exact central interval of a Poisson mean, given one count.
-
-    Raises:
-        ValueError: if the count is negative, or the level not between 0 and 1.
-
-    Reference:
-        Garwood (1936), Biometrika 28, 437-442: quantiles of chi-square with ``2 count`` and
-        ``2 count + 2`` degrees of freedom, halved. They make sense between whole counts too.
-    """
-    if not 0 <= count < math.inf:
-        raise ValueError(f"a count must not be negative, got {count}")
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie between 0 and 1, got {level}")
-    tail = (1 - level) / 2
-    low = float(gammaincinv(count, tail)) if count else 0.0
-    return low, float(gammainccinv(count + 1, tail))
-
-
-def alarm_rate(
-    counts: Tensor | Sequence[int],
-    hours: Tensor | Sequence[float],
-    level: float = 0.95,
-) -> AlarmRate:
-    """The rate of alarms over recordings, with an interval that knows of clusters.
-
-    Each end is the farthest of three: the percentile of the rate over resampled recordings, the
-    end of the exact interval of a Poisson count, and that of the count of clusters, as many as
-    make the variance between recordings, times alarms a cluster. The bootstrap alone falls short
-    where few clusters were seen, the Poisson interval wherever there are clusters. Of clusters
-    within one recording nothing is seen, nor of those too rare to have occurred.
-
-    Args:
-        counts: alarms of each recording, ``[R]``.
-        hours: how long each was watched, ``[R]``.
-        level: of the interval.
-
-    Raises:
-        ValueError: if these are not two rows of equal length, none is longer than 0 hours, or a
-            count is negative.
-    """
-    alarms = torch.as_tensor(counts, dtype=torch.float64).cpu()
-    watched = torch.as_tensor(hours, dtype=torch.float64).cpu()
-    if alarms.ndim != 1 or alarms.shape != watched.shape:
-        raise ValueError(
-            "expected one count and one number of hours for each recording, "
-            f"got {tuple(alarms.shape)} and {tuple(watched.shape)}"
-        )
-    if bool((alarms < 0).any() | (watched < 0).any()) or not float(watched.sum()) > 0:
-        raise ValueError(
-            "counts and hours must not be negative and some time must have been watched, "
-            f"got {int(alarms.sum())} alarms in {float(watched.sum()):g} h"
-        )
-    total, length = int(alarms.sum()), float(watched.sum())
-    ends = [poisson_interval(total, level)]
-    if total and len(alarms) > 1:
-        surplus = (alarms - watched * (total / length)).square().sum() / total
-        cluster = max(1.0, float(surplus) * len(alarms) / (len(alarms) - 1))  # alarms in one
-        low, high = poisson_interval(total / cluster, level)
-        ends.append((low * cluster, high * cluster))
-        tails = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
-        generator, rates = torch.Generator().manual_seed(0), []
-        has_time = watched > 0
-        size = int(has_time.sum())
-        for first in range(0, _NUM_RESAMPLES, rows := max(1, 2**20 // size)):
-            shape = (min(rows, _NUM_RESAMPLES - first), size)
-            drawn = has_time.nonzero()[:, 0][torch.randint(size, shape, generator=generator)]
-            rates.append(alarms[drawn].sum(-1) / watched[drawn].sum(-1))
-        low, high = (torch.cat(rates).quantile(tails) * length).tolist()
-        ends.append((low, high))
-    low, high = min(end[0] for end in ends) / length, max(end[1] for end in ends) / length
-    return AlarmRate(total, length, total / length, low, high, level)
 
 
 def _alarms(above: NDArray[np.int64], rearm: int, refractory: int) -> NDArray[np.int64]:

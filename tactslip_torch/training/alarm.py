@@ -17,7 +17,7 @@ import statistics
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby, product
 from typing import Any, NamedTuple
@@ -51,6 +51,7 @@ from tactslip_torch.onset.decisions import (
     score_stream,
 )
 from tactslip_torch.onset.events import (
+    Bootstrap,
     EventRules,
     LatencyParts,
     Watched,
@@ -63,7 +64,6 @@ from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN, Rule, rule_from
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.onset.thresholds import (
     Budget,
-    alarm_rate,
     false_alarms,
     lowest_threshold,
 )
@@ -800,13 +800,14 @@ class CalibratedAlarm:
                 }
             )
             if budget.scene == self.slip_free and not budget.is_share:
-                hours = [len(own) * settings.decision_samples for own in scores.is_quiet]
-                rate = alarm_rate(alarms, [own / self._rate_per_h for own in hours], self.level)
+                decisions_h = self._rate_per_h / settings.decision_samples
+                hours = [len(own) / decisions_h for own in scores.is_quiet]
+                rate = Bootstrap(len(hours), self.level).rate(alarms, hours)
                 onset = settings.onset
                 calibrated = {
                     "value": settings.threshold if onset is None else onset.threshold,
                     "target_per_hour": budget.limit,
-                    "rate": asdict(rate),
+                    "rate": {"alarms": sum(alarms), "hours": sum(hours), **(rate or {})},
                 }
         metadata = {"slip_free": self.slip_free, "budget": rows, "calibrated": calibrated}
         return replace(settings, metadata=metadata | {"confidence": self.confidence})
