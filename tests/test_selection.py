@@ -74,12 +74,14 @@ def test_merged_parts_equal_the_whole_in_any_split_and_order(cuts, order, seed, 
     parts = [moments_of(features[a:b], labels[a:b]) for a, b in itertools.pairwise(edges)]
     whole = moments_of(features, labels)
     order.shuffle(parts)
-    assert_same(ClassMoments.merged(parts), whole)
+    merged = ClassMoments(12)
+    for part in parts:
+        merged.merge(part)
+    assert_same(merged, whole)
     updated = ClassMoments(12)
     for a, b in itertools.pairwise(edges):
         updated.update(torch.from_numpy(features[a:b]), torch.from_numpy(labels[a:b]))
         assert_same(updated, moments_of(features[:b], labels[:b]))  # also between updates
-    assert_same(ClassMoments.from_state_dict(whole.state_dict()), whole)
 
 
 def test_moments_do_not_cancel_on_a_large_offset(rng):
@@ -217,10 +219,6 @@ def test_errors():
     for shape, of_labels in [((5, 4), (5,)), ((5, 3), (4,)), ((5, 3), (5, 1)), ((5, 3), ())]:
         with pytest.raises(ValueError, match=rf"\[N, 3\] and .*\({shape[0]}, {shape[1]}\) and \("):
             ClassMoments(3).update(torch.zeros(shape), torch.zeros(of_labels))
-    with pytest.raises(ValueError, match="3 and 4 features"):
-        ClassMoments(3).merge(ClassMoments(4))
-    with pytest.raises(ValueError, match="no moments"):
-        ClassMoments.merged([])
     with pytest.raises(ValueError, match=r"float64; hand float32, as the data module does"):
         ClassMoments(3).update(torch.zeros(5, 3).double(), torch.zeros(5))
     broken = torch.zeros(5, 3)

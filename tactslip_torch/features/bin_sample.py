@@ -8,9 +8,9 @@ order, not on who saw them, and on no random state.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -57,8 +57,7 @@ class SampledBins:
         return _uniform((self.recording_names[recording], index) for recording, index in places)
 
 
-@dataclass
-class _Stratum:
+class _Stratum(NamedTuple):
     """Bins of one group and class: how many there were, and those of smallest key, ascending."""
 
     num_seen: int
@@ -93,18 +92,7 @@ class BinSample:
         Shape:
             - features: ``[N, F]``, float32
             - is_slip: ``[N]``
-
-        Raises:
-            ValueError: for another shape or dtype; nothing is added then.
         """
-        if features.ndim != 2 or is_slip.shape != features.shape[:1]:
-            raise ValueError(
-                f"expected features [N, F] and is_slip [N], got {tuple(features.shape)} and "
-                f"{tuple(is_slip.shape)}"
-            )
-        if features.dtype != torch.float32:
-            raise ValueError(f"a sample keeps float32 features, got {features.dtype}")
-        self._check_width(features.shape[1])
         features, is_slip = features.detach().cpu(), is_slip.cpu().bool()
         for label in (False, True):
             rows = (is_slip == label).nonzero().squeeze(-1).tolist()
@@ -113,75 +101,33 @@ class BinSample:
                 self._add((group, label), _Stratum(len(rows), places, features[rows]))
 
     def merge(self, other: BinSample) -> None:
-        """Add the bins of another sample; they must be of other recordings (not checked).
-
-        Raises:
-            ValueError: if the samples differ in size or features; nothing is added then.
-        """
-        if self.most != other.most:
-            raise ValueError(f"cannot merge samples of {self.most} and of {other.most} bins")
-        if (width := other._width()) is not None:
-            self._check_width(width)
+        """Add the bins of another sample of that size; of other recordings (not checked)."""
         for name, part in other._strata.items():
             self._add(name, part)
 
     def bins(self) -> SampledBins:
         """The sample, in an order that depends on the bins alone."""
-        facts, tensors = self.state_dict().values()
-        kept = torch.tensor([num_kept for *_, num_kept in facts["strata"]], dtype=torch.int64)
-        seen = torch.tensor([num for *_, num, _ in facts["strata"]], dtype=torch.float64)
-        groups = sorted({group for group, *_ in facts["strata"]})
-        group = torch.tensor([groups.index(g) for g, *_ in facts["strata"]], dtype=torch.int64)
-        is_slip = torch.tensor([label for _, label, *_ in facts["strata"]], dtype=torch.bool)
-        # by recording, then by number
-        order = tensors["bin_index"].argsort(stable=True)
-        order = order[tensors["recording"][order].argsort(stable=True)]
-        stratum = torch.arange(len(kept)).repeat_interleave(kept)[order]
-        return SampledBins(
-            features=tensors["features"][order],
-            is_slip=is_slip[stratum],
-            group=group[stratum],
-            group_names=tuple(groups),
-            recording=tensors["recording"][order],
-            recording_names=tuple(facts["recordings"]),
-            bin_index=tensors["bin_index"][order],
-            sample_weight=(seen / kept)[stratum],
-        )
-
-    def state_dict(self) -> dict[str, Any]:
-        """``facts`` that JSON holds and ``tensors`` by name, the same for the same bins."""
         strata = sorted(self._strata.items())
-        places = [place for _, part in strata for place in part.places]
-        recordings = sorted({recording for _, recording, _ in places})
-        number = {recording: i for i, recording in enumerate(recordings)}
-        features = [part.features for _, part in strata]
-        return {
-            "facts": {
-                "most": self.most,
-                "strata": [[*name, part.num_seen, len(part.places)] for name, part in strata],
-                "recordings": recordings,
-            },
-            "tensors": {
-                "recording": torch.tensor([number[r] for _, r, _ in places], dtype=torch.int64),
-                "bin_index": torch.tensor([i for _, _, i in places], dtype=torch.int64),
-                "features": torch.cat(features) if features else torch.zeros(0, 0),
-            },
-        }
-
-    @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any]) -> BinSample:
-        """The sample that ``state_dict`` described."""
-        facts, tensors = state["facts"], state["tensors"]
-        sample = cls(facts["most"])
-        recordings = [facts["recordings"][i] for i in tensors["recording"].tolist()]
-        bins = zip(recordings, tensors["bin_index"].tolist(), strict=True)
-        places = [(_key(*place), *place) for place in bins]
-        stop = 0
-        for group, label, num_seen, num_kept in facts["strata"]:
-            own = slice(stop, stop := stop + num_kept)
-            part = _Stratum(num_seen, places[own], tensors["features"][own])
-            sample._add((group, label), part)
-        return sample
+        rows = [
+            (recording, index, group, label, part.num_seen / len(part.places))
+            for (group, label), part in strata
+            for _, recording, index in part.places
+        ]
+        order = sorted(range(len(rows)), key=rows.__getitem__)
+        columns = list(zip(*(rows[i] for i in order), strict=True)) or [()] * 5
+        recordings, groups = sorted(set(columns[0])), sorted({group for (group, _), _ in strata})
+        number = {name: i for i, name in enumerate(recordings)}
+        whole = [part.features for _, part in strata] or [torch.zeros(0, 0)]
+        return SampledBins(
+            features=torch.cat(whole)[order],
+            is_slip=torch.tensor(columns[3], dtype=torch.bool),
+            group=torch.tensor([groups.index(name) for name in columns[2]], dtype=torch.int64),
+            group_names=tuple(groups),
+            recording=torch.tensor([number[name] for name in columns[0]], dtype=torch.int64),
+            recording_names=tuple(recordings),
+            bin_index=torch.tensor(columns[1], dtype=torch.int64),
+            sample_weight=torch.tensor(columns[4], dtype=torch.float64),
+        )
 
     def _add(self, name: tuple[str, bool], part: _Stratum) -> None:
         if name in self._strata:
@@ -194,14 +140,6 @@ class BinSample:
         order = sorted(range(len(part.places)), key=part.places.__getitem__)[: self.most]
         places = [part.places[i] for i in order]
         self._strata[name] = _Stratum(part.num_seen, places, part.features[order])
-
-    def _width(self) -> int | None:
-        """How many features the bins have; None before the first."""
-        return next((part.features.shape[1] for part in self._strata.values()), None)
-
-    def _check_width(self, width: int) -> None:
-        if self._width() not in (None, width):
-            raise ValueError(f"the sample has bins of {self._width()} features, got {width}")
 
 
 def _uniform(places: Iterable[tuple[str, int]]) -> Tensor:

@@ -9,7 +9,6 @@ what repeats, and what costs. Any number of threads gives the same ranking.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Literal
 
 import torch
@@ -84,48 +83,10 @@ class ClassMoments:
                 away = own - own[0]  # exactly 0 if constant
                 part.count[label], part.mean[label] = len(own), own[0] + away.mean(0)
                 part.sum_sq_dev[label] = (away - away.mean(0)).square().sum(0)
-        self._add(part)
+        self.merge(part)
 
-    def merge(self, other: ClassMoments) -> ClassMoments:
-        """The moments of both sets of bins together, as a new object.
-
-        Raises:
-            ValueError: if the numbers of features differ.
-        """
-        return self.merged([self, other])
-
-    @classmethod
-    def merged(cls, parts: Iterable[ClassMoments]) -> ClassMoments:
-        """All parts together.
-
-        Raises:
-            ValueError: if there is none, or the numbers of features differ.
-        """
-        total = None
-        for part in parts:
-            total = total or cls(part.num_features)
-            if total.num_features != part.num_features:
-                raise ValueError(
-                    f"cannot merge moments of {total.num_features} and {part.num_features} features"
-                )
-            total._add(part)
-        if total is None:
-            raise ValueError("no moments to merge")
-        return total
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Plain tensors, for files and checkpoints."""
-        return {"count": self.count, "mean": self.mean, "sum_sq_dev": self.sum_sq_dev}
-
-    @classmethod
-    def from_state_dict(cls, state: dict[str, Tensor]) -> ClassMoments:
-        """The moments that ``state_dict`` described."""
-        moments = cls(0)
-        moments.count, moments.mean = state["count"], state["mean"]
-        moments.sum_sq_dev = state["sum_sq_dev"]
-        return moments
-
-    def _add(self, other: ClassMoments) -> None:
+    def merge(self, other: ClassMoments) -> None:
+        """Add the bins of other moments, of as many features."""
         count = self.count + other.count
         share = (other.count / count.clamp(min=1))[:, None]
         apart = other.mean - self.mean

@@ -71,11 +71,14 @@ class TrainingStatistics:
             ValueError: if a recording is in both, or the two differ in the number of features
                 or in the size of the sample.
         """
-        if (ours := self.sample.most) != (theirs := other.sample.most):
-            raise ValueError(f"cannot merge statistics of {ours} and {theirs} sample_bins")
-        moments = self.moments.merge(other.moments)
+        for what, ours, theirs in (
+            ("features", self.num_features, other.num_features),
+            ("sample_bins", self.sample.most, other.sample.most),
+        ):
+            if ours != theirs:
+                raise ValueError(f"cannot merge statistics of {ours} and {theirs} {what}")
         self.seen_batches.merge(other.seen_batches)
-        self.moments = moments
+        self.moments.merge(other.moments)
         self.sample.merge(other.sample)
         self._widen(other.minimum, other.maximum)
 
