@@ -19,9 +19,7 @@ from tactslip_torch.training.datamodule import SlipDataModule
 from tactslip_torch.training.learner import (
     BASELINES,
     Baselines,
-    LogisticRegression,
     PooledNumber,
-    RandomForest,
     SimpleStatistics,
 )
 from tactslip_torch.training.recipe import best_threshold
@@ -100,35 +98,6 @@ def test_the_pooled_number_is_the_best_of_all_means_and_deviations(fitted):
     assert str(found.name) == "PVDF A3 time iqr [mean]"
     assert found.rule.sign == -1
     assert torch.equal(found(features), sample.is_slip)
-
-
-def test_logistic_regression_is_scikit_learns():
-    linear = pytest.importorskip("sklearn.linear_model")
-    scaling = pytest.importorskip("sklearn.preprocessing")
-    _, sample = sampled(60)
-    rng = np.random.default_rng(4)
-    columns = 3.0 + rng.standard_normal((len(sample.is_slip), 5)) * [1, 1e-3, 1e3, 1, 0]
-    columns[:, 0] += sample.is_slip.numpy()
-    found = LogisticRegression.fit(torch.from_numpy(columns), sample)
-    scaler = scaling.StandardScaler().fit(columns)
-    made = linear.LogisticRegression(C=found.penalty, class_weight="balanced", tol=1e-10)
-    made.fit(scaler.transform(columns), sample.is_slip, sample.sample_weight)
-    wanted = made.decision_function(scaler.transform(columns))
-    score = torch.from_numpy(columns) @ found.weights + found.constant
-    np.testing.assert_allclose(score, wanted, atol=1e-3)
-
-
-def test_the_forest_votes_as_scikit_learns_does():
-    ensemble = pytest.importorskip("sklearn.ensemble")
-    _, sample = sampled(60)
-    rng = np.random.default_rng(4)
-    columns = torch.from_numpy(rng.standard_normal((len(sample.is_slip), 6)))
-    made = ensemble.RandomForestClassifier(100, class_weight="balanced", random_state=0)
-    made.fit(columns.numpy(), sample.is_slip, sample_weight=sample.sample_weight)
-    others = torch.from_numpy(rng.standard_normal((400, 6)))
-    found = RandomForest(columns, sample)(others)
-    right = found.numpy() == made.predict(others.numpy())
-    assert right.mean() > 0.99  # equal votes are decided by rounding
 
 
 def test_one_class_is_refused():

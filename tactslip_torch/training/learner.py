@@ -27,7 +27,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import lightning as L
 import numpy as np
@@ -75,9 +75,7 @@ from tactslip_torch.training.recipe import (
     FeatureSelection,
     FeatureThreshold,
     Recipe,
-    balanced_accuracy,
     best_threshold,
-    check_classes,
     has_both_classes,
     sample_groups,
 )
@@ -598,145 +596,55 @@ class SimpleStatistics:
         return torch.cat([mean, fast_mean, std, fast_std, rms, fast_rms], 1)
 
 
-@dataclass(frozen=True)
-class LogisticRegression:
-    """A linear decision, ``weights @ x + constant >= 0``.
+def _fit_regression(columns: Tensor, sample: SampledBins, *, with_logs: bool = False) -> Any:
+    """scikit-learn's logistic regression of standardised columns ``[n, K]`` of sampled bins.
 
-    Args:
-        weights: of the columns or, with ``log_floor``, of them and of their logarithms.
-        constant: added.
-        penalty: scikit-learn's ``C``.
-        log_floor: below which the logarithm of a magnitude levels out; ``None`` takes none.
-
-    Shape:
-        - weights: ``[K]``, float64, ``[2 K]`` with logarithms; log_floor: ``[K]``
+    Its ``C`` is chosen by leaving groups out unless columns are many: the best mean balanced
+    accuracy, the strongest penalty of equals. ``with_logs`` adds the logarithm of each column's
+    magnitude: amplitudes range over decades, so logarithms are worth seven points on the simulated
+    hand.
     """
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.model_selection import GridSearchCV
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
-    weights: Tensor
-    constant: float
-    penalty: float
-    log_floor: Tensor | None = None
-
-    @classmethod
-    def fit(
-        cls, columns: Tensor, sample: SampledBins, *, with_logs: bool = False
-    ) -> LogisticRegression:
-        """Fit standardised columns, with ``C`` chosen by leaving groups out unless they are many.
-
-        Args:
-            columns: of the sampled bins.
-            sample: their labels, weights and groups.
-            with_logs: add the logarithm of each column's magnitude: amplitudes range over decades,
-                so logarithms are worth seven points on the simulated hand.
-
-        Shape:
-            - columns: ``[n, K]``
-
-        Raises:
-            ValueError: if a class is absent.
-        """
-        check_classes(sample.is_slip)
-        x, floor = columns.double(), None
-        if with_logs:
-            floor = LOG_FLOOR * columns.abs().median(0).values
-            floor = torch.where(floor > 0, floor, 1.0)
-            x = _with_logs(x, floor)
-        sd, centre = torch.std_mean(x, 0, correction=0)
-        scale = torch.where(sd > 0, sd, 1.0)
-        z = (x - centre) / scale
-        penalty = WIDE_PENALTY if z.shape[1] > WIDE else _chosen_penalty(z, sample)
-        weights, constant = _fitted_regression(z, sample, slice(None), penalty)
-        constant -= float(weights @ (centre / scale))
-        return cls(weights / scale, constant, penalty, floor)
-
-    def __call__(self, columns: Tensor) -> Tensor:
-        """Decisions, ``[N, K] -> [N]``, bool."""
-        x = columns.double()
-        if self.log_floor is not None:
-            x = _with_logs(x, self.log_floor)
-        return x @ self.weights + self.constant >= 0
-
-    def metadata(self) -> dict[str, Any]:
-        """What was chosen, JSON-able."""
-        return {"C": self.penalty}
-
-
-def _with_logs(columns: Tensor, floor: Tensor) -> Tensor:
-    return torch.cat([columns, (columns.abs() + floor).log()], 1)
-
-
-def _chosen_penalty(z: Tensor, sample: SampledBins) -> float:
-    """The ``C`` of the best balanced accuracy on groups left out; the strongest of equals."""
+    before = make_pipeline(StandardScaler())
+    if with_logs:
+        floor = LOG_FLOOR * columns.abs().median(0).values
+        floor = torch.where(floor > 0, floor, 1.0)
+        logs = FunctionTransformer(_with_logs, kw_args={"floor": floor.numpy()})
+        before = make_pipeline(logs, StandardScaler())
+    z = before.fit_transform(columns.double().numpy())
     groups, names = sample_groups(sample)
     num_folds = min(len(names), MOST_FOLDS)
-    folds = [groups % num_folds == fold for fold in range(num_folds)]
-    folds = [out for out in folds if has_both_classes(sample.is_slip[~out])]
-    if num_folds < 2 or not folds:
-        return WIDE_PENALTY
-    means = {}
-    for penalty in PENALTIES:
-        found = []
-        for out in folds:
-            weights, constant = _fitted_regression(z, sample, ~out, penalty)
-            says_slip = z[out] @ weights + constant >= 0
-            found.append(balanced_accuracy(says_slip, sample.is_slip[out]))
-        known = [value for value in found if value is not None]
-        means[penalty] = sum(known) / max(len(known), 1)
-    return max(means, key=means.__getitem__)
+    splits = [(groups % num_folds != fold, groups % num_folds == fold) for fold in range(num_folds)]
+    folds = [
+        [part.nonzero()[:, 0].numpy() for part in split]
+        for split in splits
+        if all(has_both_classes(sample.is_slip[part]) for part in split)
+    ]
+    is_wide = z.shape[1] > WIDE
+    solver = "lbfgs" if is_wide else "newton-cholesky"
+    made = LogisticRegression(C=WIDE_PENALTY, class_weight="balanced", max_iter=2000, solver=solver)
+    if folds and not is_wide:
+        made = GridSearchCV(made, {"C": PENALTIES}, scoring="balanced_accuracy", cv=folds)
+    made.fit(z, sample.is_slip.numpy(), sample_weight=sample.sample_weight.numpy())
+    return make_pipeline(before, getattr(made, "best_estimator_", made))
 
 
-def _fitted_regression(
-    z: Tensor, sample: SampledBins, rows: Tensor | slice, penalty: float
-) -> tuple[Tensor, float]:
-    """Weights and constant of some bins, both classes of one weight."""
-    from sklearn.linear_model import LogisticRegression as Regression
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # sklearn's own
-
-    solver = "lbfgs" if z.shape[1] > WIDE else "newton-cholesky"
-    made = Regression(C=penalty, class_weight="balanced", max_iter=2000, solver=solver)
-    weights = sample.sample_weight[rows].numpy()
-    with warnings.catch_warnings(), threadpool_limits(1):  # small: threads would wait
-        warnings.simplefilter("ignore")  # newton-cholesky falls back to lbfgs by itself
-        made.fit(z[rows].numpy(), sample.is_slip[rows].numpy(), weights)
-    return torch.from_numpy(made.coef_[0]), float(made.intercept_[0])
+def _with_logs(columns: NDArray[np.float64], floor: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Columns, and the logarithms of their magnitudes, which level out at the floor."""
+    return np.concatenate([columns, np.log(np.abs(columns) + floor)], 1)
 
 
-class RandomForest:
-    """scikit-learn's random forest.
+def _fit_forest(columns: Tensor, sample: SampledBins) -> Any:
+    """scikit-learn's random forest of columns ``[n, K]`` of sampled bins."""
+    from sklearn.ensemble import RandomForestClassifier
 
-    Shape:
-        - columns: ``[n, K]``, of the sampled bins
-
-    Raises:
-        ValueError: if a class is absent.
-    """
-
-    def __init__(self, columns: Tensor, sample: SampledBins) -> None:
-        from sklearn.ensemble import RandomForestClassifier
-
-        check_classes(sample.is_slip)
-        made = RandomForestClassifier(
-            NUM_TREES, class_weight="balanced", random_state=0, n_jobs=2, max_features="sqrt"
-        )
-        truth, weights = sample.is_slip.numpy(), sample.sample_weight.numpy()
-        made.fit(_single(columns), truth, sample_weight=weights)
-        self._trees = [tree.tree_ for tree in made.estimators_]
-
-    def __call__(self, columns: Tensor) -> Tensor:
-        """Decisions by the mean of the trees' probabilities, ``[N, K] -> [N]``, bool."""
-        x = _single(columns)
-        slip = sum(tree.predict(x).reshape(len(x), 2)[:, 1] for tree in self._trees)
-        return torch.from_numpy(np.asarray(slip) > len(self._trees) / 2)
-
-    def metadata(self) -> dict[str, Any]:
-        """Its size, JSON-able."""
-        return {"trees": len(self._trees)}
-
-
-def _single(columns: Tensor) -> NDArray[np.float32]:
-    """As trees take them."""
-    x: NDArray[np.float32] = columns.float().contiguous().numpy()
-    return x
+    made = RandomForestClassifier(NUM_TREES, class_weight="balanced", random_state=0, n_jobs=2)
+    truth, weights = sample.is_slip.numpy(), sample.sample_weight.numpy()
+    return made.fit(columns.numpy(), truth, sample_weight=weights).set_params(n_jobs=None)
 
 
 @dataclass(frozen=True)
@@ -800,29 +708,25 @@ class PooledNumber:
         return cls(layer, tuple(pool.places(layer.inputs)), rule)
 
 
-Method = LogisticRegression | RandomForest | PooledNumber
-
-
 class Baselines:
     """Fitted baselines.
 
     Args:
         pool: of the features.
         pooled: the best pooled number.
-        others: by name which columns each takes, ``"scaled"`` ones of the detector or those of
-            ``"simple"`` statistics, and the baseline.
-        num_bins: that all were fitted on.
+        others: estimators of scikit-learn by name.
+        about: what is told of each, by name, JSON-able.
     """
 
     def __init__(
         self,
         pool: FeaturePool,
         pooled: PooledNumber,
-        others: Mapping[str, tuple[Literal["scaled", "simple"], Method]] | None = None,
-        num_bins: int | None = None,
+        others: Mapping[str, Any] | None = None,
+        about: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
-        self.pooled, self.num_bins = pooled, num_bins
-        self._others = dict(others or {})
+        self.pooled, self._others = pooled, dict(others or {})
+        self._about = {POOLED_NUMBER: pooled.metadata()} | dict(about or {})
         self._statistics = SimpleStatistics(pool) if self._others else None
 
     @classmethod
@@ -837,16 +741,28 @@ class Baselines:
         Raises:
             ValueError: if a class is absent.
         """
+        from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # sklearn's own
+
+        pooled = PooledNumber.fit(pool, sample)  # refuses one class
         x = SimpleStatistics(pool)(sample.features)
-        others: dict[str, tuple[Literal["scaled", "simple"], Method]] = {
-            "logistic_regression": ("scaled", LogisticRegression.fit(scaled, sample)),
-            "logistic_regression_simple": (
-                "simple",
-                LogisticRegression.fit(x, sample, with_logs=True),
-            ),
-            "random_forest_simple": ("simple", RandomForest(x, sample)),
+        with warnings.catch_warnings(), threadpool_limits(1):  # small: threads would wait
+            warnings.simplefilter("ignore")  # newton-cholesky falls back to lbfgs by itself
+            on_scaled = _fit_regression(scaled, sample)
+            on_simple = _fit_regression(x, sample, with_logs=True)
+            others = {
+                "logistic_regression": on_scaled,
+                "logistic_regression_simple": on_simple,
+                "random_forest_simple": _fit_forest(x, sample),
+            }
+        about = {
+            POOLED_NUMBER: pooled.metadata(),
+            "logistic_regression": {"C": on_scaled[-1].C},
+            "logistic_regression_simple": {"C": on_simple[-1].C},
+            "random_forest_simple": {"trees": NUM_TREES},
         }
-        return cls(pool, PooledNumber.fit(pool, sample), others, len(sample.is_slip))
+        num_bins = len(sample.is_slip)
+        about = {name: own | {"num_bins": num_bins} for name, own in about.items()}
+        return cls(pool, pooled, others, about)
 
     def __call__(self, features: Tensor, scaled: Tensor) -> dict[str, Tensor]:
         """Decisions by name.
@@ -856,17 +772,17 @@ class Baselines:
             - scaled: ``[N, K]``, columns of the detector
             - output: each ``[N]``, bool
         """
-        columns = {"scaled": scaled}
+        found = {POOLED_NUMBER: self.pooled(features)}
         if self._statistics is not None:
-            columns["simple"] = self._statistics(features)
-        found = {name: made(columns[kind]) for name, (kind, made) in self._others.items()}
-        return {POOLED_NUMBER: self.pooled(features)} | found
+            simple = self._statistics(features)
+            for name, made in self._others.items():
+                x = (simple if name.endswith("_simple") else scaled.double()).numpy()
+                found[name] = torch.from_numpy(made.predict(x) if len(x) else np.zeros(0, bool))
+        return found
 
     def metadata(self) -> dict[str, dict[str, Any]]:
         """What each is, by name, JSON-able."""
-        bins = {} if self.num_bins is None else {"num_bins": self.num_bins}
-        others = {name: made.metadata() | bins for name, (_, made) in self._others.items()}
-        return {POOLED_NUMBER: self.pooled.metadata() | bins} | others
+        return {name: dict(own) for name, own in self._about.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """What a detector keeps: the best pooled number, JSON-able; the others are too large."""
