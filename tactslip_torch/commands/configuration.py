@@ -21,7 +21,7 @@ import shutil
 import tempfile
 import textwrap
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
@@ -32,11 +32,13 @@ from typing import Any, NamedTuple
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
 from hydra import initialize_config_dir
+from hydra._internal.callbacks import Callbacks
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.utils import run_job
 from hydra.errors import HydraException
-from hydra.types import RunMode
+from hydra.types import HydraContext, RunMode
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -201,8 +203,8 @@ class Composed:
         folder: of configuration of the user's own, ``--config-dir``.
 
     Attributes:
+        whole: all of it, Hydra's own section as well, which ``run`` uses up.
         config: without Hydra's own section, unresolved.
-        folders: of the results, unresolved: ``hydra.run.dir``, and ``hydra.sweep.dir`` of a sweep.
         keys: those that may be set, in the order of their sections.
         groups: those that apply.
         head: what the command does.
@@ -218,13 +220,13 @@ class Composed:
         name, given = command.replace("-", "_"), list(overrides)
         if folder is not None:
             given.append(f"hydra.searchpath=[{Path(folder).absolute().as_uri()}]")
-        with _loader() as loader:
-            whole = loader.load_configuration(name, given, RunMode.RUN)
+        with _loader(name) as loader:
+            self.whole: DictConfig = loader.load_configuration(name, given, RunMode.RUN)
             files = loader.compute_defaults_list(name, given, RunMode.RUN).defaults
-        OmegaConf.set_struct(whole, False)
-        hydra: Any = OmegaConf.to_container(whole.pop("hydra"))
-        self.folders = {f"hydra.{of}.dir": str(hydra[of]["dir"]) for of in ("run", "sweep")}
-        self.config: DictConfig = whole
+        self._loader = loader
+        own_keys = [key for key in self.whole if key != "hydra"]
+        self.config: DictConfig = OmegaConf.masked_copy(self.whole, own_keys)
+        OmegaConf.set_struct(self.config, False)
         own = comments_of(conf_dir() / f"{name}.yaml")
         self.head, self.examples = own.head, own.examples
         self._files: list[tuple[Path, str]] = []
@@ -238,9 +240,27 @@ class Composed:
             for key, text in comments_of(path).keys.items():
                 said.setdefault(prefix + key, text)  # the base describes
         self._said = said
-        plain: Any = OmegaConf.to_container(whole, resolve=False)
+        plain: Any = OmegaConf.to_container(self.config, resolve=False)
         self.keys = tuple(_keys(plain, "", said))
         self.groups = tuple(self._groups(name, own.groups))
+
+    def run(self, task: Callable[[DictConfig], None]) -> None:
+        """Carry out a task as ``hydra.main`` does, which would compose everything twice more.
+
+        Args:
+            task: given the configuration, with ``HydraConfig`` set, in a folder for results that
+                holds the configuration and, as it says, the log.
+
+        Raises:
+            Exception: what the task raises.
+        """
+        self.whole.hydra.mode = RunMode.RUN
+        callbacks, name = Callbacks(self.whole), self.whole.hydra.job.config_name
+        callbacks.on_run_start(self.whole, config_name=name)
+        context = HydraContext(self._loader, callbacks)
+        done = run_job(task, self.whole, "hydra.run.dir", None, context)
+        callbacks.on_run_end(self.whole, config_name=name, job_return=done)
+        _ = done.return_value  # raises what the task did
 
     @cached_property
     def known(self) -> dict[str, Any]:
@@ -284,12 +304,12 @@ class Composed:
 
 
 @contextmanager
-def _loader() -> Iterator[Any]:
-    """Hydra's loader of this configuration, which leaves no mark on the process."""
+def _loader(name: str) -> Iterator[Any]:
+    """Hydra's loader for a job of this name, which leaves no mark on the process."""
     before = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        with initialize_config_dir(str(conf_dir()), name, "1.3"):
             yield GlobalHydra.instance().config_loader()
     finally:
         GlobalHydra.instance().hydra = before
@@ -849,8 +869,10 @@ def folder_problem(composed: Composed, *, is_sweep: bool = False) -> str | None:
         >>> folder_problem(Composed("evaluate", ["hydra.run.dir=/dev/null/recordings"]))
         'cannot write to hydra.run.dir=/dev/null/recordings: Not a directory at /dev/null'
     """
-    name = "hydra.sweep.dir" if is_sweep else "hydra.run.dir"
-    wanted = composed.folders[name].partition("${")[0]  # what it holds of the configuration is new
+    hydra: Any = OmegaConf.to_container(composed.whole.hydra)
+    of = "sweep" if is_sweep else "run"
+    name, wanted = f"hydra.{of}.dir", str(hydra[of]["dir"])
+    wanted = wanted.partition("${")[0]  # what it holds of the configuration is new
     if wanted == ".":
         return None
     folder = Path(wanted).absolute()

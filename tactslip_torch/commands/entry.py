@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.types import RunMode
@@ -71,9 +72,13 @@ def entry_point(
 
     def main() -> None:
         with stopping(), errors_in_one_line():
-            arguments = sys.argv[1:]
-            known, composed = checked(command, arguments)
-            is_sweep = bool({"-m", "--multirun"} & set(arguments))
+            arguments, further = sys.argv[1:], []
+            if "TORCHELASTIC_RUN_ID" in os.environ and not is_first_process():
+                further = ["hydra.run.dir=.", "hydra.output_subdir=null"]
+                further.append("hydra/job_logging=stdout")
+            known, composed = checked(command, [*further, *arguments])
+            options = get_args_parser().parse_args(known)
+            is_sweep = options.multirun
             if composed and (problem := folder_problem(composed, is_sweep=is_sweep)):
                 raise Mistake(problem)
 
@@ -100,12 +105,11 @@ def entry_point(
 
             in_folder.__module__ = f"{__package__}.{name}"  # Hydra names job and log file by it
             sys.argv[1:] = known
-            if "TORCHELASTIC_RUN_ID" in os.environ and not is_first_process():
-                nowhere = ["hydra.run.dir=.", "hydra.output_subdir=null"]
-                sys.argv[1:] = [*nowhere, "hydra/job_logging=stdout", *known]
-            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=name)(
-                in_folder
-            )()
+            if composed and not (is_sweep or options.cfg or options.resolve or options.help):
+                composed.run(in_folder)
+            else:
+                of_hydra = hydra.main(str(conf_dir()), name, version_base="1.3")
+                of_hydra(in_folder)()
             if runs and is_first_process():
                 _compare(runs)
 
