@@ -10,7 +10,7 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from tactslip_torch.live.sinks import Block, Counts, Event, Sink, Source
+from tactslip_torch.live.sinks import Block, Counts, Event, Placed, Sink, Source, merged
 from tactslip_torch.onset.decisions import Decisions
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.runtime import one_thread
@@ -85,7 +85,7 @@ class _State:
         self._source, self._stream, self._sinks, self.counts = source, stream, sinks, counts
         self._rate = stream.detector.pool.sample_rate_hz
         self._most = max(1, round(queue_s * self._rate))
-        self._queue: deque[tuple[int, Block] | Event] = deque()
+        self._queue: deque[Placed | Event] = deque()
         self._waiting = 0  # samples in it
         self._changed = threading.Condition()
         self._is_over = False
@@ -124,7 +124,7 @@ class _State:
                     position += max(lacking, round(_LONGER_THAN_GAP_S * self._rate))
                 is_broken, came_s = False, now_s
                 self.counts.received += len(item.samples)
-                self._put((position, item))
+                self._put(Placed(position, item))
                 position += num
                 if self._is_over:
                     break
@@ -136,13 +136,13 @@ class _State:
             self._is_over = True
             self._changed.notify_all()
 
-    def _put(self, item: tuple[int, Block] | Event) -> None:
+    def _put(self, item: Placed | Event) -> None:
         with self._changed:
             if isinstance(item, Event):
                 self._queue.append(item)
                 self._changed.notify_all()
                 return
-            num = len(item[1].samples)
+            num = len(item.block.samples)
             while not self._source.is_live and self._waiting >= self._most and not self._is_over:
                 self._changed.wait(0.2)
             if self._source.is_live and self._waiting and self._waiting + num > self._most:
@@ -166,7 +166,7 @@ class _State:
                 closing.callback(self._close, sink)
             try:
                 while items := self._get():
-                    for item in _merged(items):
+                    for item in merged(items):
                         if isinstance(item, Event):
                             self._tell(item)
                         else:
@@ -178,7 +178,7 @@ class _State:
                 self.error = error
                 self.stop()
 
-    def _get(self) -> list[tuple[int, Block] | Event]:
+    def _get(self) -> list[Placed | Event]:
         with self._changed:
             while not self._queue and not self._is_over:
                 self._changed.wait()
@@ -226,31 +226,3 @@ class _State:
             sink.close()
         except Exception as error:
             self.error = self.error or error
-
-
-def _merged(items: list[tuple[int, Block] | Event]) -> list[tuple[int, Block] | Event]:
-    """Blocks that follow one another without times as one: a push costs less than two."""
-    merged: list[tuple[int, Block] | Event] = []
-    parts: list[tuple[int, Block]] = []
-
-    def together() -> None:
-        if parts:
-            samples = [block.samples for _, block in parts]
-            whole = samples[0] if len(samples) == 1 else np.concatenate(samples)
-            merged.append((parts[0][0], Block(whole, parts[0][1].time_s)))
-            parts.clear()
-
-    for item in items:
-        if isinstance(item, Event):
-            together()
-            merged.append(item)
-            continue
-        first, block = item
-        if parts:
-            last, before = parts[-1]
-            follows = last + len(before.samples) == first
-            if not follows or block.time_s is not None or before.time_s is not None:
-                together()
-        parts.append(item)
-    together()
-    return merged

@@ -34,7 +34,7 @@ from tactslip_torch.data.formats import Reading
 from tactslip_torch.data.formats._choice import unit_of_time
 from tactslip_torch.data.formats._messages import Message, Topic, TopicColumns, Types
 from tactslip_torch.data.formats._reading import SECONDS, Refused
-from tactslip_torch.live.sinks import Block, Event
+from tactslip_torch.live.sinks import Block, Event, Sink
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import Decisions
 
@@ -234,7 +234,7 @@ class RosTopic:
             executor.remove_node(self._node)
 
 
-class RosPublisher:
+class RosPublisher(Sink):
     """A sink: decisions as messages of the topics above, published by a node."""
 
     def __init__(self, node: Any) -> None:
@@ -243,9 +243,6 @@ class RosPublisher:
         self._publishers = {
             topic: node.create_publisher(kind, topic, _QUEUE) for topic, kind in self._kinds.items()
         }
-
-    def samples(self, first: int, block: Block) -> None:
-        """They are on a topic already."""
 
     def decisions(self, decisions: Decisions) -> None:
         """Publish them."""

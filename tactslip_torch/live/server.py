@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
 from tactslip_torch.data.formats._reading import needs
-from tactslip_torch.live.sinks import Array, Block, Counts, decision_columns
+from tactslip_torch.live.sinks import Block, Counts, Placed, Sink, decision_columns, merged
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.runtime import plain
@@ -71,7 +71,7 @@ def page_facts(detector: SlipDetector, settings: AlarmSettings) -> dict[str, Any
     return dict(plain(facts))
 
 
-class PageServer:
+class PageServer(Sink):
     """A sink that shows the stream on a page.
 
     ``GET live.json`` gives ``{"socket": "ws", "token_needed": bool}``. The socket sends, in text:
@@ -133,7 +133,7 @@ class PageServer:
         self._hello = json.dumps(hello, allow_nan=False)
         self._state, self._text = "waiting", ""
         self._shift_s = 0.0  # from the sender's clock to the stream's
-        self._pending: deque[tuple[int, Array] | str] = deque()
+        self._pending: deque[Placed | str] = deque()
         self._lock = threading.Lock()
         self._pages: set[_Page] = set()
         self._loop = asyncio.new_event_loop()
@@ -163,7 +163,7 @@ class PageServer:
             self._shift_s = first / self._rate - float(block.time_s[0])
         if self._pages:
             with self._lock:
-                self._pending.append((first, block.samples.astype("<f4")))
+                self._pending.append(Placed(first, Block(block.samples.astype("<f4"))))
 
     def decisions(self, decisions: Decisions) -> None:
         """Show them soon."""
@@ -228,26 +228,20 @@ class PageServer:
                     self._tell_state()
             self._send_pending()
             self._tell_state()
-            if waits := [asyncio.ensure_future(page.drained()) for page in self._pages]:
+            if waits := [asyncio.ensure_future(page.empty.wait()) for page in self._pages]:
                 await asyncio.wait(waits, timeout=_LAST_WORDS_S)
 
     def _send_pending(self) -> None:
         with self._lock:
             pending, self._pending = self._pending, deque()
         messages: list[tuple[str | bytes, int]] = []
-        parts: list[tuple[int, Array]] = []
-        for item in [*pending, ""]:
-            if isinstance(item, tuple):
-                if parts and parts[-1][0] + len(parts[-1][1]) != item[0]:
-                    messages.append(_samples_message(parts))
-                    parts = []
-                parts.append(item)
-                continue
-            if parts:  # samples stand before the decisions on them
-                messages.append(_samples_message(parts))
-                parts = []
-            if item:
+        for item in merged(pending):  # samples stand before the decisions on them
+            if isinstance(item, str):
                 messages.append((item, 0))
+                continue
+            samples = item.block.samples
+            header = struct.pack("<IId", 1, len(samples), item.first)
+            messages.append((header + samples.tobytes(), len(samples)))
         for page in self._pages:
             page.offer(messages)
 
@@ -316,7 +310,7 @@ class _Page:
         self._send, self._most_rows = send, most_rows
         self._waiting: deque[tuple[str | bytes, int]] = deque()
         self._rows = 0
-        self._changed, self._empty = asyncio.Event(), asyncio.Event()
+        self._changed, self.empty = asyncio.Event(), asyncio.Event()
         self._is_hopeless = False
         self.dropped = 0
 
@@ -330,7 +324,7 @@ class _Page:
         self._rows += sum(rows for _, rows in messages)
         self._is_hopeless |= len(self._waiting) > _MOST_TEXTS
         if self._waiting:
-            self._empty.clear()
+            self.empty.clear()
             self._changed.set()
 
     async def send_all(self) -> None:
@@ -343,17 +337,13 @@ class _Page:
                     message, rows = self._waiting.popleft()
                     self._rows -= rows
                     await self._send(message)
-                self._empty.set()
+                self.empty.set()
                 self._changed.clear()
                 await self._changed.wait()
         except ConnectionClosed:
             pass
         finally:
-            self._empty.set()
-
-    async def drained(self) -> None:
-        """Wait until nothing waits."""
-        await self._empty.wait()
+            self.empty.set()
 
 
 def _files_of(folders: Mapping[str, Path]) -> dict[str, tuple[Path, Path]]:
@@ -367,12 +357,6 @@ def _files_of(folders: Mapping[str, Path]) -> dict[str, tuple[Path, Path]]:
                 files["/" + "/".join((*filter(None, (prefix,)), *inner.parts))] = root, path
     files["/"] = files["/index.html"]
     return files
-
-
-def _samples_message(parts: list[tuple[int, Array]]) -> tuple[bytes, int]:
-    rows = sum(len(samples) for _, samples in parts)
-    header = struct.pack("<IId", 1, rows, parts[0][0])
-    return header + b"".join(samples.tobytes() for _, samples in parts), rows
 
 
 def _response(

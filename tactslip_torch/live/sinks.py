@@ -9,12 +9,11 @@ import json
 import math
 import socket
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self, TextIO
+from typing import Any, NamedTuple, Protocol, Self, TextIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +40,13 @@ class Block(NamedTuple):
     time_s: Array | None = None
 
 
+class Placed(NamedTuple):
+    """A block and the index of its first sample since the stream's start."""
+
+    first: int
+    block: Block
+
+
 class Event(NamedTuple):
     """What happened to a stream beside its samples.
 
@@ -52,6 +58,27 @@ class Event(NamedTuple):
 
     kind: str
     text: str
+
+
+Other = TypeVar("Other")
+
+
+def merged(items: Iterable[Placed | Other]) -> Iterator[Placed | Other]:
+    """Blocks that follow one another without times as one, and what stands between them."""
+    run: list[Placed] = []
+    for item in [*items, None]:
+        follows = False
+        if isinstance(item, Placed) and run:
+            end = run[-1].first + len(run[-1].block.samples)
+            follows = item.first == end and item.block.time_s is run[-1].block.time_s is None
+        if run and not follows:
+            samples = np.concatenate([block.samples for _, block in run])
+            yield Placed(run[0].first, Block(samples, run[0].block.time_s))
+            run = []
+        if isinstance(item, Placed):
+            run.append(item)
+        elif item is not None:
+            yield item
 
 
 class Source(Protocol):
@@ -90,8 +117,8 @@ class Counts:
     alarms: int = 0
 
 
-class Sink(Protocol):
-    """Where samples, decisions and events of a live stream go."""
+class Sink:
+    """Where samples, decisions and events of a live stream go; one that does not care does none."""
 
     def samples(self, first: int, block: Block) -> None:
         """Take samples, before the decisions on them.
@@ -149,7 +176,7 @@ def _finite(values: list[Any]) -> list[Any]:
 _OF_AN_ALARM = ("time_s", "onset_s", "score", "probability", "valid", "raised_by")
 
 
-class JsonLines:
+class JsonLines(Sink):
     """A JSON line for each alarm, or for each decision, as the hosts of an export print them.
 
     An event is a line ``{"event": kind, "text": text}``; the last line counts decisions and alarms.
@@ -215,7 +242,7 @@ class JsonLines:
         self._write(json.dumps({**counts, "seconds": self._end / self._rate}) + "\n")
 
 
-class Callback:
+class Callback(Sink):
     """A function that is called with each alarm.
 
     Args:
@@ -230,9 +257,6 @@ class Callback:
     ) -> None:
         self._function, self._on_event = function, on_event
 
-    def samples(self, first: int, block: Block) -> None:
-        """Nothing is told of samples."""
-
     def decisions(self, decisions: Decisions) -> None:
         """Call the function with each alarm."""
         for alarm in decisions.alarms:
@@ -241,9 +265,6 @@ class Callback:
     def event(self, kind: str, text: str) -> None:
         """Call the other function."""
         self._on_event(kind, text)
-
-    def close(self) -> None:
-        """Nothing is left to be told."""
 
 
 def listener_at(host: str, port: int) -> socket.socket:
@@ -306,7 +327,7 @@ class LineServer:
             each.close()
 
 
-class FileSink(ABC):
+class FileSink(Sink):
     """A sink whose file gets its name when it is closed; a ``with`` that raises leaves none.
 
     Args:
@@ -347,10 +368,6 @@ class FileSink(ABC):
             self.close()
         else:
             self._stack.__exit__(kind, error, trace)
-
-    @abstractmethod
-    def close(self) -> None:
-        """Write what is left and give the file its name."""
 
 
 def truth_changes(recording: Recording | None) -> list[tuple[float, bool]]:

@@ -12,10 +12,10 @@ import sys
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -57,12 +57,16 @@ def address_of(text: str, what: str, default_host: str = "127.0.0.1") -> tuple[s
 # Bytes -------------------------------------------------------------------------------------------
 
 
-class _Connection(Protocol):
-    def read(self) -> bytes | None:
-        """What came, after at most ``_POLL_S``; ``b""``: nothing; ``None``: it has ended."""
+class _Connection(NamedTuple):
+    """An open one.
 
-    def close(self) -> None:
-        """Give it back."""
+    Attributes:
+        read: what came, after at most ``_POLL_S``; ``b""``: nothing; ``None``: it has ended.
+        close: gives it back.
+    """
+
+    read: Callable[[], bytes | None]
+    close: Callable[[], object]
 
 
 class _ByteSource(ABC):
@@ -138,7 +142,8 @@ class _ByteSource(ABC):
         except OSError as error:
             return _reason(error)
         finally:
-            connection.close()
+            with suppress(OSError):
+                connection.close()
         return ""
 
     def _connected(self) -> str:
@@ -188,7 +193,16 @@ class SerialPort(_ByteSource):
             raise OSError(self._said(error)) from None
         with suppress(Exception):  # only where the driver has it
             port.set_low_latency_mode(True)
-        return _SerialConnection(port)
+
+        def read() -> bytes:
+            """One byte is waited for, what else is there comes with it."""
+            try:
+                data: bytes = port.read(1)
+                return data + port.read(min(port.in_waiting, _MOST_BYTES)) if data else data
+            except (OSError, TypeError) as error:  # TypeError: pyserial, of a port that is closed
+                raise OSError("the device is gone") from error
+
+        return _Connection(read, port.close)
 
     def _said(self, error: OSError) -> str:
         there = needs("serial.tools.list_ports", "a serial port", "live").comports()
@@ -201,47 +215,24 @@ class SerialPort(_ByteSource):
         return f"the serial port {self._port} cannot be opened: {reason}"
 
 
-class _SerialConnection:
-    def __init__(self, port: Any) -> None:
-        self._port = port
-
-    def read(self) -> bytes:
-        """One byte is waited for, what else is there comes with it."""
-        try:
-            data: bytes = self._port.read(1)
-            if data and (more := self._port.in_waiting):
-                data += self._port.read(min(more, _MOST_BYTES))
-        except (OSError, TypeError) as error:  # TypeError: pyserial, of a port that is closed
-            raise OSError("the device is gone") from error
-        return data
-
-    def close(self) -> None:
-        with suppress(OSError):
-            self._port.close()
-
-
-class _SocketConnection:
+def _of_socket(connected: socket.socket, listener: socket.socket | None = None) -> _Connection:
     """A socket; ``listener`` says that another sender wants to take its place."""
+    options = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
+    connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # a cable that is pulled
+    for name, value in options.items():
+        if hasattr(socket, name):
+            connected.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
-    def __init__(self, connected: socket.socket, listener: socket.socket | None = None) -> None:
-        self._socket = connected
-        self._watched = [connected] if listener is None else [connected, listener]
-        options = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
-        connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # a cable that is pulled
-        for name, value in options.items():
-            if hasattr(socket, name):
-                connected.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
-
-    def read(self) -> bytes | None:
-        ready, _, _ = select.select(self._watched, [], [], _POLL_S)
-        if self._socket in ready:
-            return self._socket.recv(_MOST_BYTES) or None
+    def read() -> bytes | None:
+        watched = [each for each in (connected, listener) if each is not None]
+        ready, _, _ = select.select(watched, [], [], _POLL_S)
+        if connected in ready:
+            return connected.recv(_MOST_BYTES) or None
         if ready:
             raise ConnectionError("another sender has connected")
         return b""
 
-    def close(self) -> None:
-        self._socket.close()
+    return _Connection(read, connected.close)
 
 
 class TcpClient(_ByteSource):
@@ -268,7 +259,7 @@ class TcpClient(_ByteSource):
     def _connect(self) -> _Connection:
         connected = socket.create_connection(self._address, timeout=2.0)
         connected.settimeout(None)
-        return _SocketConnection(connected)
+        return _of_socket(connected)
 
 
 class TcpListener(_ByteSource):
@@ -303,7 +294,7 @@ class TcpListener(_ByteSource):
         if not select.select([self._listener], [], [], _POLL_S)[0]:
             return None
         connected, (self._peer, *_) = self._listener.accept()
-        return _SocketConnection(connected, self._listener)
+        return _of_socket(connected, self._listener)
 
     def _connected(self) -> str:
         return f"{self.name}: connected from {self._peer}"
@@ -324,17 +315,12 @@ class StandardInput(_ByteSource):
         super().__init__("stdin", frames, detector)
 
     def _connect(self) -> _Connection:
-        return _StandardInput()
+        def read() -> bytes | None:
+            if sys.platform != "win32" and not select.select([0], [], [], _POLL_S)[0]:
+                return b""
+            return os.read(0, _MOST_BYTES) or None
 
-
-class _StandardInput:
-    def read(self) -> bytes | None:
-        if sys.platform != "win32" and not select.select([0], [], [], _POLL_S)[0]:
-            return b""
-        return os.read(0, _MOST_BYTES) or None
-
-    def close(self) -> None:
-        """Of no need."""
+        return _Connection(read, lambda: None)
 
 
 # Files -------------------------------------------------------------------------------------------
@@ -424,9 +410,7 @@ def source_of(
     *,
     baud: int = 115200,
     reading: Reading | None = None,
-    tare_s: Sequence[float] | None = None,
-    speed: float | None = 1.0,
-    repeat: bool = False,
+    **of_file: Any,
 ) -> Source:
     """The source that a text names.
 
@@ -436,10 +420,8 @@ def source_of(
         detector: whose channels and rate it has.
         frames: how samples are written, but of a file.
         baud: of ``SerialPort``.
-        reading: of ``FileInTime`` and ``RosTopic``; what follows is of ``FileInTime``.
-        tare_s: so.
-        speed: so.
-        repeat: so.
+        reading: of ``FileInTime`` and ``RosTopic``.
+        of_file: ``tare_s``, ``speed`` and ``repeat`` of ``FileInTime``.
 
     Raises:
         FileNotFoundError: if it names none.
@@ -462,4 +444,4 @@ def source_of(
     path = Path(text)
     if not path.exists():
         raise FileNotFoundError(f"no file at {text}; source is {KINDS}")
-    return FileInTime(path, detector, reading, tare_s=tare_s, speed=speed, repeat=repeat)
+    return FileInTime(path, detector, reading, **of_file)

@@ -32,8 +32,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -350,30 +351,6 @@ class _KinematicContact:
         return volts
 
 
-@dataclass(frozen=True, eq=False)
-class StrokeTrace:
-    """One stroke of the touching elements of a recording, integrated, at its samples.
-
-    Args:
-        first: the sample at which or before which the stroke starts; row 0.
-        settling_s: how long it is integrated on behind its end.
-        friction_n: what the skin transmits, ``[num + 1, E]`` float32.
-        inertia_n: of the skin, ``[num + 1, E]`` float32.
-        slide: slip speed over the arm's, 0 where it slips back or the arm rests,
-            ``[num + 1, E]`` float32.
-        start_s: when gross sliding begins, NaN where it never does, ``[E]``.
-        end_s: when it ends for good, ``[E]``.
-    """
-
-    first: int
-    settling_s: float
-    friction_n: NDArray[np.float32]
-    inertia_n: NDArray[np.float32]
-    slide: NDArray[np.float32]
-    start_s: Array
-    end_s: Array
-
-
 class _BristleContact:
     """Contact read from integrated skin and bristles.
 
@@ -415,18 +392,16 @@ class _BristleContact:
         lane = int(np.searchsorted(grasp.touching, element))
         normal_n = grasp.normal_n(element, motion.position_mm, history.time_s)
         friction_n, slide, inertia_n = history.zeros(), grid.zeros(), grid.zeros()
-        for trace, (stroke, next_s) in zip(
-            self._traces, _with_next_starts(motion.strokes), strict=True
-        ):
-            rows = history.overlapping(stroke.stop_s, next_s)
+        places = ((friction_n, history), (inertia_n, grid), (slide, grid))
+        for trace in self._traces:
+            stop_s, next_s = trace.stroke.stroke.stop_s, trace.stroke.next_s
+            rows = history.overlapping(stop_s, next_s)
             t = history.time_s[rows]
             rest_n = grasp.mu_s * normal_n[rows] * grasp.shear_after
-            rest_n *= grasp.relaxed(np.maximum(t - stroke.stop_s, 0.0), element)
-            paused = (t >= stroke.stop_s) & (t <= next_s)
-            np.copyto(friction_n[rows], rest_n, where=paused)
-            _blend(friction_n, history, trace, trace.friction_n[:, lane], stroke.stop_s)
-            _blend(slide, grid, trace, trace.slide[:, lane], stroke.stop_s)
-            _blend(inertia_n, grid, trace, trace.inertia_n[:, lane], stroke.stop_s)
+            rest_n *= grasp.relaxed(np.maximum(t - stop_s, 0.0), element)
+            np.copyto(friction_n[rows], rest_n, where=(t >= stop_s) & (t <= next_s))
+            for (out, own), values in zip(places, trace.values[..., lane], strict=True):
+                _blend(out, own, trace.stroke, values)
         release_v = self._scene.dynamics.release_v_per_n * inertia_n
         return ElementContact(normal_n, friction_n, slide, release_v)
 
@@ -444,15 +419,13 @@ def scene_contact(
     return _BristleContact(scene, grasp, traces)
 
 
-def _blend(
-    out: Array, grid: Grid, trace: StrokeTrace, values: NDArray[np.float32], stop_s: float
-) -> None:
+def _blend(out: Array, grid: Grid, stroke: _Stroke, values: NDArray[np.float32]) -> None:
     """Put a stroke's samples in their places, fading into what is there over the settling."""
-    num, rate_hz = len(values) - 1, grid.sample_rate_hz
-    rows = grid.overlapping(trace.first / rate_hz, (trace.first + num) / rate_hz)
+    first, num, rate_hz = stroke.first, stroke.num, grid.sample_rate_hz
+    rows = grid.overlapping(first / rate_hz, (first + num) / rate_hz)
     sample = grid.blocks[rows, None] * grid.block_samples + np.arange(grid.block_samples)
-    place = sample - trace.first
-    settled = (grid.time_s[rows] - stop_s) / max(trace.settling_s, 1e-9)
+    place = sample - first
+    settled = (grid.time_s[rows] - stroke.stroke.stop_s) / max(stroke.settling_s, 1e-9)
     weight = np.where((place >= 0) & (place <= num), 1.0 - smooth_step(settled), 0.0)
     out[rows] += weight * (values[np.clip(place, 0, num)] - out[rows])
 
@@ -504,26 +477,38 @@ def _lanes_of(scene: Scene, grasp: Grasp) -> Lanes:
 
 
 @dataclass(frozen=True, eq=False)
-class _Slide:
-    """One stroke of one recording, to be integrated.
+class _Stroke:
+    """One stroke of one recording that slides, to be integrated.
 
     Args:
         scene: of the recording.
         grasp: how the hand touches.
         stroke: as the arm runs it.
-        first: the sample at which or before which it starts.
-        num: samples behind the first.
-        settling_s: how long it is integrated on behind its end.
+        next_s: when the next one that slides starts; infinite for the last.
         shear: of the touching elements as the stroke starts, as a fraction of ``mu_s N``, ``[E]``.
     """
 
     scene: Scene
     grasp: Grasp
     stroke: ArmStroke
-    first: int
-    num: int
-    settling_s: float
+    next_s: float
     shear: Array
+
+    @cached_property
+    def settling_s(self) -> float:
+        """How long it is integrated on behind its end."""
+        return min(_SETTLING_S, self.next_s - self.stroke.stop_s)
+
+    @cached_property
+    def first(self) -> int:
+        """The sample at which or before which it starts."""
+        return math.floor(self.stroke.start_s * self.scene.sample_rate_hz)
+
+    @cached_property
+    def num(self) -> int:
+        """Samples behind the first."""
+        end_s = self.stroke.stop_s + self.settling_s
+        return math.ceil(end_s * self.scene.sample_rate_hz) - self.first
 
     def drive(self, since_s: Array) -> tuple[Array, Array]:
         """The arm's speed in m/s and the elements' loads in N, at times from the first sample.
@@ -538,17 +523,29 @@ class _Slide:
         return np.broadcast_to(1e-3 * self.stroke.speed_mm_s(time_s), load_n.shape), load_n
 
 
-def _slides_of(scene: Scene) -> list[_Slide]:
+class StrokeTrace(NamedTuple):
+    """One stroke of the touching elements of a recording, integrated, at its samples.
+
+    Attributes:
+        stroke: which.
+        values: friction, what the skin transmits, and inertia of the skin, newtons; slip speed
+            over the arm's, 0 where it slips back or the arm rests, ``[3, num + 1, E]``.
+        start_s: when gross sliding begins, NaN where it never does, ``[E]``.
+        end_s: when it ends for good, ``[E]``.
+    """
+
+    stroke: _Stroke
+    values: NDArray[np.float32]
+    start_s: Array
+    end_s: Array
+
+
+def _strokes_of(scene: Scene) -> list[_Stroke]:
     """The strokes of a scene that slide, ready to be integrated."""
-    grasp, rate_hz = draw_grasp(scene), scene.sample_rate_hz
-    rest, slides = quasi_static_slips(grasp, scene.slides), []
-    for number, (stroke, next_s) in enumerate(_with_next_starts(scene.slides)):
-        settling_s = min(_SETTLING_S, next_s - stroke.stop_s)
-        first = math.floor(stroke.start_s * rate_hz)
-        num = math.ceil((stroke.stop_s + settling_s) * rate_hz) - first
-        shear = rest.shear_before[number, grasp.touching]
-        slides.append(_Slide(scene, grasp, stroke, first, num, settling_s, shear))
-    return slides
+    grasp = draw_grasp(scene)
+    before = quasi_static_slips(grasp, scene.slides).shear_before[:, grasp.touching]
+    pairs = zip(_with_next_starts(scene.slides), before, strict=True)
+    return [_Stroke(scene, grasp, stroke, next_s, shear) for (stroke, next_s), shear in pairs]
 
 
 def _steps_per_sample(scene: Scene) -> int:
@@ -595,34 +592,34 @@ def traces_of(
     Raises:
         ValueError: if no whole number of steps makes a sample.
     """
-    slides = [_slides_of(scene) for scene in scenes]
-    groups: dict[tuple[float, ...], list[_Slide]] = {}
-    for slide in chain.from_iterable(slides):
-        scene = slide.scene
-        every, num_bristles = _steps_per_sample(scene), scene.dynamics.num_bristles
-        groups.setdefault((slide.num, every, scene.sample_rate_hz, num_bristles), []).append(slide)
-    traces: dict[_Slide, StrokeTrace] = {}
+    strokes = [_strokes_of(scene) for scene in scenes]
+    groups: dict[tuple[float, ...], list[_Stroke]] = {}
+    for stroke in chain.from_iterable(strokes):
+        scene = stroke.scene
+        alike = (stroke.num, _steps_per_sample(scene), scene.sample_rate_hz)
+        groups.setdefault((*alike, scene.dynamics.num_bristles), []).append(stroke)
+    traces = {}
     for group in groups.values():
-        made = _integrated(group, torch.device(device), dtype, backend)
-        traces.update(zip(group, made, strict=True))
-    return [tuple(traces[slide] for slide in of_scene) for of_scene in slides]
+        for trace in _integrated(group, torch.device(device), dtype, backend):
+            traces[trace.stroke] = trace
+    return [tuple(traces[stroke] for stroke in of_scene) for of_scene in strokes]
 
 
 def _integrated(
-    slides: list[_Slide], device: torch.device, dtype: torch.dtype, backend: BackendName
+    strokes: list[_Stroke], device: torch.device, dtype: torch.dtype, backend: BackendName
 ) -> list[StrokeTrace]:
     """Strokes of one length, side by side."""
 
     def drive(since_s: Array) -> list[torch.Tensor]:
         """Arm and load of all lanes, ``[n, L]``."""
-        columns = zip(*(slide.drive(since_s) for slide in slides), strict=True)
+        columns = zip(*(stroke.drive(since_s) for stroke in strokes), strict=True)
         return [torch.from_numpy(np.concatenate(c, axis=1)).to(device, dtype) for c in columns]
 
-    every, num = _steps_per_sample(slides[0].scene), slides[0].num
-    step_s = 1.0 / (slides[0].scene.sample_rate_hz * every)
-    *columns, pressures = zip(*(_lanes_of(s.scene, s.grasp) for s in slides), strict=True)
+    every, num = _steps_per_sample(strokes[0].scene), strokes[0].num
+    step_s = 1.0 / (strokes[0].scene.sample_rate_hz * every)
+    *columns, pressures = zip(*(_lanes_of(s.scene, s.grasp) for s in strokes), strict=True)
     lanes = Lanes(*(torch.cat(c).to(device, dtype) for c in (*columns, pressures[:1])))
-    shear = torch.from_numpy(np.concatenate([slide.shear for slide in slides]))
+    shear = torch.from_numpy(np.concatenate([stroke.shear for stroke in strokes]))
     _, load_n = drive(np.zeros(1))
     shear_n = shear.to(lanes.mu_s) * lanes.mu_s * load_n[0]
     state, pieces = LaneState.sticking(lanes, shear_n), []
@@ -635,29 +632,20 @@ def _integrated(
     whole = np.concatenate(pieces, axis=1)  # friction, inertia, slip: [3, num, L]
     start = np.stack([shear_n.double().cpu().numpy(), *np.zeros((2, len(shear_n)))])
     whole = np.concatenate([start[:, None], whole], axis=1)
-    ends = np.cumsum([len(slide.shear) for slide in slides])[:-1]
-    return list(map(_trace, slides, np.split(whole, ends, axis=2)))
+    ends = np.cumsum([len(stroke.shear) for stroke in strokes])[:-1]
+    return list(map(_trace, strokes, np.split(whole, ends, axis=2)))
 
 
-def _trace(slide: _Slide, values: Array) -> StrokeTrace:
+def _trace(stroke: _Stroke, values: Array) -> StrokeTrace:
     """What is kept of a stroke's friction, inertia and slip speed, ``[3, num + 1, E]``."""
-    friction, inertia, slip = values
-    rate_hz = slide.scene.sample_rate_hz
-    arm, _ = slide.drive(np.arange(slide.num + 1) / rate_hz)
-    least_m_s = _MOVING_FRACTION * 1e-3 * slide.stroke.peak_mm_s
+    slip, rate_hz = values[2], stroke.scene.sample_rate_hz
+    arm, _ = stroke.drive(np.arange(stroke.num + 1) / rate_hz)
+    least_m_s = _MOVING_FRACTION * 1e-3 * stroke.stroke.peak_mm_s
     moves = arm > least_m_s
     excess = np.where(moves, slip - GROSS_FRACTION * arm, -np.abs(slip))
-    start_s, end_s = (t + slide.first / rate_hz for t in _gross(excess, rate_hz))
     relative = np.where(moves, np.maximum(slip / np.maximum(arm, least_m_s), 0.0), 0.0)
-    return StrokeTrace(
-        slide.first,
-        slide.settling_s,
-        friction.astype(np.float32),
-        inertia.astype(np.float32),
-        relative.astype(np.float32),
-        start_s,
-        end_s,
-    )
+    kept = np.stack([*values[:2], relative]).astype(np.float32)
+    return StrokeTrace(stroke, kept, *(t + stroke.first / rate_hz for t in _gross(excess, rate_hz)))
 
 
 def _gross(excess: Array, rate_hz: float) -> tuple[Array, Array]:

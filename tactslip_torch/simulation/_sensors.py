@@ -31,7 +31,6 @@ alone, and nothing moves by what is switched on beside it.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -51,9 +50,10 @@ from tactslip_torch.simulation._blocks import (
     lognormal,
     smooth_step,
 )
-from tactslip_torch.simulation._contact import ElementContact, Grasp
-from tactslip_torch.simulation.scene import ArmStroke, Motion, Scene
+from tactslip_torch.simulation._contact import Contacts, ElementContact, Grasp
+from tactslip_torch.simulation.scene import Motion, Scene
 
+_BANDS = ("high", "low")  # parts of vibration, above and below 25 Hz
 _REFERENCE_MM_S = 40.0  # the speed at which levels are given
 _LOW_BAND_HZ = 25.0  # where the low part of friction noise ends
 _LINE_DAMPING = 0.5  # ratio with which lines meet the skin: a patch is many bristles (prior, ours)
@@ -67,39 +67,17 @@ _PVDF_WARMING = 0.02  # of an SG channel's warming, what passes a film's high-pa
 # --- vibration ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Vibration:
-    """One element's vibration on a grid, ``[K, B]`` each.
-
-    Args:
-        high: volts above about 25 Hz, bursts included.
-        low: volts below 25 Hz.
-        fluctuation: the friction force's relative slow fluctuation, unit rms while sliding.
-    """
-
-    high: Array
-    low: Array
-    fluctuation: Array
-
-
-class SharedVibration(NamedTuple):
-    """What all elements of a recording share on a grid.
+class Vibration(NamedTuple):
+    """One element's vibration on a grid.
 
     Attributes:
-        friction_v: rms of friction noise at mu = 1 and 1 N, ``[K, B]``.
-        texture_v: rms of texture at 1 N, ``[K, B]``.
-        lines: sine and cosine of every line, ``[2, L, K, B]``; L may be 0.
+        bands: volts above about 25 Hz, bursts included, and below, ``[2, K, B]``.
+        fluctuation: the friction force's relative slow fluctuation, unit rms while sliding,
+            ``[K, B]``.
     """
 
-    friction_v: Array
-    texture_v: Array
-    lines: Array
-
-
-def shared_vibration(scene: Scene, grasp: Grasp, motion: Motion) -> SharedVibration:
-    """Levels and lines as the arm's speed and position make them."""
-    levels_v = _levels_v(scene, grasp, motion.speed_mm_s)
-    return SharedVibration(*levels_v, _lines(scene, grasp, motion))
+    bands: Array
+    fluctuation: Array
 
 
 def _levels_v(scene: Scene, grasp: Grasp, speed_mm_s: Array) -> tuple[Array, Array]:
@@ -158,49 +136,86 @@ def _band_responses(
     return causal_response(np.stack([high, low]))
 
 
-def band_noises(grasp: Grasp, element: int, grid: Grid, keys: Iterable[Key]) -> list[Array]:
-    """Noise of the high and of the low part, of unit rms, by the key of each."""
-    skin = float(grasp.resonance_hz[element]), float(grasp.damping[element])
-    responses = _band_responses(grasp.spectral_exponent, *skin, grid.sample_rate_hz)
-    return [grid.coloured_noise(key, part) for key, part in zip(keys, responses, strict=True)]
+class Vibrations:
+    """What the touching elements of a recording sound like on a grid.
+
+    Args:
+        scene: of the recording.
+        grasp: how the hand touches.
+        grid: where.
+    """
+
+    def __init__(self, scene: Scene, grasp: Grasp, grid: Grid) -> None:
+        self._scene, self._grasp, self._grid = scene, grasp, grid
+        motion = Motion(scene.slides, grid)
+        self._levels_v = _levels_v(scene, grasp, motion.speed_mm_s)  # [K, B] each
+        self._lines = _lines(scene, grasp, motion)
+
+    def element(self, element: int, contact: ElementContact) -> Vibration:
+        """One element's vibration, imperfections included; work only in blocks that slide."""
+        scene, grasp, grid = self._scene, self._grasp, self._grid
+        low_fraction = scene.contact.friction_noise_low_share
+        line_fraction = grasp.material.line_share if grasp.material.wavelength_mm else 0.0
+        root_load = np.sqrt(grasp.load_n[element])
+        rng = generator(*scene.key("line mixture"), element)
+        mixture = rng.standard_normal(self._lines.shape[:2])
+        bands, fluctuation = np.stack([contact.release_v, grid.zeros()]), grid.zeros()
+        for rows in _runs(np.asarray(contact.slide.any(axis=-1))):
+            slide = contact.slide[rows]
+            keys = [(*scene.key(band), element) for band in _BANDS]
+            high, low = self._band_noises(element, rows, keys)
+            if scene.fidelity == "bristles":  # a speed of its own, with the sound of that speed
+                friction_gate = _powered(slide, scene.contact.friction_noise_exponent)
+                texture_gate = _powered(slide, grasp.texture_exponent)
+            else:  # a fading in
+                friction_gate = texture_gate = slide
+            friction_v, texture_v = (level_v[rows] for level_v in self._levels_v)
+            friction = grasp.mu_ratio * grasp.mu_s * root_load * friction_v * friction_gate
+            texture = root_load * texture_v * texture_gate
+            broad = np.sqrt((1 - low_fraction) * friction**2 + (1 - line_fraction) * texture**2)
+            lines = np.einsum("pl,plkb->kb", mixture, self._lines[:, :, rows])
+            bands[0, rows] += broad * high + np.sqrt(line_fraction) * texture * lines
+            bands[1, rows] += np.sqrt(low_fraction) * friction * low
+            fluctuation[rows] += np.minimum(slide, 1.0) * low
+        self._add_imperfections(bands, element, contact)
+        return Vibration(bands, fluctuation)
+
+    def _add_imperfections(self, bands: Array, element: int, contact: ElementContact) -> None:
+        """Partial slip or sticking, and local noise."""
+        scene, grasp, grid = self._scene, self._grasp, self._grid
+        of = scene.imperfections
+        index = int(np.flatnonzero(grasp.element_of_channel == element)[0])
+        for start_s, end_s in partial_intervals(scene, scene.hand.channels[index].finger):
+            rows, envelope = grid.pulse(start_s, end_s, _PARTIAL_RAMP_S)
+            holds = contact.slide[rows] == 0
+            slip_v = np.where(holds, envelope, 0.0)
+            slip_v *= _steady_v(scene, grasp, element, _PARTIAL_MM_S)
+            sticks = np.where(holds, 1.0, 1.0 - envelope)
+            noises = self._friction_noises(element, rows, "partial slip")
+            bands[:, rows] = sticks * bands[:, rows] + slip_v * noises
+        if of.local_noise_mv > 0:
+            rng = generator(*scene.key("local noise"), element)
+            size_v = 1e-3 * of.local_noise_mv * lognormal(rng, _LEVEL_SPREAD)
+            level = np.sqrt(grasp.load_n[element]) * size_v * _wandering(_LEVEL_SPREAD, rng, grid)
+            bands += level * self._friction_noises(element, slice(None), "local noise")
+
+    def _friction_noises(self, element: int, rows: slice, purpose: str) -> Array:
+        """Noise with the bands' fractions of friction's power, unit rms in all, ``[2, k, B]``."""
+        low_fraction = self._scene.contact.friction_noise_low_share
+        keys = [(*self._scene.key(purpose), element, band) for band in _BANDS]
+        sizes = np.sqrt([1.0 - low_fraction, low_fraction])
+        return np.asarray(sizes[:, None, None] * self._band_noises(element, rows, keys))
+
+    def _band_noises(self, element: int, rows: slice, keys: Iterable[Key]) -> Array:
+        """Noise of the high and of the low part, of unit rms, by the key of each, ``[2, k, B]``."""
+        grasp, part = self._grasp, self._grid.only(rows)
+        skin = float(grasp.resonance_hz[element]), float(grasp.damping[element])
+        responses = _band_responses(grasp.spectral_exponent, *skin, part.sample_rate_hz)
+        pairs = zip(keys, responses, strict=True)
+        return np.stack([part.coloured_noise(key, response) for key, response in pairs])
 
 
-def element_vibration(
-    scene: Scene,
-    grasp: Grasp,
-    contact: ElementContact,
-    shared: SharedVibration,
-    element: int,
-    grid: Grid,
-) -> Vibration:
-    """One touching element's vibration over the whole grid; work only in blocks that slide."""
-    material = grasp.material
-    low_fraction = scene.contact.friction_noise_low_share
-    line_fraction = material.line_share if material.wavelength_mm else 0.0
-    root_load = np.sqrt(grasp.load_n[element])
-    mixture = generator(*scene.key("line mixture"), element).standard_normal(shared.lines.shape[:2])
-    vibration = Vibration(contact.release_v.copy(), grid.zeros(), grid.zeros())
-    for rows in _runs(np.asarray(contact.slide.any(axis=-1))):
-        slide, part = contact.slide[rows], grid.only(rows)
-        keys = ((*scene.key(band), element) for band in ("high", "low"))
-        high, low = band_noises(grasp, element, part, keys)
-        if scene.fidelity == "bristles":  # a speed of its own, with the sound of that speed
-            friction_gate = _powered(slide, scene.contact.friction_noise_exponent)
-            texture_gate = _powered(slide, grasp.texture_exponent)
-        else:  # a fading in
-            friction_gate = texture_gate = slide
-        friction = grasp.mu_ratio * grasp.mu_s * root_load * shared.friction_v[rows]
-        friction = friction * friction_gate
-        texture = root_load * shared.texture_v[rows] * texture_gate
-        broad = np.sqrt((1 - low_fraction) * friction**2 + (1 - line_fraction) * texture**2)
-        lines = np.einsum("pl,plkb->kb", mixture, shared.lines[:, :, rows])
-        vibration.high[rows] += broad * high + np.sqrt(line_fraction) * texture * lines
-        vibration.low[rows] += np.sqrt(low_fraction) * friction * low
-        vibration.fluctuation[rows] += np.minimum(slide, 1.0) * low
-    return vibration
-
-
-def steady_vibration_v(scene: Scene, grasp: Grasp, element: int, speed_mm_s: float) -> float:
+def _steady_v(scene: Scene, grasp: Grasp, element: int, speed_mm_s: float) -> float:
     """Volts rms of an element that slides steadily, its texture's lines counted as noise."""
     friction_v, texture_v = _levels_v(scene, grasp, np.asarray(speed_mm_s))
     kinetic = grasp.mu_ratio * grasp.mu_s
@@ -272,16 +287,16 @@ def highpass_response(corner_hz: float, block_samples: int, sample_rate_hz: floa
     return np.asarray(np.fft.rfft(taps, 2 * block_samples))
 
 
-def slow_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: Vibration) -> Array:
+def _slow_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: Vibration) -> Array:
     """What an SG channel of unit gain says of its element; all on one grid."""
     sensors = scene.sensors
     shear_v = sensors.sg_shear_v_per_n * friction_n
     shear_v = shear_v * (1.0 + _FORCE_FLUCTUATION * vibration.fluctuation)
-    vibration_v = _SG_VIBRATION * (vibration.high + vibration.low)
-    return sensors.sg_preload_v_per_n * normal_n + shear_v + vibration_v
+    vibration_v = _SG_VIBRATION * (vibration.bands[0] + vibration.bands[1])
+    return np.asarray(sensors.sg_preload_v_per_n * normal_n + shear_v + vibration_v)
 
 
-def fast_volts(scene: Scene, grid: Grid, force_n: Array, vibration: Vibration) -> Array:
+def _fast_volts(scene: Scene, grid: Grid, force_n: Array, vibration: Vibration) -> Array:
     """What a PVDF channel of unit gain says of its element.
 
     Args:
@@ -293,7 +308,7 @@ def fast_volts(scene: Scene, grid: Grid, force_n: Array, vibration: Vibration) -
     corner_hz = scene.sensors.pvdf_highpass_hz
     response = highpass_response(corner_hz, grid.block_samples, grid.sample_rate_hz)
     strain_v = grid.filtered(scene.sensors.pvdf_shear_v_per_n * force_n, response)
-    return strain_v + vibration.high + vibration.low
+    return np.asarray(strain_v + vibration.bands[0] + vibration.bands[1])
 
 
 def _drift_v(scene: Scene, index: int, grid: Grid) -> Array:
@@ -316,7 +331,7 @@ def _warming_v(scene: Scene, index: int, grid: Grid) -> Array:
     return np.asarray(far_v * np.expm1(-_WARMING_TIMES * since) / np.expm1(-_WARMING_TIMES))
 
 
-def converted(scene: Scene, front: Front, index: int, grid: Grid, volts: Array) -> Array:
+def _converted(scene: Scene, front: Front, index: int, grid: Grid, volts: Array) -> Array:
     """What the converter says: with offset, drift and white noise, between the rails, in steps."""
     noise = grid.white_noise((*scene.key("white"), scene.hand.names[index]))
     total = volts + front.offset_v[index] + front.white_v[index] * noise
@@ -326,6 +341,38 @@ def converted(scene: Scene, front: Front, index: int, grid: Grid, volts: Array) 
     rail_v = scene.sensors.rail_v
     step_v = 2.0 * rail_v / 2.0**scene.sensors.num_bits
     return np.asarray(np.clip(np.round(total / step_v) * step_v, -rail_v, rail_v - step_v))
+
+
+def volts_of(
+    scene: Scene, grasp: Grasp, contact: Contacts, grid: Grid, indices: list[int]
+) -> list[Array]:
+    """Volts of the channels asked for on the grid, ``[K, B]`` each."""
+    history, _, now = grid.history
+    front, vibrations = draw_front(scene), Vibrations(scene, grasp, grid)
+    motion, handled = Motion(scene.slides, history), Handled(scene, grasp)
+    volts = dict(zip(indices, _common_volts(scene, grid, indices), strict=True))
+    elements = set(grasp.element_of_channel[indices].tolist()) & set(grasp.touching.tolist())
+    for element in sorted(elements):
+        state = contact.element(element, grid, motion)
+        vibration = vibrations.element(element, state)
+        normal_n, shear_n, press_n = state.normal_n, state.friction_n, history.zeros()
+        if scene.imperfections.share_wander > 0:
+            factor = _drift_factor(scene, "share", element, history)
+            normal_n, shear_n = normal_n * factor, shear_n * factor
+            vibration.bands[:] *= np.sqrt(factor[now])
+        if not handled.is_idle:
+            press_n = handled.press_n(element, normal_n, history)
+            shear_n = shear_n + handled.shear_n(element, history.time_s)
+            vibration.bands[0] += handled.knock_v(element, grid)
+        for index in indices:
+            if grasp.element_of_channel[index] != element:
+                continue
+            if index in scene.hand.slow:
+                sensed = _slow_volts(scene, (normal_n + press_n)[now], shear_n[now], vibration)
+            else:  # what presses is felt like friction (prior, ours)
+                sensed = _fast_volts(scene, grid, shear_n + press_n, vibration)
+            volts[index] += front.gain[index] * _drift_factor(scene, "gain", index, grid) * sensed
+    return [_converted(scene, front, index, grid, volts[index]) for index in indices]
 
 
 # --- disturbances of every channel ----------------------------------------------------------------
@@ -349,7 +396,7 @@ _WANDER_HZ = (0.1, 2.0)  # where levels wander
 _WANDER_NODES = 16  # per block
 
 
-def common_volts(scene: Scene, grid: Grid, channels: list[int]) -> Array:
+def _common_volts(scene: Scene, grid: Grid, channels: list[int]) -> Array:
     """Mains, motor, arm, machine, knocks and pick-up of some channels, ``[len(channels), K, B]``.
 
     Raises:
@@ -577,11 +624,10 @@ The skin of all elements and 0.2 kg resonate near 40 Hz.
 """
 
 
-@dataclass(frozen=True, eq=False)
-class _Event:
+class _Event(NamedTuple):
     """A tap or a change of grip.
 
-    Args:
+    Attributes:
         start_s: when it begins.
         end_s: when the load is what it was before.
         size: of every element, newtons of a tap or a grip's rise over the load, ``[E]``.
@@ -598,38 +644,6 @@ def _quiet(scene: Scene) -> list[Interval]:
     starts_s = [stroke.stop_s + _MARGIN_S for stroke in scene.slides]
     gaps = zip([0.0, *starts_s], [*ends_s, scene.end_s], strict=True)
     return [(start_s, end_s) for start_s, end_s in gaps if end_s > start_s]
-
-
-def _draw_events(
-    scene: Scene,
-    grasp: Grasp,
-    purpose: str,
-    rate_hz: float,
-    sizes: tuple[float, float],
-    lengths_s: tuple[float, float],
-) -> list[_Event]:
-    """Events at random times where nothing slides, in order of time."""
-    if rate_hz == 0:
-        return []
-    quiet = _quiet(scene)
-    if not any(end_s - start_s > lengths_s[1] + _SETTLE_S for start_s, end_s in quiet):
-        raise ValueError(
-            f"no rest long enough for {purpose} of up to {lengths_s[1]:g} s, {_SETTLE_S:g} s to "
-            f"settle and {_MARGIN_S:g} s before and after each slide: pause longer or add a tail_s"
-        )
-    rng, events = generator(*scene.key(purpose)), []
-    load = grasp.load_n / scene.contact.load_n if purpose == "taps" else 1.0
-    for _ in range(rng.poisson(rate_hz * sum(end_s - start_s for start_s, end_s in quiet))):
-        length_s, size = log_uniform(rng, lengths_s), log_uniform(rng, sizes)
-        factor = lognormal(rng, _EVENT_SPREAD, len(grasp.load_n)) * load
-        needed_s = length_s + _SETTLE_S
-        starts, latest = np.array([(a, b - needed_s) for a, b in quiet if b - a > needed_s]).T
-        reached = np.cumsum(latest - starts)  # of the time in which the event may begin
-        place_s = rng.random() * reached[-1]
-        gap = min(int(np.searchsorted(reached, place_s, side="right")), len(reached) - 1)
-        start_s = float(latest[gap] - (reached[gap] - place_s))
-        events.append(_Event(start_s, float(start_s + length_s), size * factor))
-    return sorted(events, key=lambda event: event.start_s)
 
 
 class Handled:
@@ -651,14 +665,41 @@ class Handled:
     """
 
     def __init__(self, scene: Scene, grasp: Grasp) -> None:
-        self._scene, self._load_fraction = scene, grasp.load_n / grasp.load_n.sum()
-        of = scene.handling
+        self._scene, self._load_n, of = scene, grasp.load_n, scene.handling
         has_mass = of.carried_kg > 0
         self.carried = [stroke for stroke in scene.arm if has_mass and not stroke.slides]
-        _require_carriable(scene, grasp, self.carried)
+        if self.carried:
+            _require_carriable(scene, grasp)
         tap_s = (1e-3 * of.tap_ms[0], 1e-3 * of.tap_ms[1])
-        self.taps = _draw_events(scene, grasp, "taps", of.taps_per_s, of.tap_n, tap_s)
-        self.grips = _draw_events(scene, grasp, "grips", of.grips_per_s, of.grip_share, of.grip_s)
+        load = grasp.load_n / scene.contact.load_n
+        self.taps = self._events("taps", of.taps_per_s, of.tap_n, tap_s, load)
+        self.grips = self._events("grips", of.grips_per_s, of.grip_share, of.grip_s)
+
+    def _events(
+        self, purpose: str, per_s: float, sizes: Interval, lengths_s: Interval, load: Any = 1.0
+    ) -> list[_Event]:
+        """Events at random times where nothing slides, in order of time."""
+        if per_s == 0:
+            return []
+        scene, quiet = self._scene, _quiet(self._scene)
+        if not any(end_s - start_s > lengths_s[1] + _SETTLE_S for start_s, end_s in quiet):
+            raise ValueError(
+                f"no rest long enough for {purpose} of up to {lengths_s[1]:g} s, {_SETTLE_S:g} s "
+                f"to settle and {_MARGIN_S:g} s before and after each slide: pause longer or add "
+                "a tail_s"
+            )
+        rng, events = generator(*scene.key(purpose)), []
+        for _ in range(rng.poisson(per_s * sum(end_s - start_s for start_s, end_s in quiet))):
+            length_s, size = log_uniform(rng, lengths_s), log_uniform(rng, sizes)
+            factor = lognormal(rng, _EVENT_SPREAD, len(self._load_n)) * load
+            needed_s = length_s + _SETTLE_S
+            starts, latest = np.array([(a, b - needed_s) for a, b in quiet if b - a > needed_s]).T
+            reached = np.cumsum(latest - starts)  # of the time in which the event may begin
+            place_s = rng.random() * reached[-1]
+            gap = np.searchsorted(reached, place_s)
+            start_s = float(latest[gap] - (reached[gap] - place_s))
+            events.append(_Event(start_s, float(start_s + length_s), size * factor))
+        return sorted(events, key=lambda event: event.start_s)
 
     @property
     def is_idle(self) -> bool:
@@ -696,7 +737,8 @@ class Handled:
             since = time_s - stroke.start_s
             up, even, down, rest = (smooth_step((since - at) / _JERK_S) for at in corners_s)
             total += 1e-3 * stroke.acceleration_mm_s2 * (up - even - down + rest)
-        return self._scene.handling.carried_kg * float(self._load_fraction[element]) * total
+        fraction = float((self._load_n / self._load_n.sum())[element])
+        return self._scene.handling.carried_kg * fraction * total
 
     def press_n(self, element: int, before_n: Array, grid: Grid) -> Array:
         """Newtons that taps and grips add to an element's load.
@@ -739,10 +781,8 @@ class Handled:
         return volts
 
 
-def _require_carriable(scene: Scene, grasp: Grasp, carried: list[ArmStroke]) -> None:
+def _require_carriable(scene: Scene, grasp: Grasp) -> None:
     """Refuse an object whose inertia comes near to making the contact slide."""
-    if not carried:
-        return
     force_n = scene.handling.carried_kg * scene.acceleration_m_s2
     friction_n = (1.0 - scene.contact.runout) * float(grasp.friction_n.sum())
     what = f"carrying {scene.handling.carried_kg:g} kg at {scene.acceleration_m_s2:g} m/s2 takes"
@@ -773,55 +813,17 @@ _PARTIAL_MM_S = 10.0  # speed of a partial slip (ours)
 _PARTIAL_RAMP_S = 0.01
 
 
-def drift_factor(scene: Scene, what: Literal["share", "gain"], number: int, grid: Grid) -> Any:
+def _drift_factor(scene: Scene, what: Literal["share", "gain"], number: int, grid: Grid) -> Any:
     """What an element's load share or a channel's gain drifts by, ``[K, B]``; 1 without a drift."""
     of = scene.imperfections
     spread = of.share_wander if what == "share" else of.gain_drift
     return _wandering(spread, generator(*scene.key(what), number), grid) if spread > 0 else 1.0
 
 
-def add_imperfections(
-    scene: Scene,
-    grasp: Grasp,
-    contact: ElementContact,
-    element: int,
-    grid: Grid,
-    vibration: Vibration,
-) -> None:
-    """Change one touching element's vibration, in place: partial slip or sticking, local noise."""
-    of = scene.imperfections
-    index = int(np.flatnonzero(grasp.element_of_channel == element)[0])
-    finger = scene.hand.channels[index].finger
-    for start_s, end_s in partial_intervals(scene, finger):
-        rows, envelope = grid.pulse(start_s, end_s, _PARTIAL_RAMP_S)
-        holds = contact.slide[rows] == 0
-        slip_v = np.where(holds, envelope, 0.0)
-        slip_v *= steady_vibration_v(scene, grasp, element, _PARTIAL_MM_S)
-        sticks = np.where(holds, 1.0, 1.0 - envelope)
-        noises = _bands(scene, grasp, element, grid.only(rows), "partial slip")
-        for band, noise in zip((vibration.high, vibration.low), noises, strict=True):
-            band[rows] = sticks * band[rows] + slip_v * noise
-    if of.local_noise_mv > 0:
-        rng = generator(*scene.key("local noise"), element)
-        size_v = 1e-3 * of.local_noise_mv * lognormal(rng, _LEVEL_SPREAD)
-        level = np.sqrt(grasp.load_n[element]) * size_v * _wandering(_LEVEL_SPREAD, rng, grid)
-        noises = _bands(scene, grasp, element, grid, "local noise")
-        for band, noise in zip((vibration.high, vibration.low), noises, strict=True):
-            band += level * noise
-
-
 def partial_intervals(scene: Scene, finger: str) -> list[Interval]:
     """When a finger slips or sticks on its own; intervals may overlap."""
     per_s = scene.imperfections.partial_slips_per_s
     return _at_random(scene, (*scene.key("partial slips"), finger), per_s, _PARTIAL_S)
-
-
-def _bands(scene: Scene, grasp: Grasp, element: int, grid: Grid, purpose: str) -> list[Array]:
-    """Noise with the high and the low band's fraction of friction's power, of unit rms in all."""
-    low_fraction = scene.contact.friction_noise_low_share
-    keys = ((*scene.key(purpose), element, band) for band in ("high", "low"))
-    high, low = band_noises(grasp, element, grid, keys)
-    return [np.sqrt(1.0 - low_fraction) * high, np.sqrt(low_fraction) * low]
 
 
 # --- faults ---------------------------------------------------------------------------------------

@@ -29,7 +29,6 @@ from tactslip_torch.native import BackendName
 from tactslip_torch.simulation._blocks import Array, Grid, generator
 from tactslip_torch.simulation._bristles import integrator
 from tactslip_torch.simulation._contact import (
-    Contacts,
     Grasp,
     Slips,
     StrokeTrace,
@@ -39,25 +38,16 @@ from tactslip_torch.simulation._contact import (
 )
 from tactslip_torch.simulation._sensors import (
     Handled,
-    add_imperfections,
-    common_volts,
-    converted,
-    draw_front,
-    drift_factor,
-    element_vibration,
-    fast_volts,
     held_samples,
     recorded_channels,
-    shared_vibration,
-    slow_volts,
     stuck_volts,
+    volts_of,
 )
 from tactslip_torch.simulation.scene import (
     PAPER,
     SEEN_MATERIALS,
     SIMULATION_VERSION,
     UNSEEN_MATERIALS,
-    Motion,
     Scene,
     paper_scenes,
 )
@@ -230,7 +220,7 @@ def _recording(
         places = np.searchsorted(blocks, held // size) * size + held % size
         sensed = sorted({recorded[index] for index in indices if index not in stuck})
         grid = Grid(blocks, scene.sample_rate_hz)
-        rows = dict(zip(sensed, _volts(scene, grasp, contact, grid, sensed), strict=True))
+        rows = dict(zip(sensed, volts_of(scene, grasp, contact, grid, sensed), strict=True))
         for index in indices:
             if index in stuck:
                 volts[index, wanted] = stuck[index]
@@ -281,40 +271,6 @@ def _weighted_median(values: Array, weights: Array) -> float:
     order = np.argsort(values, kind="stable")
     reached = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(reached, 0.5 * reached[-1])])
-
-
-def _volts(
-    scene: Scene, grasp: Grasp, contact: Contacts, grid: Grid, indices: list[int]
-) -> list[Array]:
-    """Volts of the channels asked for on the grid, ``[K, B]`` each."""
-    history, _, now = grid.history
-    front, shared = draw_front(scene), shared_vibration(scene, grasp, Motion(scene.slides, grid))
-    motion, handled = Motion(scene.slides, history), Handled(scene, grasp)
-    volts = dict(zip(indices, common_volts(scene, grid, indices), strict=True))
-    elements = set(grasp.element_of_channel[indices].tolist()) & set(grasp.touching.tolist())
-    for element in sorted(elements):
-        state = contact.element(element, grid, motion)
-        vibration = element_vibration(scene, grasp, state, shared, element, grid)
-        add_imperfections(scene, grasp, state, element, grid, vibration)
-        normal_n, shear_n, press_n = state.normal_n, state.friction_n, history.zeros()
-        if scene.imperfections.share_wander > 0:
-            factor = drift_factor(scene, "share", element, history)
-            normal_n, shear_n = normal_n * factor, shear_n * factor
-            for band in (vibration.high, vibration.low):
-                band *= np.sqrt(factor[now])
-        if not handled.is_idle:
-            press_n = handled.press_n(element, normal_n, history)
-            shear_n = shear_n + handled.shear_n(element, history.time_s)
-            vibration.high[:] += handled.knock_v(element, grid)
-        for index in indices:
-            if grasp.element_of_channel[index] != element:
-                continue
-            if index in scene.hand.slow:
-                sensed = slow_volts(scene, (normal_n + press_n)[now], shear_n[now], vibration)
-            else:  # what presses is felt like friction (prior, ours)
-                sensed = fast_volts(scene, grid, shear_n + press_n, vibration)
-            volts[index] += front.gain[index] * drift_factor(scene, "gain", index, grid) * sensed
-    return [converted(scene, front, index, grid, volts[index]) for index in indices]
 
 
 def _wanted_samples(
