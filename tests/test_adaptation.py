@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.features.bin_sample import BinSample, bin_keys
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.moments import SufficientStats
-from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.training import adaptation
 from tactslip_torch.training.adaptation import (
     FACTORS,
     AccuracyChange,
@@ -24,8 +21,6 @@ from tactslip_torch.training.adaptation import (
     forget,
     solve,
 )
-from tactslip_torch.training.plan import Plan, TrainingPass
-from tactslip_torch.training.recipe import FeatureSelection, Recipe
 
 K, NUM_BINS = 3, 24
 MACHINE = Machine(0.05, 0.5, "weights")
@@ -133,42 +128,6 @@ def test_a_change_of_accuracy_names_what_falls():
     assert fall.problem(0.005).startswith("old materials fall from 85.00 to 84.00 %")
     of_one = AccuracyChange(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7})
     assert of_one.problem(0.01).startswith("b falls from 80.00 to 75.00 %")  # four times as much
-
-
-def test_known_bins_of_a_recording_give_way_to_those_that_changed(old, trained, new):
-    weights = {"a/0": 0.0} | dict.fromkeys(new, 3.0)
-    known = old.rehearsal.with_others({"a/0": trained["a/0"]} | new, weights)
-    assert not bool(known.of_recordings(["a/0"]).any())
-    assert set(known.weight[known.of_recordings(new)].tolist()) == {3.0}
-    assert len(known.z) == (len(trained) - 1 + len(new)) * NUM_BINS
-    assert known.material_names == ["a", "b", "c", "new"]
-    names = [known.recordings[i] for i in known.recording.tolist()]
-    materials = [known.material_names[i] for i in known.material.tolist()]
-    assert all(name.startswith(f"{of}/") for name, of in zip(names, materials, strict=True))
-
-
-def test_the_sample_of_training_holds_bins_that_were_trained_on(rng, monkeypatch):
-    ends = torch.zeros(2).double(), torch.ones(2).double()
-    selection = FeatureSelection((0, 2), FeatureScaler(*ends))
-    plan = Plan(Recipe(), selection, Polynomial(2, 0.5), 1.0, (1.0, 0.4), 1.0, 60, torch.zeros(2))
-    sample, gathered, kept = BinSample(30), TrainingPass(plan), {}
-    for name in ("m/0", "m/1"):
-        features = torch.from_numpy(rng.uniform(0, 1, (40, 4))).float()
-        is_slip = torch.arange(40) % 2 == 0
-        sample.update(name, "m", features, is_slip)
-        gathered.update(name, features, is_slip)
-        kept[name] = selection(features[~is_slip | (bin_keys(name, 40) < 0.4)])
-    monkeypatch.setattr(adaptation, "detector_digest", lambda detector: "digest")
-    materials = {"m/0": "m", "m/1": "m"}
-    found = Statistics.of_training(gathered, sample.bins(), materials, {}, None)
-    assert sorted(found.sums.seen_batches) == ["m/0", "m/1"]
-    known = found.rehearsal
-    for number, name in enumerate(known.recordings):
-        rows = known.z[known.recording == number]
-        assert len(rows) > 0
-        assert bool((rows[:, None] == kept[name]).all(-1).any(-1).all())
-    num_slip = sum(float(len(z) - 20) for z in kept.values())
-    assert 0.5 < float(known.sample_weight[known.is_slip].sum()) / num_slip < 2.0
 
 
 # In and out --------------------------------------------------------------------------------------

@@ -200,37 +200,6 @@ def test_balance_of_forces_holds_in_the_trace(backend):
         assert abs(float(trace.inertia_n) - pulled) < 1e-8
 
 
-@pytest.mark.parametrize("stage_s", [1e-7, 1e-2])
-def test_friction_is_passive_bounded_and_has_the_slope_it_states(stage_s, rng):
-    num = 300
-
-    def spread(low, high):
-        return torch.tensor(10 ** rng.uniform(low, high, num))
-
-    mu_s = spread(-1, 1)
-    lanes = SMOOTH.lanes(
-        mu_s=mu_s,
-        mu_k=mu_s * torch.tensor(rng.uniform(0.05, 1.0, num)),
-        vs=spread(-3, 0),
-        sigma=spread(2, 8),
-        d0=spread(-2, 6),
-        pressure=hertz_pressure(5),
-    )
-    stage = _bristles._Stage(lanes, stage_s)
-    load = spread(-3, 3)[:, None] * lanes.pressure
-    bent = load * stage.mu_s / stage.stiffness * torch.tensor(rng.uniform(-1, 1, (num, 5)))
-    speed = spread(-5, 0).requires_grad_()
-    at = stage.pull(load, bent, speed)
-    (slope,) = torch.autograd.grad(at.force.sum(), speed, retain_graph=True)
-    assert ((slope - at.slope).abs() <= 1e-9 * (at.slope.abs() + (at.force / speed).abs())).all()
-    stored = (stage.stiffness * at.bristle * at.rate).sum(-1)  # no more comes back than is held
-    work = at.force * speed
-    scale = (stage.stiffness * at.bristle * at.rate).abs().sum(-1) + work.abs()
-    assert (work - stored >= -1e-12 * scale).all()
-    assert ((stage.stiffness * at.bristle).abs() <= load * stage.mu_s * (1 + 1e-12)).all()
-    torch.testing.assert_close(at.bristle, bent + stage_s * at.rate, rtol=1e-9, atol=1e-20)
-
-
 # --- engines ------------------------------------------------------------------------------------
 
 
@@ -394,32 +363,3 @@ def test_bounded_and_within_the_cone(step_s, n, dtype, backend, num):
         assert (trace.inertia_n[0].abs() <= most).all(), number
         free = (now == 0.0) & (moving > 0)
         torch.testing.assert_close(trace.slip_m_s[0][free], state.speed_m_s[free])
-
-
-@pytest.mark.parametrize("step_s", [1e-6, 5e-3])
-def test_no_stage_is_left_unsolved_and_engines_agree(step_s, monkeypatch):
-    """Every lane's equation holds to rounding, or turns its sign within 3e-8 of the speed."""
-    root, eps, num, solved = _bristles._Stage.root, torch.finfo(torch.float64).eps, 12, []
-
-    def watched(stage, load, base, offset, guess, high):
-        speed = root(stage, load, base, offset, guess, high)
-        left, _, at = stage.left(load, base, offset, speed)
-        below, above = (
-            stage.left(load, base, offset, speed * (1.0 + side * eps**0.5))[0] for side in (-2, 2)
-        )
-        scale = stage.inertia * speed + offset.abs() + stage.stage_s * at.force.abs()
-        solved.append((left.abs() <= 16.0 * eps * scale) | (below <= 0) & (above >= 0))
-        return speed
-
-    monkeypatch.setattr(_bristles._Stage, "root", watched)
-    lanes, speed, load = extreme(2, torch.float64)
-    state, drive = at_rest(lanes, 0.5 * lanes.mu_k * load), turning(speed, load, num * step_s)
-    eager, _ = carry(lanes, state, drive, num, step_s, backend="torch")
-    assert len(solved) == 2 * num
-    assert torch.stack(solved).all()
-    if NO_ENGINE:
-        return
-    compiled, _ = carry(lanes, state, drive, 4, step_s, backend="native")
-    scale = 1e-6 * largest_force(lanes, speed, load)
-    for name in ("friction_n", "inertia_n"):
-        assert ((getattr(eager, name)[:4] - getattr(compiled, name)).abs() <= scale).all(), name

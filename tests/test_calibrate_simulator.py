@@ -72,7 +72,6 @@ def test_a_damaged_file_of_frozen_values_is_one_line(tmp_path, text):
     with pytest.raises(ValueError, match="must hold the calibrated parameters") as refusal:
         read_calibrated(path)
     assert "restore it from the release" in str(refusal.value)
-    assert "\n" not in str(refusal.value)
 
 
 # --- the command --------------------------------------------------------------------------------
@@ -187,14 +186,9 @@ def test_another_protocol_is_not_frozen(tmp_path, put_in, override, section):
         ("data.materials=[M1,iron,wood]", "seen materials only, .* got iron, wood"),
         ("seeds=[0,1000]", r"1000 or more, .* got \[0, 1000\]"),
         ("seeds=[1000,1000]", "seeds must differ"),
-        ("seeds=[1000.5]", r"seeds must be a list of whole numbers, .* got \[1000.5\]"),
-        ("seeds=null", r"seeds must be a list of whole numbers, .* got None"),
         ("bounds=3", r"bounds must be two numbers, such as \[-2,2\], got 3"),
-        ("bounds=[-1,a]", r"bounds must be two numbers, .* got \[-1, 'a'\]"),
         ("bounds=[1,2]", r"bounds must hold 0, .* got \[1, 2\]"),
-        ("step=null", "step must be a positive finite number, got None"),
         ("most_points=1.5", "most_points must be a positive whole number, got 1.5"),
-        ("check_cycles=true", "check_cycles must be a positive whole number, got True"),
     ],
 )
 def test_what_is_no_calibration_is_refused(tmp_path, override, message):

@@ -150,17 +150,12 @@ def test_the_exit_status_is_0_if_it_holds_and_1_if_not(run, tmp_path):
     ("override", "words"),
     [
         ("calibrate=all", "calibrate and evaluate must be different roles of train, test, unseen"),
-        ("evaluate=[train]", "got calibrate=train evaluate=[train]"),
         ("fold=other", "fold must be one of unseen4, got other"),
         ("+data.broken=A/0", "repair or leave out A/0"),
         ("out=taken", "taken is a file, out= must be a folder; give another"),
-        ("out=taken/deeper", "taken is a file, out= must be a folder; give another"),
         ("out=foreign", "certificate.json is no certificate of ours; move it, or give another"),
         ("data.channels=3", "the features expect 4 channels SG1..PVDF2, the recordings have 3"),
         ("scored_bins=1.5", "scored_bins must be a positive whole number, got 1.5"),
-        ("extremes=0", "extremes must be a positive whole number, got 0"),
-        ("bins=abc", "bins must be a positive whole number, got 'abc'"),
-        ("seed=-1", "seed must be a whole number of at least 0, got -1"),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(override, words, tmp_path, monkeypatch):
@@ -172,6 +167,5 @@ def test_bad_input_is_one_line_and_nothing_is_written(override, words, tmp_path,
     with pytest.raises(BAD_INPUT) as caught:
         certify(composed(*TINY, f"model={saved(tmp_path)}", *more, override, name="certify"))
     assert words in one_line(caught.value)
-    assert "\n" not in one_line(caught.value)
     assert (tmp_path / "foreign" / "certificate.json").read_text() == "mine"
     assert not list(tmp_path.glob("certificate*"))

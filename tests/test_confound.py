@@ -81,9 +81,6 @@ def ran(tmp_path_factory):
     return folder, printed.getvalue(), returned
 
 
-# Table and figure --------------------------------------------------------------------------------
-
-
 # The experiment, on small scenes -----------------------------------------------------------------
 
 

@@ -7,7 +7,6 @@ from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import unseen4
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.hand import HandLayout
 from tactslip_torch.signals.filtering import ChannelFilter, savgol_filter
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 
@@ -85,26 +84,6 @@ def test_a_broken_sample_before_a_causal_bin_is_named(align):
         return
     with pytest.raises(ValueError, match=r"^a/0: channel SG1, sample 150 \(0\.0750 s\) is nan"):
         maker(source.ids[0], split_of(source))
-
-
-@pytest.mark.parametrize(
-    ("pool", "message"),
-    [
-        (
-            FeaturePool(HandLayout.paper24()),
-            r"expect 24 channels SG1..PVDF10, .* have 2 SG1..PVDF1",
-        ),
-        (FeaturePool(SmallSet.hand, 1000.0), r"expect 1000 Hz, the recordings have 2000 Hz"),
-        (
-            FeaturePool(SmallSet.hand, bin_samples=200),
-            r"bins of 200 samples, .*bin_ms=50 makes .*100",
-        ),
-    ],
-    ids=["channels", "rate", "bin"],
-)
-def test_parts_that_do_not_fit_are_refused(pool, message):
-    with pytest.raises(ValueError, match=message):
-        FeatureMaker(SmallSet(), pool, ChannelFilter([51, 11]), LabelRule())
 
 
 @pytest.mark.parametrize("num_workers", [0, 2])

@@ -3,7 +3,6 @@
 import csv
 import hashlib
 import logging
-import os
 import pickle
 from dataclasses import replace
 
@@ -90,7 +89,6 @@ def refused(said, root, make=FileRecordings, **options):
     """The source says that, in one line."""
     with pytest.raises((ValueError, FileNotFoundError), match=said) as caught:
         make(root, **options)
-    assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
@@ -195,14 +193,6 @@ def test_a_column_that_may_be_the_label_is_no_channel_unless_said(tmp_path, name
     assert FileRecordings(tmp_path, channels=rows_named("b", "a")).hand.names == ("b", "a")
 
 
-def test_many_files_are_looked_at_in_processes(tmp_path):
-    for place in range(18):
-        table(tmp_path / f"{place}.csv", samples(place, 20))
-    manifest(tmp_path, *(f"{place}.csv,wood,{place},,,slip" for place in range(18)))
-    source = FileRecordings(tmp_path)
-    assert [source.entry(name).file for name in source.ids] == [f"{n}.csv" for n in range(18)]
-
-
 # Keys ----------------------------------------------------------------------------------------
 
 
@@ -234,27 +224,13 @@ def test_a_key_is_of_what_a_file_holds_and_how_it_is_read(tables):
     assert key() != keys[0]
 
 
-def test_a_file_is_hashed_once_until_it_changes_and_a_folder_by_all_its_files(
-    tmp_path, monkeypatch
-):
-    hashed, whole = [], hashlib.file_digest
-
-    def counted(file, how):
-        hashed.append(file.name)
-        return whole(file, how)
-
-    monkeypatch.setattr(hashlib, "file_digest", counted)
-    for place in ("one", "two", "three"):
+def test_a_folder_is_hashed_by_all_its_files(tmp_path):
+    for place, content in (("one", "b"), ("two", "b"), ("three", "c")):
         (tmp_path / place / "inner").mkdir(parents=True)
         (tmp_path / place / "a").write_text("a")
-        (tmp_path / place / "inner" / "b").write_text("b" if place != "three" else "c")
-    for _ in range(2):
-        one, two, three = (file_digest(tmp_path / p) for p in ("one", "two", "three"))
+        (tmp_path / place / "inner" / "b").write_text(content)
+    one, two, three = (file_digest(tmp_path / p) for p in ("one", "two", "three"))
     assert one == two != three
-    assert len(hashed) == 6
-    os.utime(tmp_path / "two" / "a", ns=(1, 1))
-    assert file_digest(tmp_path / "two") == two
-    assert hashed[6:] == [str(tmp_path / "two" / "a")]
     (tmp_path / "two" / "a").rename(tmp_path / "two" / "c")
     assert file_digest(tmp_path / "two") != one
 
@@ -295,35 +271,25 @@ def test_gaps_are_refused_missing_or_bridged(tmp_path):
     assert torch.equal(part[:, 360:400], read[:, 360:400])
 
 
-def test_the_mean_of_a_stretch_is_taken_off(tables):
+def test_the_mean_of_a_stretch_is_taken_off_without_what_is_missing_there(tables):
     whole = first(FileRecordings(tables))
     tared = FileRecordings(tables, tare_s=[0.5, 1.5])
     assert torch.equal(first(tared), whole - whole[:, 100:300].mean(-1, keepdim=True))
     part = first(tared, [(0.5, 1.0), (2.5, 3.0)])  # of the rest nothing is read
-    wanted = torch.zeros(600, dtype=torch.bool)
-    wanted[100:200] = wanted[500:600] = True
-    assert torch.equal(part[:, wanted], first(tared)[:, wanted])
-    assert part[:, ~wanted].isnan().all()
+    assert torch.equal(part[:, 500:600], first(tared)[:, 500:600])
+    assert part[:, 200:500].isnan().all()
     refused(r"0\.csv: lasts 3 s, tare_s wants 4 s", tables, tare_s=[1.0, 4.0])
-
-
-def test_what_is_missing_or_not_finite_is_no_part_of_a_tare(tmp_path):
-    content, kept = gappy(tmp_path)
-    read = first(FileRecordings(tmp_path, gaps="missing", tare_s=[1.4, 1.6]))
+    content, kept = gappy(tables)
+    read = first(FileRecordings(tables, gaps="missing", tare_s=[1.4, 1.6]))
     level = content[:, 280:300].mean(-1, keepdim=True)
     assert torch.allclose(read[:, kept], content[:, kept] - level, atol=1e-12, rtol=0)
-    lost = FileRecordings(tmp_path, gaps="missing", tare_s=[1.55, 1.75], strict=False)
+    lost = FileRecordings(tables, gaps="missing", tare_s=[1.55, 1.75], strict=False)
     assert "nothing is there to tare on" in lines_of(lost)[0]
-    content = samples(0)
-    content[1, 100:200] = torch.nan
-    content[2, 110:190] = torch.inf
-    table(tmp_path / "a.csv", content)
-    manifest(tmp_path, "a.csv,wood,0,,,slip")
-    with pytest.raises(ValueError, match=r"a\.csv has nothing finite in its column 2 .* 0\.5 to 1"):
-        first(FileRecordings(tmp_path, tare_s=[0.5, 1.0]))
-    read = first(FileRecordings(tmp_path, tare_s=[0.25, 0.6]))
-    level = [content[0, 50:120].mean(), content[1, 50:100].mean(), content[2, 50:110].mean()]
-    assert torch.allclose(read[:, 300:], content[:, 300:] - torch.tensor(level)[:, None].double())
+    content[1, 100:] = torch.nan
+    table(tables / "0.csv", content)
+    manifest(tables, "0.csv,wood,0,,,slip")
+    with pytest.raises(ValueError, match=r"0\.csv has nothing finite in its column 2 .* 0\.5 to 1"):
+        first(FileRecordings(tables, tare_s=[0.5, 1.0]))
 
 
 def test_files_of_several_rates_are_brought_to_one(tmp_path):
@@ -597,33 +563,19 @@ def test_a_rate_that_nobody_says_is_asked_for(tmp_path):
         ({"cycles": 0}, r"data\.cycles must be a number of trials or null, got 0"),
         ({"gaps": "ignore"}, r"data\.gaps must be one of refuse, missing, bridge"),
         ({"tare_s": [1.0, 0.5]}, r"data\.tare_s must be \[start, end\] in seconds"),
-        ({"skip_s": -1.0}, r"data\.skip_s must be a finite number of at least 0, got -1"),
         ({"slide_s": "long"}, r"data\.slide_s must be a finite number .*, got 'long'"),
         ({"bridge_ms": 0.0, "gaps": "bridge"}, r"data\.bridge_ms must be a positive finite .* 0"),
-        ({"bridge_ms": "abc"}, r"data\.bridge_ms must be a positive .* 'abc'"),
-        ({"tare_s": [0, "a"]}, r"data\.tare_s must be \[start, end\] in seconds, got \[0, 'a'\]"),
-        ({"tare_s": 0.5}, r"data\.tare_s must be \[start, end\] in seconds, got 0\.5"),
-        ({"tare_s": "ab"}, r"data\.tare_s must be \[start, end\] in seconds, got 'ab'"),
         ({"streams": 3}, r"data\.streams must be sets of channels by name, .* got 3"),
-        ({"streams": {"a": 3}}, r"data\.streams must be sets of channels by name, .* got {'a': 3}"),
         ({"streams": {"one": {"colour": "red"}}}, r"a stream has reading, .* got colour"),
         ({"channels": 3}, r"data\.channels must be a list of rows of name, .* got 3"),
         ({"channels": ["a"]}, r"data\.channels must be a list of rows of name, .* got \['a'\]"),
         ({"reading": 3}, r"data\.reading must be what is said of files, got 3"),
         ({"reading": {"rate": 5}}, "reading must be of sample_rate_hz, time"),
         ({"reading": {"channels": 3}}, r"reading\.channels must be a list of columns, .* got 3"),
-        ({"reading": {"channels": [[1]]}}, r"reading\.channels must be a list of columns"),
         ({"reading": {"channels": ["a", "a"]}}, r"reading\.channels names a column twice"),
-        ({"reading": {"time": [1]}}, r"reading\.time must be a name, a number or null, got \[1\]"),
         ({"reading": {"time_unit": "h"}}, r"reading\.time_unit must be one of s, ms, us, ns"),
-        ({"reading": {"delimiter": 3}}, r"reading\.delimiter must be one character, got 3"),
-        ({"reading": {"samples": 3}}, r"reading\.samples must be the name of an array"),
-        ({"reading": {"time_first": "abc"}}, r"reading\.time_first must be true, false or null"),
-        ({"reading": {"isolate_s": 0}}, r"reading\.isolate_s must be a positive finite .* 0"),
         ({"resample_hz": 199.9999}, "is no ratio of whole numbers up to 50000"),
-        ({"resample_hz": -5}, r"data\.resample_hz must be a positive finite"),
         ({"adapting": "quick"}, "adapting must be slow or fast, got 'quick'"),
-        ({"kind": "two words"}, "kind must be one word"),
         ({"channels": [{"name": "a"}]}, "channel row 1: expected name, kind, finger, segment"),
         ({"manifest": "other.csv"}, r"no manifest at .*other\.csv"),
     ],
@@ -684,11 +636,9 @@ def test_paths_say_what_recordings_are(folder):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"root": "nowhere"}, "no folder at"),
         ({"root": "linked"}, r"n/pen9.csv: is a link out of the folder"),
         ({"pattern": "("}, r"data.pattern='\(' is no regular expression"),
         ({"pattern": "(?P<object>.*)"}, r"must have a group \(\?P<material>...\)"),
-        ({"pattern": "(?P<material>x+)"}, "no file in .* has a path that matches"),
         ({"labels": {"n": "slips"}}, "data.labels must be of slip and non-slip, got 'slips'"),
         ({"labels": {"n": "slip"}}, r"2 problems in .*t/case1.csv: scene 't' is none of data.labe"),
         ({"pattern": r"./(?P<material>pe)(?P<trial>.+)\.csv"}, "trial 'n0' is no num"),

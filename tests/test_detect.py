@@ -126,19 +126,6 @@ def test_the_truth_stands_beside_them(run):
     assert events["num_false_alarms"] == len(false)
 
 
-def test_an_alarm_behind_the_first_release_is_not_early(model, tmp_path):
-    samples = volts(4.0, ((1.9, 4.0),))
-    truth = {"onsets_s": (2.0,), "sliding_s": ((2.0, 4.0),), "speeds_mm_s": (20.0,)}
-    save(tmp_path / "a.npz", recording(samples, released_s=((1.9, 2.1),), **truth))
-    (entry,) = detected(model, tmp_path, tmp_path / "out", "threshold=3")["recordings"]
-    (onset,), last = entry["truth"]["onsets"], entry["alarms"][-1]
-    assert 1.9 < last["alarm_s"] < 2.0
-    assert (last["outcome"], onset["outcome"], onset["slid_mm"]) == ("found", "found", 0.0)
-    assert onset["first_release_s"] == 1.9
-    assert [onset["delay_s"], last["delay_s"]] == pytest.approx([last["alarm_s"] - 2.0] * 2)
-    assert onset["delay_first_s"] == pytest.approx(last["alarm_s"] - 1.9)
-
-
 def test_the_files_agree_with_each_other(run):
     folder, content = run
     assert sorted(path.name for path in folder.iterdir()) == [
@@ -323,10 +310,7 @@ REFUSED = {
     "short": (lambda: quiet(0.049), [], "{place}/a.npz has 98 samples, too few for a decision"),
     "units": (lambda: recording(units="counts"), [], "a.npz is in counts, the detector was traine"),
     "threshold": (recording, ["threshold=high"], "threshold must be a finite number, got 'high'"),
-    "reading": (recording, ["reading=3"], "reading must be of sample_rate_hz, time"),
-    "masked": (recording, ["masked_channels=[SG9]"], "masked_channels names the channel 'SG9', wh"),
     "backend": (recording, ["backend=steam"], "steam"),
-    "mcap": (recording, ["mcap=a.mcap"], "mcap must be true or false, got 'a.mcap'"),
     "tare": (recording, ["tare_s=[0,a]"], "tare_s must be [start, end] in seconds, got [0, 'a']"),
     "view": (recording, ["view=3"], "view must be [start, end] in seconds, got 3"),
 }
@@ -344,7 +328,6 @@ def test_bad_input_is_one_line(name, model, tmp_path):
     with pytest.raises(ValueError) as caught:  # noqa: PT011  # the words are below
         detect(composed(f"model={model}", f"input={place}", *more), tmp_path / "out")
     assert said.format(place=place) in one_line(caught.value)
-    assert "\n" not in one_line(caught.value)
     assert not (tmp_path / "out" / "onsets.json").exists()
 
 

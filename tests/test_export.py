@@ -154,9 +154,8 @@ def test_a_wrong_model_is_not_left_and_the_earlier_files_are_kept(detector, tmp_
         (tmp_path / file).write_bytes(content)
     right, of_another = export.stream_graph, alarming_detector(3)
     monkeypatch.setattr(export, "stream_graph", lambda _, *given: right(of_another, *given))
-    with pytest.raises(ValueError, match=r"stream\.onnx was not written: .*differs?") as caught:
+    with pytest.raises(ValueError, match=r"stream\.onnx was not written: .*differs?"):
         export_detector(detector, tmp_path)
-    assert "\n" not in str(caught.value)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == earlier
 
 

@@ -5,7 +5,6 @@ both
 precisions. Kinds of bins at 100 samples, and engines, stand in ``contract/test_features.py``.
 """
 
-import math
 from functools import cache
 
 import numpy as np
@@ -24,7 +23,6 @@ from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
 
-PAPER = oracles.pool_names()
 HAND = HandLayout.from_rows(
     {"name": name, "kind": kind, "finger": "index", "segment": "distal"}
     for name, kind in [("SG1", "SG"), ("PVDF1", "PVDF"), ("PVDF2", "PVDF")]
@@ -42,11 +40,6 @@ OPTIONS = [
 BACKENDS = {"torch": 1e-10, "native float64": 1e-9, "torch float32": 1e-6, "mixed float32": 2e-4}
 BACKENDS |= {"onnx float64": 1e-9, "onnx float32": 2e-4}
 """Each with the error it may have, of the larger of a value and its column's median."""
-
-
-@pytest.fixture(scope="module")
-def paper_pool():
-    return FeaturePool(HandLayout.paper24())
 
 
 def columns(names, *parts):
@@ -131,14 +124,6 @@ def test_every_feature_equals_the_oracle(options, backend):
     assert_close(found, expected, names, BACKENDS[backend])
 
 
-@pytest.mark.slow
-def test_every_column_of_the_paper_equals_the_oracle(paper_pool, rng):
-    # more of noise, as the median over bins is the scale that rounding is held against
-    bins = np.concatenate([rng.standard_normal((24, 24, 100)), oracles.plausible_bins(rng, 16)])
-    found = paper_pool(torch.from_numpy(bins)).numpy()
-    assert_close(found, np.stack([oracles.pool(one) for one in bins]), PAPER, 1e-10)
-
-
 def test_channels_are_found_by_kind_wherever_they_lie(rng):
     """A hand that lists its films first has the same features in the pool's own order."""
     rows = HAND.to_rows()
@@ -149,8 +134,8 @@ def test_channels_are_found_by_kind_wherever_they_lie(rng):
     torch.testing.assert_close(mixed(bins[:, [1, 0, 2]]), straight(bins), rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("num", [99, 100, 101, 102])
-@pytest.mark.parametrize("wanted", [{"median"}, {"iqr"}, {"median", "iqr"}, {"median", "mode"}])
+@pytest.mark.parametrize("num", [99, 100])
+@pytest.mark.parametrize("wanted", [{"median"}, {"iqr"}, {"median", "mode"}])
 def test_order_statistics_alone_sort_no_more_than_they_need(wanted, num, rng):
     pool = FeaturePool(HAND, bin_samples=num, level=1)
     bins = torch.from_numpy(rng.standard_normal((4, 3, num)))
@@ -194,25 +179,6 @@ def test_a_constant_bin_has_the_stated_values(level):
             assert value == pytest.approx(0.25 if component[0] == "A" else 0, abs=1e-12), name
 
 
-@pytest.mark.parametrize(("bad", "channel"), [(math.nan, 0), (math.inf, 1), (-math.inf, 2)])
-def test_nan_and_inf_spoil_their_channel_and_no_other(bad, channel, rng):
-    pool = FeaturePool(HAND, backend="torch")
-    bins = torch.from_numpy(rng.standard_normal((2, 3, 100)))
-    clean = pool(bins)
-    bins[1, channel, 50] = bad
-    bins.requires_grad_()
-    features = pool(bins)
-    own = torch.tensor([name[0] == HAND.names[channel] for name in NAMES])
-    assert features[1, own].isnan().all()
-    assert torch.equal(features[0], clean[0])
-    assert torch.equal(features[1, ~own], clean[1, ~own])
-    features[1, ~own].sum().backward()
-    assert bins.grad.isfinite().all()
-    valid = [[True] * 3, [i != channel for i in range(3)]]
-    assert pool.validity(bins.detach()).tolist() == valid
-    assert pool.is_missing(bins.detach()).tolist() == [[not v for v in row] for row in valid]
-
-
 @pytest.mark.parametrize(
     ("dtype", "arithmetic", "least"),
     [
@@ -227,18 +193,6 @@ def test_a_film_is_dead_where_its_span_is_too_small_for_the_dtype(dtype, arithme
         bins = torch.ones(3, 100, dtype=dtype)
         bins[1, 50] += factor * least
         assert pool.validity(bins).tolist() == [False, is_valid, False]
-
-
-# Physics -------------------------------------------------------------------------------------
-
-
-def test_a_tone_lands_on_its_line():
-    t = torch.arange(100, dtype=torch.float64) / 2000.0
-    for tone_hz in (62.5, 125.0):
-        tone = torch.sin(2 * math.pi * tone_hz * t) * torch.hann_window(100, dtype=torch.float64)
-        features = FeaturePool(HAND)(tone.expand(3, 100))
-        centroid = features[columns(NAMES, "PVDF1", "A1", "spectral_centroid")].item()
-        assert centroid == pytest.approx(2.56 * tone_hz, abs=25)
 
 
 # Manners and gradients -----------------------------------------------------------------------

@@ -202,22 +202,6 @@ def test_derivatives_are_right_once_and_twice(num_bins, num_features, route, rng
         torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-9)
 
 
-def test_an_offset_of_nothing(rng):
-    """The dual has a derivative there; the primal has one of everything else, or says so."""
-    z, targets, penalty, _, weights = drawn(rng, 12, 2)
-    new, nothing = torch.ones(1, 2).double(), torch.zeros(()).double().requires_grad_()
-    inputs = z, targets, penalty, nothing, weights
-    with pytest.raises(ValueError, match=r"no derivative by an offset .* of 0; .* route='dual'"):
-        fit_quadratic(*inputs, route="primal")
-    expected = torch.autograd.grad(by_gram_matrix(new)(*inputs).sum(), inputs)
-    dual = torch.autograd.grad(fit_quadratic(*inputs, route="dual")(new).sum(), inputs)
-    others = z, targets, penalty, weights
-    primal = fit_quadratic(z, targets, penalty, 0.0, weights, route="primal")(new).sum()
-    found = torch.autograd.grad(primal, others)
-    for one, other in zip((*dual, *found), (*expected, *expected[:3], expected[4]), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-10)
-
-
 def test_single_precision_is_promoted_and_gets_its_gradient(rng):
     z, targets, *_ = (tensor.detach().float() for tensor in drawn(rng, 12, 4))
     machine = fit_quadratic(z.requires_grad_(), targets, 0.7)

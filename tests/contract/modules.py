@@ -20,7 +20,7 @@ from typing import Any
 
 from .names import PACKAGE, REPLACED_NEXT, SlipDetector, StreamingDetector, settings
 from .recordings import samples_of
-from .running import ROOT, arguments_of, environment
+from .running import ROOT, environment
 
 FOLDER = ROOT / PACKAGE
 
@@ -59,8 +59,8 @@ def counted(modules: list[str]) -> list[str]:
 def of_training(folder: Path) -> list[str]:
     """Modules that ``train +exp=quick`` executes, in a process of its own."""
     words = settings(experiment="quick", workers=0, cache=folder / "cache", folder=folder / "run")
-    command = arguments_of("train", *words)
-    program = f"from contract import modules; modules.print_of({command[1:]!r})"
+    command = [f"{PACKAGE}.train", *words]
+    program = f"from contract import modules; modules.print_of({command!r})"
     done = subprocess.run(
         [sys.executable, "-c", program],
         cwd=folder,

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from .names import COMMANDS, PACKAGE
+from .names import PACKAGE
 
 ROOT = Path(__file__).parents[2]
 
@@ -30,7 +30,7 @@ class Ran(NamedTuple):
 
 def arguments_of(command: str, *overrides: str) -> list[str]:
     """The arguments of ``python`` for a command."""
-    return [*COMMANDS[command].split(), *overrides]
+    return ["-m", PACKAGE, command, *overrides]
 
 
 def environment(**more: str) -> dict[str, str]:

@@ -12,39 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from .names import (
-    ADD,
-    BATCH_FIT,
-    CERTIFICATE,
-    CHECK,
-    CONFUSION,
-    CONVERT,
-    CROSSVAL,
-    DECISIONS,
-    DETECTOR,
-    FORGET,
-    HELD_OUT,
-    IMPORTANCE,
-    LIST,
-    MANIFEST,
-    METRICS,
-    ONSETS,
-    PARETO,
-    RUN_FILES,
-    SPLITS,
-    STREAM_OUTPUTS,
-    SUMMARY,
-    TEMPLATE,
-    TEST,
-    TRAIN,
-    UNDO,
-    Scene,
-    SlipDetector,
-    StreamingDetector,
-    score_raw,
-    settings,
-    simulate,
-)
+from . import names
+from .names import SlipDetector, StreamingDetector, settings
 from .recordings import (
     CHANNELS,
     NAMES,
@@ -76,18 +45,18 @@ def probe(detector):
     """Scores of some raw bins, to tell two detectors apart."""
     length = detector.context_before + detector.pool.bin_samples + detector.context_after
     bins = torch.from_numpy(samples_of("D", 3).T.copy()).double().unfold(1, length, 397)
-    return score_raw(detector, bins.transpose(0, 1))
+    return detector.score_raw(bins.transpose(0, 1))
 
 
 # Train, evaluate, detect -------------------------------------------------------------------------
 
 
 def test_train_leaves_its_files_and_counts_every_bin(trained):
-    assert set(RUN_FILES) <= {path.name for path in trained.folder.iterdir()}
-    splits = trained.metrics[SPLITS]
-    assert list(splits) == [TRAIN, TEST, HELD_OUT]
-    for name, num_recordings in ((TRAIN, 6), (TEST, 3), (HELD_OUT, 3)):
-        confusion = np.array(splits[name][CONFUSION])
+    assert set(names.RUN_FILES) <= {path.name for path in trained.folder.iterdir()}
+    splits = trained.metrics[names.SPLITS]
+    assert list(splits) == [names.TRAIN, names.TEST, names.HELD_OUT]
+    for name, num_recordings in ((names.TRAIN, 6), (names.TEST, 3), (names.HELD_OUT, 3)):
+        confusion = np.array(splits[name][names.CONFUSION])
         assert np.array_equal(confusion.sum(1), num_recordings * BINS), name
         recall = confusion.diagonal() / confusion.sum(1)
         accuracy = confusion.trace() / confusion.sum()
@@ -103,9 +72,9 @@ def test_evaluate_gives_what_training_gave(command, trained_or_slow, recordings,
     data = [*of_set(recordings), *split_of_set()]
     told = settings(model=trained.file, workers=0, cache=cache, folder="run")
     command.well(tmp_path, "evaluate", *data, *told)
-    splits = read(tmp_path / "run" / METRICS)[SPLITS]
-    for name, scores in trained.metrics[SPLITS].items():
-        assert splits[name][CONFUSION] == scores[CONFUSION], name
+    splits = read(tmp_path / "run" / names.METRICS)[names.SPLITS]
+    for name, scores in trained.metrics[names.SPLITS].items():
+        assert splits[name][names.CONFUSION] == scores[names.CONFUSION], name
 
 
 def test_detect_decides_as_a_stream(command, trained_or_slow, recordings, tmp_path):
@@ -113,14 +82,14 @@ def test_detect_decides_as_a_stream(command, trained_or_slow, recordings, tmp_pa
     trained = trained_or_slow
     told = settings(model=trained.file, input=recordings, folder="run")
     command.well(tmp_path, "detect", *told, *settings(every_decision=True, figure=False))
-    found = read(tmp_path / "run" / ONSETS[0])
+    found = read(tmp_path / "run" / names.ONSETS[0])
     assert len(found["recordings"]) == NUM_RECORDINGS
-    rows = table(tmp_path / "run" / ONSETS[1])
+    rows = table(tmp_path / "run" / names.ONSETS[1])
     for material in (*SEEN, "D"):
         for trial in TRIALS:
             mine = [row for row in rows if row["file"] == f"{material}_{trial}.csv"]
             assert any(abs(float(row["onset_s"]) - SLIDE_S[0]) < 0.2 for row in mine), mine
-    decided = table(tmp_path / "run" / DECISIONS.format("D_2"))
+    decided = table(tmp_path / "run" / names.DECISIONS.format("D_2"))
     expected = StreamingDetector(trained.detector, dtype=torch.float64).push(samples_of("D", 2))
     scores = np.array([float(row["score"]) for row in decided])[: len(expected.score)]
     np.testing.assert_allclose(scores, expected.score.numpy(), rtol=1e-4, atol=1e-4)
@@ -135,12 +104,12 @@ def test_stream_decides_as_detect_and_ends_whole_by_a_signal(
     model = settings(model=trained_or_slow.file)
     told = settings(input=recordings / "D_2.csv", folder="run", every_decision=True, figure=False)
     command.well(tmp_path, "detect", *model, *told)
-    decided = table(tmp_path / "run" / DECISIONS.format("D_2"))
+    decided = table(tmp_path / "run" / names.DECISIONS.format("D_2"))
     told = settings(source_of_stream=recordings / "D_2.csv", every_decision=True, speed=None)
     out = command.well(tmp_path, "stream", *model, *told)
     *rows, last = [json.loads(line) for line in out.splitlines()]
     rows = [row for row in rows if "event" not in row]
-    for name, word in STREAM_OUTPUTS.items():
+    for name, word in names.STREAM_OUTPUTS.items():
         of_stream, of_detect = [row[name] for row in rows], [row[word] for row in decided]
         if isinstance(of_stream[0], float):
             assert of_stream == pytest.approx([float(x) for x in of_detect], abs=1e-12), name
@@ -166,7 +135,7 @@ def test_detect_does_without_masked_channels(command, selected, recordings, tmp_
     told = settings(model=selected.file, input=recordings / "D_1.csv")
     masked = settings(masked_channels=["SG1", "PVDF2"], folder="run")
     command.well(tmp_path, "detect", *told, *masked)
-    (one,) = read(tmp_path / "run" / ONSETS[0])["recordings"]
+    (one,) = read(tmp_path / "run" / names.ONSETS[0])["recordings"]
     assert list((tmp_path / "run").glob("*.png"))
     assert one["decisions"]["invalid"] == one["decisions"]["number"] > 100
 
@@ -177,47 +146,34 @@ def test_detect_does_without_masked_channels(command, selected, recordings, tmp_
 def test_data_checks_summarises_and_drafts_a_manifest(command, recordings, tmp_path):
     told = settings(root_of_data=recordings, workers=0)
     mine = settings(channels=CHANNELS)
-    out = command.well(tmp_path, "data", *settings(action=CHECK), *told, *mine)
+    out = command.well(tmp_path, "data", *settings(action=names.CHECK), *told, *mine)
     assert f"{NUM_RECORDINGS} recordings of 4 materials, 36.0 s" in out
     assert "0 problems" in out
-    words = settings(action=SUMMARY, output="summary.png")
+    words = settings(action=names.SUMMARY, output="summary.png")
     lines = command.well(tmp_path, "data", *words, *told, *mine).splitlines()
     rows = {line.split()[0]: line.split()[1:] for line in lines if line.split()}
     assert rows["A"][:5] == ["3", "3.00", "3.00", "9.0", "3"]  # shortest, longest, all; onsets
     assert (tmp_path / "summary.png").stat().st_size > 10_000
-    words = settings(action=TEMPLATE, pattern='"{material}_{trial}"', output="draft.csv")
+    words = settings(action=names.TEMPLATE, pattern='"{material}_{trial}"', output="draft.csv")
     command.well(tmp_path, "data", *words, *told)
     drafted = {
         (row["file"], row["material"], row["trial"]) for row in table(tmp_path / "draft.csv")
     }
-    listed = {(r["file"], r["material"], r["trial"]) for r in table(recordings / MANIFEST)}
+    listed = {(r["file"], r["material"], r["trial"]) for r in table(recordings / names.MANIFEST)}
     assert drafted == listed
-
-
-def test_data_check_lists_every_problem_with_file_and_line(command, tmp_path):
-    root = write_set(tmp_path / "set")
-    (root / "A_1.csv").unlink()
-    lines = (root / "B_2.csv").read_text().splitlines()
-    lines[30] = "0.0145,what,1,1,1"
-    (root / "B_2.csv").write_text("\n".join(lines))
-    told = settings(action=CHECK, root_of_data=root, channels=CHANNELS, workers=0)
-    ran = command(tmp_path, "data", *told)
-    assert ran.status != 0
-    for words in ("A_1.csv", "B_2.csv", "31"):
-        assert words in ran.out + ran.err
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("to", ["npz", "h5"])
 def test_converted_recordings_are_the_same_set(command, selected, recordings, to, tmp_path):
     told = settings(root_of_data=recordings, channels=CHANNELS, workers=0)
-    command.well(tmp_path, "data", *settings(action=CONVERT, format=to, output="to"), *told)
+    command.well(tmp_path, "data", *settings(action=names.CONVERT, format=to, output="to"), *told)
     data = [*settings(data="files", root="to"), *split_of_set()]
     words = settings(model=selected.file, workers=0, cache="off", folder="run")
     command.well(tmp_path, "evaluate", *data, *words)
-    splits = read(tmp_path / "run" / METRICS)[SPLITS]
-    for name, scores in selected.metrics[SPLITS].items():
-        assert splits[name][CONFUSION] == scores[CONFUSION], name
+    splits = read(tmp_path / "run" / names.METRICS)[names.SPLITS]
+    for name, scores in selected.metrics[names.SPLITS].items():
+        assert splits[name][names.CONFUSION] == scores[names.CONFUSION], name
 
 
 def test_generate_writes_what_simulate_gives_and_goes_on(command, tmp_path):
@@ -232,36 +188,27 @@ def test_generate_writes_what_simulate_gives_and_goes_on(command, tmp_path):
     command.well(tmp_path, "generate", *words, *settings(generated_cycles=2))
     assert len(list((tmp_path / "run").glob("*.npz"))) == 2
     assert first.read_bytes() == before
-    assert len(table(tmp_path / "run" / MANIFEST)) == 2
-
-
-def test_a_scene_gives_the_same_samples_again_and_in_any_part():
-    whole = simulate(Scene("M4", seed=7)).samples
-    assert torch.equal(simulate(Scene("M4", seed=7)).samples, whole)
-    part = simulate(Scene("M4", seed=7), windows=[(2.0, 2.5)]).samples[:, 4002:4998]
-    assert part.isfinite().all()
-    assert torch.equal(part, whole[:, 4002:4998])
-    assert not torch.equal(simulate(Scene("M4", seed=8)).samples[:, :1000], whole[:, :1000])
+    assert len(table(tmp_path / "run" / names.MANIFEST)) == 2
 
 
 # Adapt, certify, importance ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("back", [UNDO, FORGET])
+@pytest.mark.parametrize("back", [names.UNDO, names.FORGET])
 def test_adapt_adds_a_material_and_takes_it_back(command, selected, cache, back, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(selected.folder, run)
     new = write_set(tmp_path / "new", {f"D/{trial}": 1 for trial in TRIALS})
-    model = settings(model=run / DETECTOR)
+    model = settings(model=run / names.DETECTOR)
     more = settings(recordings=new, channels=CHANNELS, materials=["D"], cache=cache)
-    command.well(tmp_path, "adapt", *model, *settings(action=ADD), *more)
-    added = SlipDetector.load(run / DETECTOR)
+    command.well(tmp_path, "adapt", *model, *settings(action=names.ADD), *more)
+    added = SlipDetector.load(run / names.DETECTOR)
     assert added.info["train_materials"] == [*SEEN, "D"]
     assert (probe(added) - probe(selected.detector)).abs().max() > 1e-6
-    assert "D" in command.well(tmp_path, "adapt", *model, *settings(action=LIST))
-    which = settings(material="D", cache=cache) if back == FORGET else []
+    assert "D" in command.well(tmp_path, "adapt", *model, *settings(action=names.LIST))
+    which = settings(material="D", cache=cache) if back == names.FORGET else []
     command.well(tmp_path, "adapt", *model, *settings(action=back), *which)
-    found = SlipDetector.load(run / DETECTOR)
+    found = SlipDetector.load(run / names.DETECTOR)
     assert found.info["train_materials"] == list(SEEN)
     torch.testing.assert_close(probe(found), probe(selected.detector), rtol=1e-9, atol=1e-9)
 
@@ -271,12 +218,12 @@ def test_a_certificate_holds_on_bins_it_has_not_seen(command, trained_by, record
     data, general = [*of_set(recordings), *split_of_set()], trained_by("general")
     words = settings(model=general.file, out=tmp_path, bins=100, bins_to_score=50, extremes=3)
     command.well(tmp_path, "certify", *data, *words)
-    certificate = read(tmp_path / CERTIFICATE)
+    certificate = read(tmp_path / names.CERTIFICATE)
     assert certificate["holds"] is True
     detector = general.detector
     length = detector.context_before + detector.pool.bin_samples + detector.context_after
     bins = torch.from_numpy(samples_of("C", 1).T.copy()).unfold(1, length, 53).transpose(0, 1)
-    double, single = score_raw(detector, bins.double()), score_raw(detector, bins.float())
+    double, single = (detector.score_raw(bins.double()), detector.score_raw(bins.float()))
     assert (double - single).abs().max() <= certificate["margin"]["score"]
 
 
@@ -284,7 +231,7 @@ def test_importance_has_every_unit_and_refits_for_the_best(command, selected, ca
     few = settings(bins=20, bins_to_score=30, bins_to_explain=8, draws=20)
     told = settings(model=selected.file, workers=0, cache=cache, folder="run")
     command.well(tmp_path, "importance", *few, *told)
-    content = read(tmp_path / "run" / IMPORTANCE)
+    content = read(tmp_path / "run" / names.IMPORTANCE)
     units = [(row["unit"], row["name"]) for row in content["units"]]
     expected = [("channel", name) for name in NAMES]
     assert units == [
@@ -296,61 +243,6 @@ def test_importance_has_every_unit_and_refits_for_the_best(command, selected, ca
     num = sum(row["features_in_use"] for row in content["units"] if row["unit"] == "channel")
     assert num == len(selected.detector.selected_names) == 12
     assert {row["joins"] for row in content["best"]["channel"]} == set(NAMES)
-
-
-# Crossval, pareto, calibrate ---------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_crossval_leaves_each_material_out_for_each_recipe(command, recordings, cache, tmp_path):
-    few = settings(num_held_out=1, train_share_of_crossval=0.67, bins_of_fit=20, bins_to_score=50)
-    told = settings(workers=0, cache=cache, folder="run")
-    command.well(tmp_path, "crossval", *of_set(recordings), *few, *told)
-    content = read(tmp_path / "run" / CROSSVAL)
-    assert set(content[SPLITS]) == {"paper", "robust", "general"}
-    for rows in content[SPLITS].values():
-        assert [row["materials"] for row in rows] == [["A"], ["B"], ["C"], ["D"]]
-        for row in rows:
-            (only,) = row["per_material"].values()
-            assert row[HELD_OUT] == pytest.approx(only)
-            assert 0.6 < only <= 1
-
-
-@pytest.mark.slow
-def test_pareto_keeps_the_limits_it_was_given(command, recordings, cache, tmp_path):
-    data = [*of_set(recordings), *split_of_set()]
-    few = settings(search="quick", search_sizes=[4, 8], search_calls=10, search_timed=3)
-    few += settings(search_precisions=["double"], retime_calls=20, engine="auto")
-    told = settings(deadline_ms=500, most_compute_us=400_000, workers=0, cache=cache, folder="run")
-    command.well(tmp_path, "pareto", *data, *few, *told)
-    content = read(tmp_path / "run" / PARETO)
-    for row in content["front"]:
-        latency = row["latency"]
-        parts = [latency[k] for k in ("look_ahead_ms", "bin_ms", "hop_ms")]
-        assert latency["worst_ms"] == pytest.approx(sum(parts) + latency["compute_us"] / 1e3)
-    detector = SlipDetector.load(tmp_path / "run" / DETECTOR)
-    assert probe(detector).isfinite().all()
-
-
-@pytest.mark.slow
-def test_pareto_says_when_nothing_meets_the_limits(command, recordings, cache, tmp_path):
-    data = [*of_set(recordings), *split_of_set()]
-    few = settings(search="quick", search_sizes=[4], search_calls=10, search_timed=2)
-    few += settings(search_precisions=["double"], retime_calls=20, engine="auto")
-    told = settings(deadline_ms=500, most_compute_us=0.001, workers=0, cache=cache, folder="run")
-    ran = command(tmp_path, "pareto", *data, *few, *told)
-    assert ran.status == 1
-    assert "none" in (ran.out + ran.err).lower()
-
-
-@pytest.mark.slow
-def test_calibrate_evaluates_points_and_freezes_nothing_unasked(command, cache, tmp_path):
-    few = settings(calibration_seeds=[1000], fact_cycles=1, calibration_points=2, cycles=3)
-    split = settings(materials=["M1", "M5"], seen=["M1", "M5"], penalties=[0.1, 1.0])
-    ran = command(tmp_path, "calibrate", *few, *split, *settings(workers=0, folder="run"))
-    assert ran.status in (0, 1), ran.err
-    assert "friction_noise" in ran.out
-    assert any((tmp_path / "run").glob("*.json"))
 
 
 # A simulated set, and statistics in shards -------------------------------------------------------
@@ -367,11 +259,11 @@ def quick(command, tmp_path_factory):
 
 @pytest.mark.slow
 def test_the_quick_experiment_trains_exports_and_says_it_is_simulated(quick):
-    metrics = read(quick / "run" / METRICS)
+    metrics = read(quick / "run" / names.METRICS)
     assert metrics["simulated"] is True
     assert metrics["num_features_pool"] == 2582
-    non_slip = {name: sum(s[CONFUSION][0]) for name, s in metrics[SPLITS].items()}
-    assert non_slip == {TRAIN: 3 * 60, TEST: 3 * 60, HELD_OUT: 2 * 60}
+    non_slip = {name: sum(s[names.CONFUSION][0]) for name, s in metrics[names.SPLITS].items()}
+    assert non_slip == {names.TRAIN: 3 * 60, names.TEST: 3 * 60, names.HELD_OUT: 2 * 60}
     assert metrics["onnx"]["bin"]["error"] < 1e-3
     assert metrics["baselines"]
 
@@ -379,20 +271,20 @@ def test_the_quick_experiment_trains_exports_and_says_it_is_simulated(quick):
 @pytest.mark.slow
 def test_workers_and_a_warm_cache_change_nothing(command, quick, tmp_path):
     told = settings(experiment="quick", export=False, baselines=False, folder="run")
-    metrics = read(quick / "run" / METRICS)
+    metrics = read(quick / "run" / names.METRICS)
     for words in (settings(workers=2, cache="off"), settings(workers=0, cache=quick / "cache")):
         command.well(tmp_path, "train", *told, *words)
-        again = read(tmp_path / "run" / METRICS)
+        again = read(tmp_path / "run" / names.METRICS)
         assert again["selected"] == metrics["selected"]
-        for name, scores in metrics[SPLITS].items():
-            assert again[SPLITS][name][CONFUSION] == scores[CONFUSION]
+        for name, scores in metrics[names.SPLITS].items():
+            assert again[names.SPLITS][name][names.CONFUSION] == scores[names.CONFUSION]
         shutil.rmtree(tmp_path / "run")
 
 
 @pytest.mark.slow
 def test_sums_in_shards_give_the_detector_of_one_process(selected, tmp_path):
     """By the example script, which took the place of 0.1.0's command."""
-    example, run = runpy.run_path(str(ROOT / BATCH_FIT)), selected.file.parent
+    example, run = runpy.run_path(str(ROOT / names.BATCH_FIT)), selected.file.parent
     for shard in ("1/2", "2/2"):
         example["collect"](run, shard, tmp_path / f"sums-{shard[0]}.stats", [])
     shards = sorted(tmp_path.glob("sums-*.stats"), reverse=True)

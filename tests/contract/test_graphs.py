@@ -8,19 +8,9 @@ import onnxruntime as ort
 import pytest
 import torch
 
+from . import names
 from .conftest import RECIPES
-from .names import (
-    BIN_GRAPH,
-    BIN_INPUT,
-    BIN_OUTPUTS,
-    SIDECAR,
-    STREAM_GRAPH,
-    STREAM_HANDED_ON,
-    STREAM_INPUTS,
-    STREAM_OUTPUTS,
-    StreamingDetector,
-    predict_raw,
-)
+from .names import BIN_GRAPH, BIN_INPUT, BIN_OUTPUTS, STREAM_GRAPH
 from .recordings import NAMES, samples_of
 
 pytestmark = pytest.mark.onnx
@@ -76,8 +66,8 @@ def test_the_bin_graph_scores_as_the_detector(exported, kind):
     kinds = kinds_of_bin(detector)
     session, bins = session_of(folder / BIN_GRAPH), kinds[kind].astype(precision)
     found = dict(zip(BIN_OUTPUTS, session.run(BIN_OUTPUTS, {BIN_INPUT: bins}), strict=True))
-    expected = predict_raw(detector, torch.from_numpy(bins).double())
-    ordinary = predict_raw(detector, torch.from_numpy(kinds["ordinary"].copy()).double()).score
+    expected = detector.predict_raw(torch.from_numpy(bins).double())
+    ordinary = detector.predict_raw(torch.from_numpy(kinds["ordinary"].copy()).double()).score
     scores = expected.score.numpy()
     bound = CLOSE[precision] * (float(ordinary.std()) + np.abs(scores))
     assert (np.abs(found["score"] - scores) <= bound).all()
@@ -95,7 +85,7 @@ def test_a_channel_that_is_nan_is_left_out_by_the_bin_graph(exported):
     name = detector.pool.hand.names[detector.needed_index[0]]
     bins[:, NAMES.index(name)] = np.nan
     score, valid = session_of(folder / BIN_GRAPH).run(["score", "valid"], {BIN_INPUT: bins})
-    expected = predict_raw(detector, torch.from_numpy(bins).double()).score.numpy()
+    expected = detector.predict_raw(torch.from_numpy(bins).double()).score.numpy()
     close = CLOSE[precision] * (np.abs(expected) + expected.std())
     assert (np.abs(score - expected) <= close).all()
     assert not valid.any()
@@ -114,10 +104,10 @@ class Fed:
 
     def push(self, samples):
         feeds = {"samples": np.ascontiguousarray(samples, self.precision), **self.memory}
-        assert set(feeds) == set(STREAM_INPUTS)
-        names = [*STREAM_OUTPUTS, *STREAM_HANDED_ON.values()]
-        found = dict(zip(names, self.session.run(names, feeds), strict=True))
-        self.memory |= {name: found.pop(handed) for name, handed in STREAM_HANDED_ON.items()}
+        assert set(feeds) == set(names.STREAM_INPUTS)
+        wanted = [*names.STREAM_OUTPUTS, *names.STREAM_HANDED_ON.values()]
+        found = dict(zip(wanted, self.session.run(wanted, feeds), strict=True))
+        self.memory |= {name: found.pop(handed) for name, handed in names.STREAM_HANDED_ON.items()}
         return found
 
 
@@ -130,12 +120,12 @@ def test_the_stream_graph_decides_as_the_stream(exported, cuts, is_broken):
         samples[2000:2010, 1:3] = np.nan
     graph = Fed(folder / STREAM_GRAPH, precision)
     parts = [graph.push(samples[a:b]) for a, b in pairwise([0, *cuts, len(samples)])]
-    stream = StreamingDetector(detector, dtype=torch.float64)
+    stream = names.StreamingDetector(detector, dtype=torch.float64)
     expected = stream.push(samples)
     assert expected.is_alarm.any()
     assert expected.is_valid.all() != is_broken
     spread = {"score": float(expected.score.std()), "statistic": float(expected.statistic.std())}
-    for name, field in STREAM_OUTPUTS.items():
+    for name, field in names.STREAM_OUTPUTS.items():
         values = np.concatenate([part[name] for part in parts])
         truth = getattr(expected, field).numpy()
         if truth.dtype == bool:
@@ -148,7 +138,7 @@ def test_the_stream_graph_decides_as_the_stream(exported, cuts, is_broken):
 @pytest.mark.parametrize("name", [BIN_GRAPH, STREAM_GRAPH])
 def test_a_graph_says_what_it_takes(exported, name):
     folder, detector, precision = exported
-    told = json.loads((folder / SIDECAR.format(name)).read_text())
+    told = json.loads((folder / names.SIDECAR.format(name)).read_text())
     assert told["channels"] == NAMES
     assert told["sample_rate_hz"] == detector.pool.sample_rate_hz
     assert told["precision"] == precision

@@ -11,17 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from .names import (
-    BUILD_C_HOST,
-    HOST_OPTIONS,
-    HOSTS,
-    INSTALL_HOST,
-    SIDECAR,
-    STREAM_GRAPH,
-    STREAM_OUTPUTS,
-    WEB_OPTIONS,
-    StreamingDetector,
-)
+from . import names
 from .recordings import samples_of
 from .running import ROOT
 
@@ -63,12 +53,12 @@ def host_of(tmp_path_factory):
             pytest.skip(f"not installed: {', '.join(missing)}")
         if name not in made:
             if name == "c":
-                done = run(BUILD_C_HOST.format(**places).split())
+                done = run(names.BUILD_C_HOST.format(**places).split())
                 assert done.returncode == 0, done.stderr
             if name in ("node", "web") and not (EXPORT / name / "node_modules").exists():
-                done = run(INSTALL_HOST.split(), EXPORT / name)
+                done = run(names.INSTALL_HOST.split(), EXPORT / name)
                 assert done.returncode == 0, done.stderr
-            made[name] = HOSTS[name].format(**places).split()
+            made[name] = names.HOSTS[name].format(**places).split()
         return made[name]
 
     return host
@@ -76,7 +66,7 @@ def host_of(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def stream(graphs_of):
-    return graphs_of("selected") / STREAM_GRAPH
+    return graphs_of("selected") / names.STREAM_GRAPH
 
 
 def saved(folder, samples):
@@ -91,10 +81,10 @@ def no_constant(word):
 
 def decided_by(host, name, stream, recording, *options):
     """All decisions a host prints, and its summary."""
-    words = [*host, stream, recording, HOST_OPTIONS["every"], *options]
+    words = [*host, stream, recording, names.HOST_OPTIONS["every"], *options]
     if name == "web":
         output = recording.with_name("page.png")
-        pairs = zip(WEB_OPTIONS, (stream, recording, output), strict=True)
+        pairs = zip(names.WEB_OPTIONS, (stream, recording, output), strict=True)
         words = [*host, *(word for pair in pairs for word in pair)]
     done = run(words)
     assert done.returncode == 0, done.stderr
@@ -106,11 +96,11 @@ def decided_by(host, name, stream, recording, *options):
 
 def assert_decided(lines, summary, detector, samples):
     """Flags and times are those of the package; scores to single precision."""
-    expected = StreamingDetector(detector, dtype=torch.float64).push(samples)
+    expected = names.StreamingDetector(detector, dtype=torch.float64).push(samples)
     assert summary["decisions"] == len(lines) == len(expected.score) > 50
     assert summary["alarms"] == int(expected.is_alarm.sum())
     assert summary["seconds"] == len(samples) / 2000
-    for name, field in STREAM_OUTPUTS.items():
+    for name, field in names.STREAM_OUTPUTS.items():
         truth = getattr(expected, field)
         found = [line[name] for line in lines]
         if truth.dtype == torch.bool:
@@ -131,7 +121,7 @@ def test_a_host_decides_what_the_package_decides(name, host_of, stream, selected
 @pytest.mark.parametrize("name", COMMAND_LINE_HOSTS)
 @pytest.mark.parametrize("chunk", [1, 333])
 def test_any_chunk_decides_the_same(name, chunk, host_of, stream, selected, tmp_path):
-    options = (HOST_OPTIONS["chunk"], chunk)
+    options = (names.HOST_OPTIONS["chunk"], chunk)
     found = decided_by(host_of(name), name, stream, saved(tmp_path, SAMPLES), *options)
     assert_decided(*found[:2], selected.detector, SAMPLES)
 
@@ -147,7 +137,7 @@ def test_missing_samples_are_flagged_and_told_once(name, host_of, stream, select
 
 @pytest.mark.parametrize("name", COMMAND_LINE_HOSTS)
 def test_another_threshold_raises_other_alarms(name, host_of, stream, tmp_path):
-    recording, option = saved(tmp_path, SAMPLES), HOST_OPTIONS["threshold"]
+    recording, option = saved(tmp_path, SAMPLES), names.HOST_OPTIONS["threshold"]
     given = [(), (option, 1e9), (option, -1e9)]
     found = [decided_by(host_of(name), name, stream, recording, *words)[1] for words in given]
     assert found[1]["alarms"] == 0
@@ -157,7 +147,7 @@ def test_another_threshold_raises_other_alarms(name, host_of, stream, tmp_path):
 
 def whole(folder, stream):
     """A copy of the stream's graph and sidecar, which may be spoilt."""
-    for path in (stream, stream.with_name(SIDECAR.format(stream.name))):
+    for path in (stream, stream.with_name(names.SIDECAR.format(stream.name))):
         shutil.copy(path, folder)
     return folder / stream.name
 
@@ -167,7 +157,7 @@ def cut(path):
 
 
 def without_sidecar(path):
-    path.with_name(SIDECAR.format(path.name)).unlink()
+    path.with_name(names.SIDECAR.format(path.name)).unlink()
 
 
 WRONG = {
@@ -177,9 +167,9 @@ WRONG = {
     "no sidecar": (without_sidecar, SAMPLES, (), "stream.onnx.json", 1),
     "too few channels": (None, SAMPLES[:, :3].copy(), (), "recording.npy 3 4", 1),
     "integers": (None, (1000 * SAMPLES).astype("<i2"), (), "recording.npy float32 <i2", 1),
-    "another rate": (None, SAMPLES, (HOST_OPTIONS["rate"], 1000), "1000 2000", 1),
-    "no chunk": (None, SAMPLES, (HOST_OPTIONS["chunk"], 0), "--chunk 0", 2),
-    "no number": (None, SAMPLES, (HOST_OPTIONS["threshold"], "high"), "--threshold high", 2),
+    "another rate": (None, SAMPLES, (names.HOST_OPTIONS["rate"], 1000), "1000 2000", 1),
+    "no chunk": (None, SAMPLES, (names.HOST_OPTIONS["chunk"], 0), "--chunk 0", 2),
+    "no number": (None, SAMPLES, (names.HOST_OPTIONS["threshold"], "high"), "--threshold high", 2),
     "no option": (None, SAMPLES, ("--loud",), "--loud", 2),
 }
 

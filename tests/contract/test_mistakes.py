@@ -24,26 +24,15 @@ def files(**words):
 
 MISTAKES = {  # beside those of tests/test_command_line.py, which a page lists
     # command, overrides, words of the line
-    "unknown material": (
-        "train",
-        settings(materials=["M1", "Foo"], seen=["M1"], held_out=["Foo"]),
-        "'Foo' M1 iron",
-    ),
-    "material of no recording": ("train", files(seen=["A", "Z"]), "'Z' A, B, C, D"),
     "seen and held out": ("train", files(held_out=["A"]), "A seen unseen"),
-    "layout": ("train", settings(layout="nope"), "labels.layout 'nope' whole_slide half_second"),
     "bin of half samples": ("train", settings(bin_ms=50.1), "labels.bin_ms=50.1 100.2 2000"),
     "no recordings left": ("train", settings(cycles=0), "cycles 1 0"),
-    "share": ("train", files(train_share=1.5), "split.train_fraction 0 1 1.5"),
-    "even frame": ("train", files(frames={"SG": 50, "PVDF": 11}), "features.frames.SG odd 50"),
     "dtype": ("train", files(dtype="float16"), "features.dtype float64 float32 'float16'"),
-    "engine": ("train", files(engine="cuda"), "backend 'cuda' native torch"),
     "too many features": (
         "train",
         files(recipe="paper", num_features=9999),
         "recipe.num_features=9999 506",
     ),
-    "no penalty": ("train", files(recipe="paper", penalties=[]), "recipe.penalties []"),
     "statistics of the wrong recipe": (
         "train",
         files(recipe="general", statistics=True),
@@ -55,40 +44,23 @@ MISTAKES = {  # beside those of tests/test_command_line.py, which a page lists
         "Z1 SG1 csv",
     ),
     "evaluate another hand": ("evaluate", settings(model="{model}", cycles=2), "4 24 SG1"),
-    "detect in nothing": ("detect", settings(model="{model}", input="nowhere"), "nowhere"),
     "detect without an alarm": ("detect", settings(model="{bare}", input="{root}"), "alarm onset"),
-    "mask of no channel": (
-        "detect",
-        settings(model="{model}", input="{root}", masked_channels=["SG9"]),
-        "'SG9' SG1",
-    ),
     "export in a precision": (
         "export",
         settings(model="{model}", precision="int8"),
         "precision float32 float64 'int8'",
     ),
-    "export of no graph": ("export", settings(model="{model}", graph="cnn"), "bin stream 'cnn'"),
     "export of no alarm": ("export", settings(model="{bare}", graph="stream"), "alarm onset"),
-    "certify nothing": ("certify", settings(model="missing.pt"), "no detector missing.pt"),
     "adapt without statistics": (
         "adapt",
         settings(model="{bare}", recordings="{root}", channels=CHANNELS),
         "statistics.pt statistics=true",
     ),
     "adapt by nothing": ("adapt", settings(model="{model}"), "recordings"),
-    "adapt in another way": ("adapt", settings(model="{model}", action="learn"), "add 'learn'"),
-    "undo nothing": ("adapt", settings(model="{model}", action="undo"), "undo"),
     "crossval of too many": (
         "crossval",
         [*of_set("{root}"), *settings(num_held_out=4, workers=0)],
         "num_unseen 4",
-    ),
-    "pareto without time": ("pareto", files(deadline_ms=-1), "deadline_ms -1"),
-    "calibrate on reported seeds": ("calibrate", settings(calibration_seeds=[3]), "seeds 1000 [3]"),
-    "convert to nothing": (
-        "data",
-        settings(action="convert", root_of_data="{root}", format="docx", output="to"),
-        "'docx' npz text",
     ),
 }
 
@@ -108,14 +80,7 @@ def places(trained_by, recordings, tmp_path_factory):
     return {"{model}": model, "{root}": recordings, "{bare}": folder / DETECTOR}
 
 
-SOME_SLOW = [
-    name if place % 2 == 0 else pytest.param(name, marks=pytest.mark.slow)
-    for place, name in enumerate(MISTAKES)
-]
-"""Each is a command in a process of its own: every second one is made among the slow tests."""
-
-
-@pytest.mark.parametrize("name", SOME_SLOW)
+@pytest.mark.parametrize("name", MISTAKES)
 def test_a_mistake_is_one_line_and_a_failing_exit(command, places, name, tmp_path):
     which, overrides, words = MISTAKES[name]
     for word, place in places.items():

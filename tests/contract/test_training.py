@@ -4,28 +4,12 @@ import contextlib
 import os
 import signal
 
-import numpy as np
 import pytest
 import torch
 
+from . import names
 from .conftest import train
-from .names import (
-    CHECKPOINT,
-    CONFUSION,
-    DETECTOR,
-    FIT_FACTS,
-    HELD_OUT,
-    SPLITS,
-    TEST,
-    TRAIN,
-    TRAINING_RECORDINGS,
-    SufficientStats,
-    fit_quadratic,
-    held_out_scores,
-    score_raw,
-    settings,
-    solve_moments,
-)
+from .names import settings
 from .recordings import HELD_OUT as HELD_OUT_MATERIALS
 from .recordings import SEEN, TRIALS, samples_of, write_set
 from .running import wait_for
@@ -35,12 +19,12 @@ def scores_of(detector):
     """Scores of raw bins of recordings that no set holds."""
     length = detector.context_before + detector.pool.bin_samples + detector.context_after
     samples = torch.from_numpy(samples_of("E", 1).T.copy()).double()
-    return score_raw(detector, samples.unfold(1, length, 97).transpose(0, 1))
+    return detector.score_raw(samples.unfold(1, length, 97).transpose(0, 1))
 
 
 def trained_on(detector):
     """Names of the training recordings, as "material/trial"."""
-    return {name.split("|")[0] for name in detector.info[TRAINING_RECORDINGS]}
+    return {name.split("|")[0] for name in detector.info[names.TRAINING_RECORDINGS]}
 
 
 # Nothing of a held-out recording is learned ------------------------------------------------------
@@ -50,8 +34,8 @@ def trained_on(detector):
 def with_other_recordings(command, tmp_path):
     """Trains once more on the set with other samples in some recordings."""
 
-    def again(trained, names):
-        root = write_set(tmp_path / "set", dict.fromkeys(names, 1))
+    def again(trained, changed):
+        root = write_set(tmp_path / "set", dict.fromkeys(changed, 1))
         return train(command, tmp_path, trained.overrides, root=root, cache=tmp_path / "cache")
 
     return again
@@ -68,11 +52,11 @@ def test_held_out_recordings_change_no_number_of_the_fit(trained_or_slow, with_o
     torch.testing.assert_close(
         scores_of(other.detector), scores_of(trained.detector), rtol=1e-12, atol=1e-12
     )
-    for key in FIT_FACTS:
+    for key in names.FIT_FACTS:
         assert other.metrics[key] == trained.metrics[key], key
-    assert other.metrics[SPLITS][TRAIN] == trained.metrics[SPLITS][TRAIN]
-    told, found = (t.metrics[SPLITS] for t in (trained, other))
-    assert told[TEST] != found[TEST] or told[HELD_OUT] != found[HELD_OUT]
+    assert other.metrics[names.SPLITS][names.TRAIN] == trained.metrics[names.SPLITS][names.TRAIN]
+    told, found = (t.metrics[names.SPLITS] for t in (trained, other))
+    assert told[names.TEST] != found[names.TEST] or told[names.HELD_OUT] != found[names.HELD_OUT]
 
 
 def test_a_training_recording_does_change_the_fit(selected, with_other_recordings):
@@ -91,83 +75,15 @@ def test_a_killed_run_goes_on_behind_its_last_pass(command, trained_or_slow, tmp
     for attempt in ("1", "2", "3"):  # on a busy machine a run may end first
         run = tmp_path / attempt / "run"
         pid = command.start(tmp_path / attempt, "train", *overrides, *settings(folder="run"))
-        wait_for(run / CHECKPOINT)
+        wait_for(run / names.CHECKPOINT)
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-        if command.wait().status == -signal.SIGKILL and not (run / DETECTOR).exists():
+        if command.wait().status == -signal.SIGKILL and not (run / names.DETECTOR).exists():
             break
-    assert not (run / DETECTOR).exists()
+    assert not (run / names.DETECTOR).exists()
     resumed = train(command, tmp_path / "again", overrides, resume=run)
     torch.testing.assert_close(
         scores_of(resumed.detector), scores_of(trained.detector), rtol=1e-12, atol=1e-12
     )
-    for name, scores in trained.metrics[SPLITS].items():
-        assert resumed.metrics[SPLITS][name][CONFUSION] == scores[CONFUSION], name
-
-
-# Folds in closed form ----------------------------------------------------------------------------
-
-
-def draw(rng, num=60, num_features=5):
-    """Scaled features, labels, groups and weights."""
-    z = torch.from_numpy(rng.uniform(-1, 1, (num, num_features)))
-    is_slip = z[:, 0] + 0.5 * z[:, 1] * z[:, 2] > torch.from_numpy(0.2 * rng.standard_normal(num))
-    weights = torch.from_numpy(rng.uniform(0.5, 2, num))
-    return z, is_slip, torch.from_numpy(rng.integers(0, 4, num)), weights
-
-
-def kernel_machine(z, targets, weights, penalty, offset, others):
-    """Scores of others by the kernel machine, in NumPy from its definition."""
-    gram = (z @ z.T + offset) ** 2
-    solved = np.linalg.solve(gram + np.diag(1 / (penalty * weights)), targets)
-    return (others @ z.T + offset) ** 2 @ solved
-
-
-@pytest.mark.parametrize("penalty", [0.01, 1.0, 100.0])
-def test_held_out_folds_in_closed_form_are_those_of_refits(penalty, rng):
-    z, is_slip, groups, weights = draw(rng)
-    found = held_out_scores(z, is_slip, groups, penalty, 0.3, weights)
-    targets = np.where(is_slip, 1.0, -1.0)
-    for group in range(4):
-        out = (groups != group).numpy()
-        args = (z.numpy()[out], targets[out], weights.numpy()[out], penalty, 0.3)
-        expected = kernel_machine(*args, z.numpy()[~out])
-        np.testing.assert_allclose(found.numpy()[~out], expected, rtol=1e-8, atol=1e-8)
-        refit = fit_quadratic(z[out], is_slip[out], penalty, 0.3, weights[out])
-        np.testing.assert_allclose(refit(z[~out]).numpy(), expected, rtol=1e-8, atol=1e-8)
-
-
-def test_gradients_through_folds_and_fit_are_those_of_differences(rng):
-    z, is_slip, groups, weights = draw(rng, 24, 3)
-    others = draw(rng, 10, 3)[0]
-    z, weights = z.requires_grad_(), weights.requires_grad_()
-    numbers = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (0.7, 0.4)]
-
-    def folds(z, penalty, offset, weights):
-        return held_out_scores(z, is_slip, groups, penalty, offset, weights)
-
-    def fit(z, penalty, offset, weights):
-        return fit_quadratic(z, is_slip, penalty, offset, weights)(others)
-
-    assert torch.autograd.gradcheck(folds, (z, *numbers, weights))
-    assert torch.autograd.gradcheck(fit, (z, *numbers, weights))
-
-
-def test_moments_in_any_order_solve_to_the_machine_of_the_bins(rng, tmp_path):
-    """Batches added, taken out, kept in files and put together; classes of equal weight."""
-    z, is_slip, groups, _ = draw(rng, 200)
-    parts = [SufficientStats(num_features=5), SufficientStats(num_features=5)]
-    for group in (2, 0, 3, 1):
-        own = groups == group
-        parts[group % 2].update(f"batch {group}", z[own], is_slip[own])
-    own = groups == 1
-    parts[1].remove("batch 1", z[own], is_slip[own])
-    parts[1].save(tmp_path / "part")
-    parts[0].merge(SufficientStats.load(tmp_path / "part"))
-    out = groups != 1
-    kept, targets = z[out].numpy(), np.where(is_slip[out], 1.0, -1.0)
-    counts = {sign: (targets == sign).sum() for sign in (-1.0, 1.0)}
-    weights = np.array([len(kept) / (2 * counts[sign]) for sign in targets])
-    expected = kernel_machine(kept, targets, weights, 0.1, 0.5, z.numpy())
-    found = solve_moments(parts[0], 0.1)(z)
-    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-8, atol=1e-8)
+    for name, scores in trained.metrics[names.SPLITS].items():
+        assert resumed.metrics[names.SPLITS][name][names.CONFUSION] == scores[names.CONFUSION], name
