@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from tactslip_torch.data.labels import LabelRule
-from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.data.recording import Recording, RecordingId, Timeline
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
@@ -26,16 +26,12 @@ RATE_HZ = 2000.0
 
 
 @dataclass(frozen=True)
-class SmallTimeline:
+class SmallTimeline(Timeline):
     duration_s: float = 2.0
     onsets_s: tuple[float, ...] = (1.1,)
     annotated_onsets_s: tuple[float, ...] = (1.1,)
     sliding_s: tuple[tuple[float, float], ...] = ((1.1, 1.95),)
     speeds_mm_s: tuple[float, ...] = (20.0,)
-    non_slip_s: tuple[tuple[float, float], ...] = ()
-    slip_s: tuple[tuple[float, float], ...] = ()
-    missing_s: tuple[tuple[float, float], ...] = ()
-    released_s: tuple[tuple[float, float], ...] = ()
 
 
 class SmallSet:

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactslip_torch.data.file_recordings import FileTimeline, on_time
-from tactslip_torch.data.manifest import Truth, manifest_of, read_manifest, truth_of
-from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.file_recordings import on_time
+from tactslip_torch.data.manifest import manifest_of, read_manifest, truth_of
+from tactslip_torch.data.recording import RecordingId, Timeline
 
 FILES = ("a.csv", "b.csv", "c.csv")
 
@@ -48,14 +48,14 @@ def test_a_table_of_files_materials_and_labels(root):
     assert found.problems == found.warnings == ()
     first, second, third = found.entries
     assert first.recording == RecordingId("wood", 3)
-    assert first.truth == Truth(
+    assert first.truth == Timeline(
         onsets_s=(2.0, 9.0),
         sliding_s=((2.0, 7.0), (9.0, 11.5)),
         non_slip_s=((0.0, 1.5),),
         speeds_mm_s=(20.0, 40.0),
     )
     assert (first.sample_rate_hz, second.sample_rate_hz) == (None, 1000.0)
-    assert (second.place, second.truth) == ("manifest.csv:4", Truth(label="slip"))
+    assert (second.place, second.truth) == ("manifest.csv:4", Timeline(label="slip"))
     assert (third.file, third.truth) == ("day 2/d.csv", None)
 
 
@@ -249,11 +249,11 @@ def test_a_path_out_of_the_folder_is_refused(root, file, line):
 
 def test_a_label_stands_for_all_but_the_start():
     for label in ("slip", "non-slip"):
-        times, wrong = on_time(Truth(label=label), 3.0, skip_s=0.5)
+        times, wrong = on_time(Timeline(label=label), 3.0, skip_s=0.5)
         assert not wrong
         rest = ((0.5, 3.0),)
         assert (times.slip_s, times.non_slip_s) == ((rest, ()) if label == "slip" else ((), rest))
-    _, wrong = on_time(Truth(label="slip"), 0.4, skip_s=0.5)
+    _, wrong = on_time(Timeline(label="slip"), 0.4, skip_s=0.5)
     assert wrong == ["label: of 0.4 s nothing is left behind the first 0.5 s; lower skip_s"]
 
 
@@ -267,7 +267,7 @@ def test_a_slide_of_which_only_the_onset_is_known_ends_with_what_comes_first():
 
 
 def test_what_leaves_the_recording_is_named_and_what_is_off_by_a_sample_is_cut():
-    truth = Truth(
+    truth = Timeline(
         onsets_s=(2.0, 9.0), sliding_s=((2.0, 7.0), (9.0, 11.5)), non_slip_s=((0.0, 1.0),)
     )
     _, wrong = on_time(truth, 8.0)
@@ -278,7 +278,7 @@ def test_what_leaves_the_recording_is_named_and_what_is_off_by_a_sample_is_cut()
     assert on_time(truth, 11.4995)[1] == ["sliding_s: 9-11.5 s leaves the recording of 11.5 s"]
     times, wrong = on_time(truth, 11.4995, slack_s=0.0005, missing_s=[(4.0, 4.1)])
     assert not wrong
-    assert times == FileTimeline(
+    assert times == Timeline(
         (2.0, 9.0),
         (2.0, 9.0),
         (0.0, 0.0),

@@ -43,18 +43,16 @@ from tactslip_torch.data.formats import (
 )
 from tactslip_torch.data.formats._reading import MM_S
 from tactslip_torch.data.labels import slip_by_speed
-from tactslip_torch.data.manifest import (
+from tactslip_torch.data.manifest import Entry, Listing, Problem, manifest_of, read_manifest
+from tactslip_torch.data.recording import (
+    MOMENTS,
     SPANS,
-    TIMES,
-    Entry,
-    Listing,
-    Problem,
+    STRETCHES,
+    Recording,
+    RecordingId,
     Stretch,
-    Truth,
-    manifest_of,
-    read_manifest,
+    Timeline,
 )
-from tactslip_torch.data.recording import MOMENTS, STRETCHES, Recording, RecordingId
 from tactslip_torch.hand import KNOWN_KINDS, Adapting, Channel, HandLayout
 from tactslip_torch.runtime import check_choice, check_number, in_processes
 from tactslip_torch.signals.resampling import resample
@@ -114,22 +112,15 @@ def _digest(path: str, changed_ns: int, size: int) -> str:
 # The truth on the time of a recording -----------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class FileTimeline(Truth):
-    """A truth on the time of its recording: all is known and lies inside; a ``Timeline``."""
-
-    duration_s: float = 0.0
-
-
 def on_time(
-    truth: Truth,
+    truth: Timeline,
     duration_s: float,
     *,
     skip_s: float = 0.0,
     slide_s: float = 0.5,
     slack_s: float = 0.0,
     missing_s: Iterable[Stretch] = (),
-) -> tuple[FileTimeline, list[str]]:
+) -> tuple[Timeline, list[str]]:
     """A truth on the time of its recording, and what does not fit there.
 
     Args:
@@ -156,7 +147,7 @@ def on_time(
             "lower skip_s"
         )
     if problems:
-        return FileTimeline(duration_s=duration_s), problems
+        return Timeline(duration_s=duration_s), problems
     onsets = truth.onsets_s
     cut: dict[str, Any] = {
         name: tuple((start, min(end, duration_s)) for start, end in getattr(truth, name))
@@ -171,10 +162,10 @@ def on_time(
     cut["missing_s"] = tuple(sorted({*cut["missing_s"], *missing_s}))
     speeds = truth.speeds_mm_s if len(truth.speeds_mm_s) == len(onsets) else (0.0,) * len(onsets)
     annotated = truth.annotated_onsets_s or onsets
-    return FileTimeline(onsets, annotated, speeds, **cut, duration_s=duration_s), []
+    return Timeline(onsets, annotated, speeds, **cut, duration_s=duration_s), []
 
 
-def scaled(truth: Truth, factor: float) -> Truth:
+def scaled(truth: Timeline, factor: float) -> Timeline:
     """A truth told by a clock that runs ``factor`` times as fast as the one wanted."""
     changes: dict[str, Any] = {
         name: tuple(moment * factor for moment in getattr(truth, name))
@@ -235,15 +226,15 @@ class _Part(NamedTuple):
     units: str
     own: Archived | None
     rate_hz: float
-    by_speed: Truth | None = None
+    by_speed: Timeline | None = None
 
     @property
-    def truth(self) -> Truth:
+    def truth(self) -> Timeline:
         """What a file of ours says."""
         if self.own is None:
-            return Truth()
+            return Timeline()
         told = self.own.recording
-        return Truth(**{name: getattr(told, name) for name in TIMES})
+        return Timeline(**{name: getattr(told, name) for name in (*MOMENTS, *STRETCHES)})
 
 
 def look(path: Path, stream: Stream, stated_hz: float | None = None) -> _Part:
@@ -296,11 +287,11 @@ def _part_of(opened: Opened, path: Path, stream: Stream, stated_hz: float | None
     return _Part(clock, is_measured, num, hand, tuple(places), units, own, rate, told)
 
 
-def _by_speed(speed: EvenSamples, clock: Clock, stream: Stream) -> Truth:
+def _by_speed(speed: EvenSamples, clock: Clock, stream: Stream) -> Timeline:
     """What the column of speed tells of slip."""
     mm_s = speed.exact(0, speed.num_samples)[0].double() * MM_S[stream.reading.speed_unit]
     found = slip_by_speed(mm_s.numpy(), clock.sample_rate_hz, stream.speed_over or 0.0)
-    return Truth(tuple(start for start, _ in found.sliding_s), **found._asdict())
+    return Timeline(tuple(start for start, _ in found.sliding_s), **found._asdict())
 
 
 def _hand_of(opened: Opened, stream: Stream) -> tuple[HandLayout, list[int]]:
@@ -625,7 +616,7 @@ class _File(NamedTuple):
 
     entry: Entry
     parts: tuple[_Part, ...]
-    times: FileTimeline
+    times: Timeline
 
 
 def _doubts(recording: _File) -> list[str]:
@@ -900,7 +891,7 @@ class FileRecordings:
         """Where a recording is, and what was said of it."""
         return self._files[recording].entry
 
-    def timeline(self, recording: RecordingId) -> FileTimeline:
+    def timeline(self, recording: RecordingId) -> Timeline:
         """When things happen in a recording; nothing is read for it."""
         return self._files[recording].times
 

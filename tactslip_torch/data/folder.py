@@ -18,8 +18,8 @@ from tactslip_torch.data.formats import (
     format_of,
     named_format,
 )
-from tactslip_torch.data.manifest import NAMES, TIMES, write_table
-from tactslip_torch.data.recording import RecordingId, RecordingSource
+from tactslip_torch.data.manifest import NAMES, write_table
+from tactslip_torch.data.recording import TIMES, RecordingId, RecordingSource
 
 MANIFEST = NAMES[0]
 

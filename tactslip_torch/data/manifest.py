@@ -18,12 +18,20 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import yaml  # type: ignore[import-untyped]
 
 from tactslip_torch.data.formats import is_there
-from tactslip_torch.data.recording import MOMENTS, STRETCHES, RecordingId
+from tactslip_torch.data.recording import (
+    MOMENTS,
+    SPANS,
+    TIMES,
+    Label,
+    RecordingId,
+    Stretch,
+    Timeline,
+)
 from tactslip_torch.runtime import whole_file
 
 _Cell = str | list["_Cell"]
@@ -183,11 +191,6 @@ def _column(text: str) -> str:
     return "_".join(text.lower().split())
 
 
-Stretch = tuple[float, float]
-Label = Literal["slip", "non-slip"]
-SPANS = (*STRETCHES, "missing_s")
-TIMES = (*MOMENTS, *SPANS)
-"""What a ``Truth`` says beside its label."""
 _TRUTH_COLUMNS = (*TIMES, "label")
 _LABELS: dict[str, Label] = {"slip": "slip", "nonslip": "non-slip", "noslip": "non-slip"}
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -195,34 +198,7 @@ _SPAN = re.compile(rf"({_NUMBER})\s*(?:-|\N{{EN DASH}}|\.\.|to)\s*({_NUMBER}|end
 _TOUCH_S = 1e-6  # by less than that stretches only touch
 
 
-@dataclass(frozen=True)
-class Truth:
-    """When a recording slips, as far as somebody said.
-
-    Args:
-        onsets_s: when a slide begins; those of ``sliding_s`` where only they were given.
-        annotated_onsets_s: the same as a person marked them, where both are known.
-        speeds_mm_s: one for all strokes, or one per onset.
-        sliding_s: start and end of the slide behind each onset.
-        slip_s: stretches that are slip, begun nobody knows when.
-        non_slip_s: stretches that are not.
-        missing_s: stretches whose samples are not to be used.
-        released_s: of each onset, when the first and the last element of the skin let go.
-        label: of all of the recording.
-    """
-
-    onsets_s: tuple[float, ...] = ()
-    annotated_onsets_s: tuple[float, ...] = ()
-    speeds_mm_s: tuple[float, ...] = ()
-    sliding_s: tuple[Stretch, ...] = ()
-    slip_s: tuple[Stretch, ...] = ()
-    non_slip_s: tuple[Stretch, ...] = ()
-    missing_s: tuple[Stretch, ...] = ()
-    released_s: tuple[Stretch, ...] = ()
-    label: Label | None = None
-
-
-def truth_of(cells: Mapping[str, _Cell]) -> tuple[Truth | None, list[str]]:
+def truth_of(cells: Mapping[str, _Cell]) -> tuple[Timeline | None, list[str]]:
     """The truth that the cells of a line tell, ``None`` if they are all empty, and what is wrong.
 
     Example:
@@ -244,7 +220,7 @@ def truth_of(cells: Mapping[str, _Cell]) -> tuple[Truth | None, list[str]]:
             problems.append(f"{name}: {error}")
     if problems:
         return None, problems
-    truth = Truth(**told)
+    truth = Timeline(**told)
     onsets = truth.onsets_s or truth.annotated_onsets_s  # or the starts of slides
     onsets = onsets or tuple(start for start, _ in truth.sliding_s)
     speeds = truth.speeds_mm_s
@@ -253,7 +229,7 @@ def truth_of(cells: Mapping[str, _Cell]) -> tuple[Truth | None, list[str]]:
     return truth, _contradictions(truth)
 
 
-def _contradictions(truth: Truth) -> list[str]:
+def _contradictions(truth: Timeline) -> list[str]:
     """What cannot all be true, whatever the recording is."""
     found = []
     for name in MOMENTS[:2]:
@@ -284,7 +260,7 @@ def _contradictions(truth: Truth) -> list[str]:
     return found
 
 
-def _overlaps(truth: Truth) -> list[str]:
+def _overlaps(truth: Timeline) -> list[str]:
     """Stretches that cannot both be, of a truth whose numbers are fine one by one."""
     found = []
     for name in SPANS:
@@ -397,7 +373,7 @@ class Entry:
     place: str
     file: str
     recording: RecordingId
-    truth: Truth | None = None
+    truth: Timeline | None = None
     sample_rate_hz: float | None = None
     is_nominal: bool = False
 

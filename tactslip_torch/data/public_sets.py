@@ -17,15 +17,13 @@ from typing import Any
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.manifest import (
     Entry,
-    Label,
     Listing,
     Problem,
-    Truth,
     better_told,
     manifest_of,
     read_manifest,
 )
-from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.recording import Label, RecordingId, Timeline
 from tactslip_torch.hand import HandLayout
 
 _GROUPS = ("material", "trial", "scene", "label")
@@ -133,7 +131,7 @@ def authors_raw(
     return _set_of(listing, root, manifest, {"channels": rows, **options})
 
 
-def nominal(speeds_mm_s: Sequence[float], distance_mm: float, pause_s: float) -> Truth:
+def nominal(speeds_mm_s: Sequence[float], distance_mm: float, pause_s: float) -> Timeline:
     """Strokes one behind the other, a pause before each.
 
     Example:
@@ -150,7 +148,7 @@ def nominal(speeds_mm_s: Sequence[float], distance_mm: float, pause_s: float) ->
         start = (slides[-1][1] if slides else 0.0) + pause_s
         slides.append((start, start + distance_mm / speed))
     onsets = tuple(start for start, _ in slides)
-    return Truth(onsets, speeds_mm_s=tuple(map(float, speeds_mm_s)), sliding_s=tuple(slides))
+    return Timeline(onsets, speeds_mm_s=tuple(map(float, speeds_mm_s)), sliding_s=tuple(slides))
 
 
 def _listed(
@@ -192,7 +190,7 @@ def _listed(
             known = ", ".join(labels)
             problems.append(Problem(file, f"{told} {word!r} is none of data.labels: {known}"))
         else:
-            truth = Truth(label=label) if label else None
+            truth = Timeline(label=label) if label else None
             entries.append(Entry(file, file, RecordingId(material, int(trial), scene), truth))
     return Listing(tuple(entries), tuple(problems))
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from torch import Tensor
 
@@ -41,9 +41,47 @@ class RecordingId:
         return f"{self.material}/{self.cycle}{scene}{session}"
 
 
+Stretch = tuple[float, float]
+"""Start and end, in seconds."""
+Label = Literal["slip", "non-slip"]
 MOMENTS = ("onsets_s", "annotated_onsets_s", "speeds_mm_s")
 STRETCHES = ("sliding_s", "slip_s", "non_slip_s", "released_s")
 """What a ``Recording`` says of its time: numbers, one of each slide, and pairs of start and end."""
+SPANS = (*STRETCHES, "missing_s")
+TIMES = (*MOMENTS, *SPANS)
+"""What a ``Timeline`` says beside the duration and a label."""
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """When things happen in a recording, known before any sample is, as far as somebody said.
+
+    Args:
+        onsets_s: when a slide begins, exact where known; those of ``sliding_s`` where only they
+            were given.
+        annotated_onsets_s: the same as a person marked them, where both are known.
+        speeds_mm_s: steady speed, one per onset.
+        sliding_s: start and end of the slide behind each onset.
+        slip_s: stretches that are slip, begun nobody knows when.
+        non_slip_s: stretches without slip in which the hand is handled.
+        missing_s: stretches without samples, or whose samples are not to be used; no bin is laid
+            that needs one of them.
+        released_s: of each onset, when the first and the last element of the skin let go; empty
+            where that is not known.
+        label: of all of the recording; none is left where a ``RecordingSource`` tells of it.
+        duration_s: length of the recording; 0 before it is opened.
+    """
+
+    onsets_s: tuple[float, ...] = ()
+    annotated_onsets_s: tuple[float, ...] = ()
+    speeds_mm_s: tuple[float, ...] = ()
+    sliding_s: tuple[Stretch, ...] = ()
+    slip_s: tuple[Stretch, ...] = ()
+    non_slip_s: tuple[Stretch, ...] = ()
+    missing_s: tuple[Stretch, ...] = ()
+    released_s: tuple[Stretch, ...] = ()
+    label: Label | None = None
+    duration_s: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +117,13 @@ class Recording:
     material: str
     speeds_mm_s: tuple[float, ...]
     onsets_s: tuple[float, ...]
-    sliding_s: tuple[tuple[float, float], ...]
+    sliding_s: tuple[Stretch, ...]
     annotated_onsets_s: tuple[float, ...] = ()
-    non_slip_s: tuple[tuple[float, float], ...] = ()
+    non_slip_s: tuple[Stretch, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    slip_s: tuple[tuple[float, float], ...] = ()
+    slip_s: tuple[Stretch, ...] = ()
     units: str = "V"
-    released_s: tuple[tuple[float, float], ...] = ()
+    released_s: tuple[Stretch, ...] = ()
 
     def __post_init__(self) -> None:
         if self.samples.ndim != 2:
@@ -136,51 +174,6 @@ class Recording:
     def duration_s(self) -> float:
         """Length in seconds."""
         return self.samples.shape[-1] / self.sample_rate_hz
-
-    @property
-    def missing_s(self) -> tuple[tuple[float, float], ...]:
-        """None: what is missing is NaN among the samples. So it is a ``Timeline`` itself."""
-        return ()
-
-
-class Timeline(Protocol):
-    """When things happen in a recording, known before any sample is."""
-
-    @property
-    def duration_s(self) -> float:
-        """Length of the recording."""
-
-    @property
-    def onsets_s(self) -> tuple[float, ...]:
-        """Exact onsets, one per stroke."""
-
-    @property
-    def annotated_onsets_s(self) -> tuple[float, ...]:
-        """The onsets as a person marked them."""
-
-    @property
-    def sliding_s(self) -> tuple[tuple[float, float], ...]:
-        """Start and end of each slide."""
-
-    @property
-    def released_s(self) -> tuple[tuple[float, float], ...]:
-        """When the first and the last element let go, of each onset; empty if not known."""
-
-    @property
-    def speeds_mm_s(self) -> tuple[float, ...]:
-        """Steady speed of each stroke that slides."""
-
-    @property
-    def non_slip_s(self) -> tuple[tuple[float, float], ...]:
-        """Stretches without slip in which the hand is handled."""
-
-    @property
-    def slip_s(self) -> tuple[tuple[float, float], ...]:
-        """Stretches that are slip though nobody knows when it began."""
-
-    @property
-    def missing_s(self) -> tuple[tuple[float, float], ...]:
-        """Stretches of which there are no samples; no bin is laid that needs one of them."""
 
 
 class RecordingSource(Protocol):

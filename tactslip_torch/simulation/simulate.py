@@ -23,7 +23,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.data.recording import Recording, RecordingId, Stretch
+from tactslip_torch.data.recording import Timeline as _Timeline
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.native import BackendName
 from tactslip_torch.simulation._blocks import Array, Grid, generator
@@ -53,38 +54,23 @@ from tactslip_torch.simulation.scene import (
 )
 
 
-@dataclass(frozen=True)
-class Timeline:
+@dataclass(frozen=True, kw_only=True)
+class Timeline(_Timeline):
     """When what happens, one entry per stroke that slides unless said otherwise.
 
+    Onsets are exact, annotated ones have the jitter of a person. With bristles a slide of a tacky
+    material includes its stick phases; of ``released_s``, bristles may hold an element that carries
+    little load: it never lets go and does not count. ``non_slip_s`` are intervals, ascending and
+    apart, that a detector of motors or knocks would call slip. ``slip_s`` is empty since every
+    onset is known, ``missing_s`` since dropped samples repeat the last, as loggers do.
+
     Args:
-        duration_s: of the recording, a whole number of samples.
-        num_samples: the same in samples.
-        speeds_mm_s: steady speeds.
-        onsets_s: when the contact begins to slide, exact.
-        annotated_onsets_s: the same as a person would mark it, with jitter.
-        sliding_s: ``(onset, end)`` of each slide. With bristles a slide of a tacky material
-            includes its stick phases.
-        released_s: of each slide, when its first and when its last element lets go. Bristles may
-            hold an element that carries little load: it never lets go and does not count.
+        num_samples: of the recording, whose duration is a whole number of samples.
         arm_s: ``(start, stop)`` of every stroke that the arm drives, sliding or not.
-        non_slip_s: intervals without slip in which the hand is handled, ascending and apart: what
-            a detector of motors or knocks would call slip.
-        slip_s: none: every onset is known.
-        missing_s: none: dropped samples repeat the last, as loggers do.
     """
 
-    duration_s: float
     num_samples: int
-    speeds_mm_s: tuple[float, ...]
-    onsets_s: tuple[float, ...]
-    annotated_onsets_s: tuple[float, ...]
-    sliding_s: tuple[tuple[float, float], ...]
-    released_s: tuple[tuple[float, float], ...]
-    arm_s: tuple[tuple[float, float], ...]
-    non_slip_s: tuple[tuple[float, float], ...] = ()
-    slip_s: tuple[tuple[float, float], ...] = ()
-    missing_s: tuple[tuple[float, float], ...] = ()
+    arm_s: tuple[Stretch, ...]
 
 
 def timeline(scene: Scene) -> Timeline:
