@@ -322,21 +322,15 @@ def _isolated(path: Path, how: Reading, stack: ExitStack) -> Opened:
     found = json.loads(answer.read_text())
     if "refused" in found:
         raise Refused(found["refused"])
-    size = found["num_samples"]
-    values: Any = np.empty(0, found["dtype"])
-    if size:
-        values = np.memmap(folder / "samples", found["dtype"], "r")
-    values = values.reshape(size, found["num_channels"])
+    kept: dict[str, Any] = {}
+    for path_of in folder.glob("*.npy"):
+        kept[path_of.stem] = np.load(path_of, mmap_mode="r")
     if found["header"] is not None:
-        return opened_from(found["header"], path, values)
-    stamps = None
-    if size and found["has_times"]:
-        stamps = Samples(path, [np.memmap(folder / "times", "f8", "r")])
-    speed = None
-    if size and found["has_speed"]:
-        speed = Samples(path, [np.memmap(folder / "speed", "f8", "r")])
+        return opened_from(found["header"], path, kept["samples"])
+    stamps, speed = (Samples(path, [kept[n]]) if n in kept else None for n in ("times", "speed"))
     names = None if found["names"] is None else tuple(found["names"])
-    return Opened(Samples(path, values), None, names, stamps, "s", found["sample_rate_hz"], speed)
+    samples = Samples(path, kept["samples"])
+    return Opened(samples, None, names, stamps, "s", found["sample_rate_hz"], speed)
 
 
 def _read_for_parent() -> None:
@@ -372,26 +366,20 @@ def _limit(how: Reading) -> None:
 
 
 def _written(opened: Opened, folder: Path) -> dict[str, Any]:
-    """Samples and times as plain numbers in files, and the rest as plain values."""
-    samples, archived, times = opened.samples, opened.archived, opened.times()
-    with (folder / "samples").open("wb") as file:
+    """Samples, times and speed as arrays in files, and the rest as plain values."""
+    samples, archived, times, speed = opened.samples, opened.archived, opened.times(), opened.speed
+    head = {"fortran_order": False, "shape": (samples.num_samples, samples.num_channels)}
+    head["descr"] = "<f4" if samples.dtype == torch.float32 else "<f8"
+    with (folder / "samples.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, head)  # type: ignore[no-untyped-call]
         for piece in pieces(samples, _STRETCH):
             file.write(piece.T.contiguous().numpy().data)
     if times is not None:
-        times.tofile(folder / "times")
-    if opened.speed is not None:
-        opened.speed.read(0, opened.speed.num_samples).double().numpy().tofile(folder / "speed")
+        np.save(folder / "times.npy", times)
+    if speed is not None:
+        np.save(folder / "speed.npy", speed.read(0, speed.num_samples)[0].double())
     header = None
     if archived is not None:
         header = header_of(archived.recording, archived.hand, archived.key)
         header["shape"] = [samples.num_channels, samples.num_samples]
-    return {
-        "dtype": str(samples.dtype).removeprefix("torch."),
-        "num_samples": samples.num_samples,
-        "num_channels": samples.num_channels,
-        "names": opened.names,
-        "sample_rate_hz": opened.sample_rate_hz,
-        "has_times": times is not None,
-        "has_speed": opened.speed is not None,
-        "header": header,
-    }
+    return {"names": opened.names, "sample_rate_hz": opened.sample_rate_hz, "header": header}

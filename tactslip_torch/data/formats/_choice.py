@@ -38,21 +38,16 @@ class Array:
     Args:
         name: in full, as people of the format write it: ``/group/volts``, ``trial.volts``.
         values: have ``shape`` and ``dtype`` and are sliced as NumPy's are.
-        leaf: the last part of the name, if it has parts.
+        leaf: the last part of the name.
         labels: words that may name its channels, the likeliest first.
         sample_rate_hz: if the file says it of this array.
     """
 
     name: str
     values: Any
-    leaf: str = ""
+    leaf: str
     labels: Sequence[tuple[str, ...]] = ()
     sample_rate_hz: float | None = None
-
-    @property
-    def short_name(self) -> str:
-        """Without the groups it stands in."""
-        return self.leaf or self.name
 
     @property
     def length(self) -> int:
@@ -188,9 +183,10 @@ def _some(words: Sequence[str]) -> str:
 
 def choose(
     path: str | os.PathLike[str],
-    arrays: Sequence[Array],
-    refused: Mapping[str, str],
+    found: Mapping[str, Any],
     how: Reading,
+    separator: str = "/",
+    said: Callable[[Any], tuple[list[tuple[str, ...]], float | None]] = lambda _: ([], None),
 ) -> Opened:
     """The samples of a file: its only array of two dimensions, or all columns of one length.
 
@@ -199,13 +195,23 @@ def choose(
 
     Args:
         path: of the file.
-        arrays: that can be read.
-        refused: names of what cannot, each with the reason.
+        found: everything in it by name: an array of numbers, a tuple of words, or the text why it
+            is neither.
         how: what a person says of the file.
+        separator: between the parts of a name.
+        said: what attributes say of an array: words that may name its channels, and its rate.
 
     Raises:
         Refused: in one line that names what could be meant, if that is none or several.
     """
+    words = {name: kept for name, kept in found.items() if isinstance(kept, tuple)}
+    refused = {name: kept for name, kept in found.items() if isinstance(kept, str)}
+    arrays = []
+    for name, kept in found.items():
+        if not isinstance(kept, tuple | str):
+            labels, rate = said(kept)
+            labels += _labels_near(name, words, separator)
+            arrays.append(Array(name, kept, name.rpartition(separator)[2], labels, rate))
     several = [array for array in arrays if math.prod(array.values.shape) > 1]
     within = several if how.samples is None else _named(how.samples, several, refused)
     times = [] if isinstance(how.time, int) else _times_of(several, refused, how)
@@ -214,8 +220,8 @@ def choose(
     beside = [*times, *speeds]
     singles = [array for array in within if array.is_column and array not in beside]
     matrices = [array for array in within if not array.is_column]
-    words = {word for single in singles for word in (single.name, single.leaf)}
-    if matrices and (how.channels is None or not words.issuperset(how.channels)):
+    called = {word for single in singles for word in (single.name, single.leaf)}
+    if matrices and (how.channels is None or not called.issuperset(how.channels)):
         if len(matrices) > 1:
             raise Refused(f"holds several arrays, {_listed(matrices)}; say reading.samples")
         opened = _of_matrix(path, matrices[0], times, how)
@@ -224,8 +230,8 @@ def choose(
         columns = [array for array in several if array.is_column]
         opened, near = _of_columns(path, singles, columns, how)
     else:
-        said = "; ".join([f"{name!r} {why}" for name, why in refused.items()][:3])
-        reasons = f" ({said})" if said else ""
+        whys = "; ".join([f"{name!r} {why}" for name, why in refused.items()][:3])
+        reasons = f" ({whys})" if whys else ""
         raise Refused(f"holds no samples{reasons}; say reading.samples if it does")
     if opened.stamps is None and times:
         opened = _with_times(path, opened, times, how)
@@ -243,7 +249,7 @@ def _times_of(
 ) -> Sequence[Array]:
     """The arrays that may be times, by the name that was given or by what they are called."""
     if how.time == "auto":
-        return [a for a in several if a.is_column and _is_time_name(a.short_name)]
+        return [a for a in several if a.is_column and _is_time_name(a.leaf)]
     if how.time is None:
         return []
     return _said(str(how.time), several, refused)
@@ -263,7 +269,7 @@ def _with_times(
     length = opened.samples.num_samples
     fitting = [array for array in times if array.is_column and array.length == length]
     if fitting:
-        unit = unit_of_time(fitting[0].short_name, how)
+        unit = unit_of_time(fitting[0].leaf, how)
         return opened._replace(stamps=Samples(path, [fitting[0].values]), time_unit=unit)
     if how.time != "auto":
         raise Refused(f"has times {_listed(times)} for {length} samples; say reading.time")
@@ -321,7 +327,7 @@ def _of_columns(
         raise Refused("holds no column but the times; say reading.time=null if it is none")
     if len({column.length for column in chosen}) > 1:
         raise Refused(f"holds columns of several lengths, {_listed(chosen)}; say reading.channels")
-    names = tuple(column.short_name for column in chosen)
+    names = tuple(column.leaf for column in chosen)
     if len(set(names)) < len(names):
         names = tuple(column.name for column in chosen)
     opened = Opened(Samples(path, [column.values for column in chosen]), names=names)
@@ -353,12 +359,12 @@ def _listed(arrays: Sequence[Array]) -> str:
 def _single_rate(arrays: Sequence[Array], name: str) -> float | None:
     """A rate that is an array of one number, the nearest to the samples by its name."""
     single = [a for a in arrays if math.prod(a.values.shape) == 1]
-    single = [a for a in single if a.short_name.lower() in _RATE_NAMES]
+    single = [a for a in single if a.leaf.lower() in _RATE_NAMES]
     single.sort(key=lambda one: len(os.path.commonprefix([one.name, name])))
-    return rate_in({one.short_name: float(np.ravel(one.values[()])[0]) for one in single})
+    return rate_in({one.leaf: float(np.ravel(one.values[()])[0]) for one in single})
 
 
-def labels_near(
+def _labels_near(
     name: str, words: Mapping[str, tuple[str, ...]], separator: str
 ) -> list[tuple[str, ...]]:
     """The words of a file that may name the channels of an array, those beside it first."""

@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 
 from tactslip_torch.data.formats._choice import (
     LABEL_NAMES,
-    Array,
     choose,
-    labels_near,
     rate_in,
     why_not_numbers,
 )
@@ -78,79 +76,62 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     channels by words, that are called so.
     """
     file = stack.enter_context(needs("h5py", f"reading {path.suffix}").File(path, "r"))
-    said = _attribute(file, "header")
-    own = header_in(said[0]) if len(said) == 1 else None
+    own = header_in(_attribute(file, "header"))
     if own is not None:
         if why := _why_not(file["samples"]):
             raise ValueError(f"/samples {why}")
         return opened_from(own, path, file["samples"], 1)
-    refused: dict[str, str] = {}
-    numbers: dict[str, Any] = {}
-    words: dict[str, tuple[str, ...]] = {}
-    for name, dataset in _datasets(file, refused):
-        why = _why_not(dataset)
-        if why is None:
-            numbers[name] = dataset
-            continue
-        refused[name] = why
+    found: dict[str, Any] = {}
+    for name, dataset in _datasets(file, found):
         is_label = name.rpartition("/")[2].lower() in LABEL_NAMES
+        found[name] = _why_not(dataset) or dataset
         if is_label and _why_elsewhere(dataset) is None and _are_words(dataset):
-            words[name] = _decoded(dataset[()])
-    return choose(path, _described(numbers, words, "/"), refused, how)
+            found[name] = _decoded(dataset[()])
+    return choose(path, found, how, said=_said)
 
 
-def _described(
-    numbers: Mapping[str, Any], words: Mapping[str, tuple[str, ...]], separator: str
-) -> list[Array]:
-    """Datasets of numbers with the names of channels and the rate that are said of them."""
-    arrays = []
-    for name, dataset in numbers.items():
-        around = [dataset]
-        while around[-1].name != "/":
-            around.append(around[-1].parent)
-        named = [
-            _attribute(one, at) for one in around for at in one.attrs if at.lower() in LABEL_NAMES
-        ]
-        labels = [*named, *labels_near(name, words, separator)]
-        rate = next(filter(None, map(_rate_of, around)), None)
-        arrays.append(Array(name, dataset, name.rpartition(separator)[2], labels, rate))
-    return arrays
+def _said(dataset: Any) -> tuple[list[tuple[str, ...]], float | None]:
+    """Words that may name the channels of a dataset and its rate, the nearest attributes first."""
+    around = [dataset]
+    while around[-1].name != "/":
+        around.append(around[-1].parent)
+    named = [(one, at) for one in around for at in one.attrs if at.lower() in LABEL_NAMES]
+    rate = next(filter(None, map(_rate_of, around)), None)
+    return [_attribute(one, at) for one, at in named], rate
 
 
-def _datasets(file: Any, refused: dict[str, str]) -> Iterator[tuple[str, Any]]:
+def _datasets(file: Any, found: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """Every dataset that hard links lead to, by name, breadth first.
 
     Args:
         file: open.
-        refused: gets the names of what is no such, with the reason.
+        found: gets the names of what is no such, with the reason.
 
     Raises:
         Refused: if there are more than ``MOST_MEMBERS`` groups and datasets.
     """
     h5py = needs("h5py", "reading HDF5")
-    groups, seen = [("", file)], {h5py.h5o.get_info(file.id).addr}
+    groups, seen = [("", file)], {file["/"]}
     while groups:
         prefix, group = groups.pop(0)
         for leaf in group:
             name = f"{prefix}/{leaf}"
             if not isinstance(group.get(leaf, getlink=True), h5py.HardLink):
-                refused[name] = "is a link, perhaps to another file, and not followed"
+                found[name] = "is a link, perhaps to another file, and not followed"
                 continue
             try:
-                found = group[leaf]
-                address = h5py.h5o.get_info(found.id).addr
+                thing = group[leaf]
+                is_known = thing in seen
             except (KeyError, OSError, RuntimeError, TypeError, ValueError):
-                refused[name] = "is damaged"
+                found[name] = "is damaged"
                 continue
-            if address in seen:
-                continue
-            seen.add(address)
+            seen.add(thing)
             if len(seen) > MOST_MEMBERS:
                 raise Refused(f"holds more than {MOST_MEMBERS} objects")
-            if isinstance(found, h5py.Group):
-                groups.append((name, found))
-            elif isinstance(found, h5py.Dataset):
-                yield name, found
+            if isinstance(thing, h5py.Group) and not is_known:
+                groups.append((name, thing))
+            elif isinstance(thing, h5py.Dataset) and not is_known:
+                yield name, thing
 
 
 def _why_elsewhere(dataset: Any) -> str | None:
@@ -211,44 +192,37 @@ def _rate_of(thing: Any) -> float | None:
 def read_mat(path: Path, how: Reading, stack: ExitStack) -> Opened:
     """The samples of a MAT file of version 7.3, variables of structs as ``trial.volts``."""
     file = stack.enter_context(needs("h5py", "reading .mat of version 7.3").File(path, "r"))
-    numbers, words, refused = _variables(file)
-    own = header_in("".join(words.get("header", ())))
+    found = _variables(file)
+    own = header_in(found.get("header"))
     if own is not None:
-        return opened_from(own, path, numbers["samples"])
+        return opened_from(own, path, found["samples"])
     if how.time_first is not None:
         how = replace(how, time_first=not how.time_first)  # as MATLAB shows it
-    return choose(path, _described(numbers, words, "."), refused, how)
+    return choose(path, found, how, ".", _said)
 
 
-def _variables(file: Any) -> tuple[dict[str, Any], dict[str, tuple[str, ...]], dict[str, str]]:
-    """Numbers, words, and the reasons why others are neither, by the classes MATLAB wrote."""
-    refused: dict[str, str] = {}
-    numbers: dict[str, Any] = {}
-    words: dict[str, tuple[str, ...]] = {}
-    for path_in_file, thing in _datasets(file, refused):
+def _variables(file: Any) -> dict[str, Any]:
+    """Numbers, words, or why they are neither, by name and by the classes MATLAB wrote."""
+    linked: dict[str, Any] = {}
+    found: dict[str, Any] = {}
+    for path_in_file, thing in _datasets(file, linked):
         name = path_in_file.strip("/").replace("/", ".")
         if name.startswith("#"):
             continue
         kind = "".join(_attribute(thing, "MATLAB_class"))
         why = _why_elsewhere(thing) or ("is empty" if "MATLAB_empty" in thing.attrs else None)
         if why is None and kind in ("char", "cell"):
-            found = _characters(thing) if kind == "char" else _cells(file, thing)
-            if found is not None:
-                words[name] = found
-                continue
-            why = f"is a {kind} array"
-        if why is None and kind == "logical":
-            why = "holds true or false"
-        if why is None and ("MATLAB_object_decode" in thing.attrs or kind not in _CLASSES):
-            why = f"is of class {kind[:40]}"
-        if why is None and "MATLAB_sparse" in thing.parent.attrs:
-            why = "is of a sparse matrix"
-        why = why or _why_not(thing)
-        if why is None:
-            numbers[name] = thing
+            words = _characters(thing) if kind == "char" else _cells(file, thing)
+            found[name] = f"is a {kind} array" if words is None else words
+        elif why is None and kind == "logical":
+            found[name] = "holds true or false"
+        elif why is None and ("MATLAB_object_decode" in thing.attrs or kind not in _CLASSES):
+            found[name] = f"is of class {kind[:40]}"
+        elif why is None and "MATLAB_sparse" in thing.parent.attrs:
+            found[name] = "is of a sparse matrix"
         else:
-            refused[name] = why
-    return numbers, words, refused
+            found[name] = why or _why_not(thing) or thing
+    return linked | found
 
 
 def _characters(thing: Any) -> tuple[str, ...] | None:

@@ -16,7 +16,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._choice import Array, choose, labels_near, why_not_numbers
+from tactslip_torch.data.formats._choice import choose, why_not_numbers
 from tactslip_torch.data.formats._hdf5 import read_mat
 from tactslip_torch.data.formats._reading import (
     FREE_BYTES,
@@ -82,17 +82,10 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     for name, value in _loaded(path).items():
         if not name.startswith("__"):
             _look(name, value, found, 0)
-    words = {name: one for name, one in found.items() if isinstance(one, tuple)}
-    own = header_in("".join(words.get("header", ())))
+    own = header_in(found.get("header"))
     if own is not None:
         return opened_from(own, path, found["samples"], 1)
-    arrays = [
-        Array(name, one, name.rpartition(".")[2], labels_near(name, words, "."))
-        for name, one in found.items()
-        if isinstance(one, np.ndarray)
-    ]
-    refused = {name: one for name, one in found.items() if isinstance(one, str)}
-    return choose(path, arrays, refused, how)
+    return choose(path, found, how, ".")
 
 
 def _loaded(path: Path) -> dict[str, Any]:

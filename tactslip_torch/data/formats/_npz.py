@@ -24,7 +24,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._choice import Array, choose, why_not_numbers
+from tactslip_torch.data.formats._choice import choose, why_not_numbers
 from tactslip_torch.data.formats._reading import (
     FORM,
     MOST_CHANNELS,
@@ -90,9 +90,8 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
             return opened_from(_header(stored), path, stored["samples"], 1)
         if how.samples is None and "samples" in stored:
             how = replace(how, samples="samples", time_first=how.time_first is True)
-    whys = {name: why_not_numbers(kept.dtype, kept.shape) for name, kept in stored.items()}
-    arrays = [Array(name, kept) for name, kept in stored.items() if whys[name] is None]
-    return choose(path, arrays, {n: why for n, why in whys.items() if why is not None}, how)
+    found = {n: why_not_numbers(kept.dtype, kept.shape) or kept for n, kept in stored.items()}
+    return choose(path, found, how)
 
 
 def _header(content: Mapping[str, NDArray[Any]]) -> dict[str, Any]:

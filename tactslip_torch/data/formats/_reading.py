@@ -484,14 +484,15 @@ def text_of(header: Mapping[str, Any]) -> str:
     return text
 
 
-def header_in(text: str | None) -> dict[str, Any] | None:
-    """What ``text_of`` wrote; ``None`` if a text is not ours.
+def header_in(kept: object) -> dict[str, Any] | None:
+    """What ``text_of`` wrote, whole or as words; ``None`` of anything that is not ours.
 
     Raises:
         Refused: if it is of another version, or too long.
         ValueError: if it is damaged.
     """
-    if text is None or FORM.rpartition(" ")[0] not in text:
+    text = "".join(kept) if isinstance(kept, tuple) else kept
+    if not isinstance(text, str) or FORM.rpartition(" ")[0] not in text:
         return None
     if len(text) > MOST_HEADER:
         raise Refused(f"has a header of {len(text)} characters, at most {MOST_HEADER} are read")
@@ -520,7 +521,6 @@ def opened_from(
     path: str | os.PathLike[str],
     source: Any,
     time_axis: int = 0,
-    rows: Sequence[int] | None = None,
 ) -> Opened:
     """An open file of ours: its samples, as ``Samples`` has them, and all else around none of them.
 
@@ -528,7 +528,7 @@ def opened_from(
         ValueError: if a part of the header is missing or wrong, or belongs to other samples.
     """
     try:
-        samples = Samples(path, source, time_axis, rows, DTYPES[header["dtype"]])
+        samples = Samples(path, source, time_axis, dtype=DTYPES[header["dtype"]])
         found = samples.num_channels, samples.num_samples
         if shape_of(header) != found:
             raise ValueError(

@@ -113,7 +113,7 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
             spool.add(_rows_of(lines, layout, line))
     table = spool.array()
     if own is not None:
-        return opened_from(own, path, table, 0, range(1, layout.num_columns))
+        return opened_from(own, path, table[:, 1:])
     names, first_rows = layout.names, table[:_TO_COUNT]
     if names is None and how.time == "auto" and how.sample_rate_hz is None:
         how = replace(how, time=0 if layout.num_columns > 1 else None)
