@@ -116,7 +116,7 @@ class TopicMessages:
         name = self._topic.name
         try:
             columns = TopicColumns(Message(self._topic, 0, content), Types(), self._how)
-            num = columns.rows(content)[0].shape[1]
+            num = columns.num_channels
         except Refused as error:
             raise ValueError(f"topic {name} of {self._topic.kind}: {error}") from None
         named = columns.names is not None and self._how.channels is None

@@ -13,7 +13,6 @@ import json
 import keyword
 import re
 import zlib
-from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -254,9 +253,9 @@ class TopicColumns:
         how: what a person says of the topic.
 
     Attributes:
+        num_channels: of the samples.
         names: of the channels, if messages have names.
-        is_timed: whether one of the numbers is the time, since nothing else is.
-        time_name: of that number.
+        time_name: of the number that is the time, since nothing else is.
         is_small: whether float32 holds all numbers.
 
     Raises:
@@ -280,7 +279,7 @@ class TopicColumns:
         self._time, self._columns = chosen_columns(names, num_columns, how)
         self.names = None if names is None else tuple(names[place] for place in self._columns)
         self.time_name = names[self._time] if names and self._time is not None else None
-        self.is_timed = self._time is not None
+        self.num_channels = len(self._columns)
         self.is_small = self._is_array and np.can_cast(rows.dtype, np.float32)
 
     def _decoded(self, message: bytes) -> tuple[NDArray[Any], tuple[str, ...] | None, int | None]:
@@ -329,11 +328,9 @@ class _TopicSamples:
 
     def __init__(self, first: Message, types: Types | None, how: Reading, stack: ExitStack) -> None:
         self._of, self._how, self._stack = TopicColumns(first, types, how), how, stack
-        self.topic, self.names = self._of.topic, self._of.names
-        self.checksum = 0
-        num_columns = self._of.rows(first.content)[0].shape[1]
-        self.spool = Spool(num_columns, "f4" if self._of.is_small else "f8", stack)
-        self._logged, self._stamps, self._counts = (array("q") for _ in range(3))
+        self.topic, self.names, self.checksum = self._of.topic, self._of.names, 0
+        self.spool = Spool(self._of.num_channels, "f4" if self._of.is_small else "f8", stack)
+        self._marks = Spool(3, np.int64, stack)  # when recorded, stamp or 0, number of samples
         self._named: list[Any] = []  # the times that ``how`` names
 
     def add(self, message: Message) -> None:
@@ -344,12 +341,9 @@ class _TopicSamples:
         """
         rows, stamp, named = self._of.rows(message.content)
         self.spool.add(rows)
+        self._marks.add(np.array([[message.log_time, stamp or 0, len(rows)]], np.int64))
         self.checksum = zlib.crc32(message.content, self.checksum)
-        self._logged.append(message.log_time)
-        self._counts.append(len(rows))
-        if stamp is not None:
-            self._stamps.append(stamp)
-        if self._of.is_timed:
+        if named is not None:
             self._named.append(named)
 
     def ordered(self) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
@@ -357,7 +351,11 @@ class _TopicSamples:
 
         No times if nobody asks for them, or of a single block where nobody gives the rate.
         """
-        rows, times, counts = self.spool.array(), self._message_times(), np.array(self._counts)
+        rows, (logged, stamps, counts) = self.spool.array(), self._marks.array().T
+        times = stamps if self._how.time == "auto" and stamps.any() else logged
+        if self._named:
+            unit = unit_of_time(self._of.time_name, self._how)
+            times = _nanoseconds(np.array(self._named), SECONDS[unit])
         if (np.diff(times) < 0).any():
             order = np.argsort(times, kind="stable")
             starts = np.cumsum(counts) - counts  # the first row of each message
@@ -389,14 +387,6 @@ class _TopicSamples:
         number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         since = np.repeat((times - times[0]).astype(np.float64), counts)
         return np.asarray((since + number * np.repeat(spacing, counts)) / _SECOND)
-
-    def _message_times(self) -> NDArray[np.int64]:
-        """In nanoseconds."""
-        if self._of.is_timed:
-            unit = unit_of_time(self._of.time_name, self._how)
-            return _nanoseconds(np.array(self._named), SECONDS[unit])
-        is_stamped = self._how.time == "auto" and any(self._stamps)
-        return np.array(self._stamps if is_stamped else self._logged, np.int64)
 
 
 def _nanoseconds(times: NDArray[Any], seconds: float) -> NDArray[np.int64]:
