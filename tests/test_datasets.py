@@ -644,7 +644,7 @@ def test_paths_say_what_recordings_are(folder):
         ({"pattern": r"./(?P<material>pe)(?P<trial>.+)\.csv"}, "trial 'n0' is no num"),
         (
             {"pattern": r"[nt]/(?P<material>[a-z]+)(?P<trial>\d+)\.csv", "labels": None},
-            "is pen/0, as n/pen0.csv is",
+            "trial 0 of pen, scene paper, was listed in n/pen0.csv",
         ),
     ],
 )
@@ -700,7 +700,7 @@ def test_what_is_wrong_with_the_authors_names(tmp_path):
         authors(tmp_path / name)
     begins = ", ".join(STEMS)
     assert sorted(lines_of(authors_raw(tmp_path, **SHORT, strict=False))) == [
-        "b/abs-slip01.txt: is M1/1, as a/abs-slip1.txt is",
+        "b/abs-slip01.txt: trial 1 of M1, scene paper, was listed in a/abs-slip1.txt",
         f"glass-slip1.txt: its name begins with none of {begins}; data.stems names more",
         f"wod-slip1.txt: its name begins with none of {begins}; did you mean 'wood'?; data.stems "
         "names more",

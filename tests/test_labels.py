@@ -18,7 +18,7 @@ from tactslip_torch.data.labels import (
     needed_windows,
     slip_by_speed,
 )
-from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.recording import RecordingId, Timeline
 from tactslip_torch.data.splits import Split
 from tactslip_torch.signals.filtering import ChannelFilter, bins_at
 
@@ -205,7 +205,7 @@ def test_a_speed_that_is_noisy_lost_or_begins_in_slip():
     assert found.speeds_mm_s == (10.0,)
     rest = [[0.0995, 0.2995], [0.4995, 0.7], [0.7995, 1.0]]
     assert np.array(found.non_slip_s) == pytest.approx(np.array(rest))
-    assert slip_by_speed(np.zeros(0), rate, 5.0) == ((), (), (), ())
+    assert slip_by_speed(np.zeros(0), rate, 5.0) == Timeline()
 
 
 def test_a_speed_is_wanted_of_recordings_that_have_one():

@@ -49,10 +49,9 @@ def check(config: DictConfig) -> int:
         for recording, found in _inspect_all(config, source):
             entry = source.entry(recording)
             if isinstance(found, str):
-                problems.append(Problem(entry.place, f"{entry.file}: {found}"))
+                problems.append(entry.problem(found))
             else:
-                odd = found.oddities(source.hand.names)
-                warnings += [Problem(entry.place, f"{entry.file}: {what}") for what in odd]
+                warnings += map(entry.problem, found.oddities(source.hand.names))
     for line in (*(f"problem: {p}" for p in problems), *(f"warning: {w}" for w in warnings)):
         print(line)
     if source.ids:
@@ -116,8 +115,7 @@ def convert(config: DictConfig) -> list[Written]:
         try:
             return job.write(recording)
         except (ValueError, OSError) as error:
-            entry = source.entry(recording)
-            what = str(Problem(entry.place, f"{entry.file}: {one_line(error)}"))
+            what = str(source.entry(recording).problem(one_line(error)))
             if config.skip_failed:
                 return what
             raise ValueError(

@@ -290,8 +290,7 @@ def _part_of(opened: Opened, path: Path, stream: Stream, stated_hz: float | None
 def _by_speed(speed: EvenSamples, clock: Clock, stream: Stream) -> Timeline:
     """What the column of speed tells of slip."""
     mm_s = speed.exact(0, speed.num_samples)[0].double() * MM_S[stream.reading.speed_unit]
-    found = slip_by_speed(mm_s.numpy(), clock.sample_rate_hz, stream.speed_over or 0.0)
-    return Timeline(tuple(start for start, _ in found.sliding_s), **found._asdict())
+    return slip_by_speed(mm_s.numpy(), clock.sample_rate_hz, stream.speed_over or 0.0)
 
 
 def _hand_of(opened: Opened, stream: Stream) -> tuple[HandLayout, list[int]]:
@@ -646,12 +645,6 @@ def _doubts(recording: _File) -> list[str]:
     return doubts
 
 
-def _at(entry: Entry, what: str) -> Problem:
-    """What is said of an entry, its file named once."""
-    said = what.removeprefix(entry.file).lstrip(":, ")
-    return Problem(entry.place, said if entry.place == entry.file else f"{entry.file}: {said}")
-
-
 class FileRecordings:
     """A ``RecordingSource`` of the files of a folder.
 
@@ -773,19 +766,18 @@ class FileRecordings:
             for number, what in zip(seen, differences, strict=True):
                 if what is not None and what not in wrong[number]:
                     wrong[number].append(what)
-        warnings = []
+        warnings: list[Problem] = []
         for number, *own in zip(seen, *streams, strict=True):
             if not wrong[number]:
                 entry = entries[number]
                 file, wrong[number] = self._timed(entry, tuple(own))
                 if not wrong[number]:
-                    self._files[entry.recording] = file
-                    warnings += [_at(entry, doubt) for doubt in _doubts(file)]
+                    self._files.setdefault(entry.recording, file)
+                    warnings += map(entry.problem, _doubts(file))
         problems = [
-            _at(entry, what)
+            problem
             for entry, each in zip(entries, wrong, strict=True)
-            for what in each
-            if what
+            for problem in map(entry.problem, filter(None, each))
         ]
         rates = [part.rate_hz for part in self._any.parts] if self._files else []
         if self._resample_hz is None and len(set(rates)) > 1:

@@ -256,17 +256,14 @@ def guessed(file: str, pattern: str) -> dict[str, str]:
     path = Path(file)
     text = path.with_suffix("").as_posix() if "/" in pattern else path.stem
 
-    def read(**other: str) -> dict[str, str]:
-        """The fields of a reading, in which those of ``other`` are not these."""
-        expression = _literal(fixed[0])
-        for name, behind in zip(names, fixed[1:], strict=True):
-            expression += _field(name, words[name], other.get(name)) + _literal(behind)
-        found = re.fullmatch(expression, text)
-        return found.groupdict() if found else {}
-
-    found = read()
-    for name, value in found.items():
-        if another := read(**{name: value}):
+    expression = _literal(fixed[0])
+    for name, behind in zip(names, fixed[1:], strict=True):
+        expression += _field(name, words[name]) + _literal(behind)
+    read = re.fullmatch(expression, text)
+    found = read.groupdict() if read else {}
+    for name, value in found.items():  # read again, with another value: no path holds two strokes
+        if again := re.fullmatch(f"{expression}//(?!(?P={name})//).*", f"{text}//{value}//"):
+            another = again.groupdict()
             one, two = (
                 ", ".join(f"{name}={value!r}" for name, value in each.items())
                 for each in (found, another)
@@ -282,16 +279,10 @@ def _literal(text: str) -> str:
     return "[^/]*?".join(re.escape(piece) for piece in text.split("*"))
 
 
-def _field(name: str, words: Sequence[str] | None, other: str | None) -> str:
-    """The expression of a field: one of the words, if given, and not ``other``."""
-    one = r"\d" if name == "trial" else "[^/]"
-    inner = f"{one}+?" if words is None else "|".join(map(re.escape, words))
-    if other is not None and words is None:
-        size = len(other)
-        inner = f"{one}{{{size + 1},}}|(?!{re.escape(other)}){one}{{{size}}}"
-        inner += f"|{one}{{1,{size - 1}}}" if size > 1 else ""
-    elif other is not None:
-        inner = "|".join(re.escape(word) for word in words or () if word != other) or "(?!)"
+def _field(name: str, words: Sequence[str] | None) -> str:
+    """The expression of a field: one of the words, if given."""
+    free = r"\d+?" if name == "trial" else "[^/]+?"
+    inner = free if words is None else "|".join(map(re.escape, words))
     if name == "trial":
         return rf"(?<!\d)(?P<trial>{inner})(?!\d)"
     between = f"{_BETWEEN}*" if name in ("material", "scene") else ""

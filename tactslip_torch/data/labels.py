@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tactslip_torch.data.recording import Stretch, Timeline
 from tactslip_torch.runtime import check_choice
 
 Layout = Literal["whole_slide", "half_second"]
@@ -97,11 +98,11 @@ class LabelledBins:
 def label_bins(
     rule: LabelRule,
     onsets_s: Sequence[float],
-    sliding_s: Sequence[tuple[float, float]],
+    sliding_s: Sequence[Stretch],
     duration_s: float,
     sample_rate_hz: float,
-    non_slip_s: Sequence[tuple[float, float]] = (),
-    slip_s: Sequence[tuple[float, float]] = (),
+    non_slip_s: Sequence[Stretch] = (),
+    slip_s: Sequence[Stretch] = (),
 ) -> LabelledBins:
     """Lay bins around the onsets of a recording, and in its stretches of slip or of none.
 
@@ -188,7 +189,7 @@ class _Stroke(NamedTuple):
 def _strokes(
     rule: LabelRule,
     onsets_s: Sequence[float],
-    sliding_s: Sequence[tuple[float, float]],
+    sliding_s: Sequence[Stretch],
     num_samples: int,
     sample_rate_hz: float,
 ) -> list[_Stroke]:
@@ -263,9 +264,7 @@ def _laid(
     return starts, is_slip_each, torch.full_like(starts, stroke), position
 
 
-def _samples_of(
-    stretch: tuple[float, float], num_samples: int, sample_rate_hz: float
-) -> tuple[int, int]:
+def _samples_of(stretch: Stretch, num_samples: int, sample_rate_hz: float) -> tuple[int, int]:
     """First sample that lies inside a stretch, and the end of those that do."""
     first = math.ceil(stretch[0] * sample_rate_hz - 1e-6)  # what was meant as a whole sample is one
     stop = math.floor(stretch[1] * sample_rate_hz + 1e-6)
@@ -280,33 +279,16 @@ def _samples_of(
 _SHORTEST_S = 0.02
 """A speed that is above or below the threshold for less than that is noise."""
 
-_Stretch = tuple[float, float]
-
-
-class SpeedLabels(NamedTuple):
-    """Slip by its speed.
-
-    Args:
-        sliding_s: start and end of each slide whose onset was recorded, in seconds.
-        speeds_mm_s: the median speed of each of those to two digits, so that results by speed have
-            few rows.
-        slip_s: slides that had begun before the recording, or while the speed was not known.
-        non_slip_s: stretches in which the speed is not above the threshold.
-    """
-
-    sliding_s: tuple[_Stretch, ...]
-    speeds_mm_s: tuple[float, ...]
-    slip_s: tuple[_Stretch, ...]
-    non_slip_s: tuple[_Stretch, ...]
-
 
 def slip_by_speed(
     speed_mm_s: NDArray[np.float64], sample_rate_hz: float, speed_over: float
-) -> SpeedLabels:
+) -> Timeline:
     """Where a speed of slip, of any sign, is above a threshold.
 
     Onsets and ends are where the straight line between two samples crosses the threshold. What is
-    above or below it for less than 20 ms belongs to what is around it.
+    above or below it for less than 20 ms belongs to what is around it. ``speeds_mm_s`` are the
+    median speeds of slides to two digits, so that results by speed have few rows. Slides that had
+    begun before the recording, or while the speed was not known, are ``slip_s``.
 
     Args:
         speed_mm_s: of the contact against what it touches; NaN where it is not known, which is
@@ -318,8 +300,8 @@ def slip_by_speed(
         - speed_mm_s: ``[T]``
 
     Example:
-        >>> slip_by_speed(np.repeat([0.0, 10.0], 100), 1000.0, 5.0)[:2]
-        (((0.0995, 0.2),), (10.0,))
+        >>> slip_by_speed(np.repeat([0.0, 10.0], 100), 1000.0, 5.0).sliding_s
+        ((0.0995, 0.2),)
     """
     speed = np.abs(speed_mm_s)
     state = np.where(np.isnan(speed), -1, speed > speed_over)
@@ -345,7 +327,14 @@ def slip_by_speed(
             speeds.append(float(f"{np.median(speed[start:stop]):.2g}"))
         elif value == 1:
             slip.append(stretch)
-    return SpeedLabels(tuple(sliding), tuple(speeds), tuple(slip), tuple(rest))
+    onsets = tuple(start for start, _ in sliding)
+    return Timeline(
+        onsets,
+        speeds_mm_s=tuple(speeds),
+        sliding_s=tuple(sliding),
+        slip_s=tuple(slip),
+        non_slip_s=tuple(rest),
+    )
 
 
 _Run = tuple[int, int, int]
@@ -366,7 +355,7 @@ def _neighbours(runs: Sequence[_Run]) -> list[tuple[int | None, _Run, int | None
 
 def clear_of(
     bins: LabelledBins,
-    missing_s: Sequence[tuple[float, float]],
+    missing_s: Sequence[Stretch],
     before: int,
     after: int,
     sample_rate_hz: float,
@@ -392,7 +381,7 @@ def clear_of(
 
 def needed_windows(
     bins: LabelledBins, context_samples: int, duration_s: float, sample_rate_hz: float
-) -> list[tuple[float, float]]:
+) -> list[Stretch]:
     """The stretches of time that filtering the bins needs, merged where they touch, in seconds.
 
     A stretch within two contexts of an end of the recording reaches to that end, so that the

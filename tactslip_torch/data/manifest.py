@@ -377,6 +377,11 @@ class Entry:
     sample_rate_hz: float | None = None
     is_nominal: bool = False
 
+    def problem(self, what: str) -> Problem:
+        """Something wrong with it, its file named once."""
+        said = what.removeprefix(self.file).lstrip(":, ")
+        return Problem(self.place, said if self.place == self.file else f"{self.file}: {said}")
+
 
 class Listing(NamedTuple):
     """The recordings of a set, what is wrong with the list, and what may be."""
@@ -445,7 +450,7 @@ def read_manifest(path: Path, root: Path) -> Listing:
         problems += [Problem(place, wrong) for wrong in wrong_here]
         drafts += [draft] if draft else []
     entries = tuple(_numbered(drafts))
-    problems += _twice(entries)
+    problems += twice(entries)
     first: dict[str, Entry] = {}
     for entry in entries:
         material = entry.recording.material
@@ -531,7 +536,7 @@ def _numbered(drafts: Sequence[Entry]) -> Iterator[Entry]:
         yield replace(draft, recording=name)
 
 
-def _twice(entries: Iterable[Entry]) -> list[Problem]:
+def twice(entries: Iterable[Entry]) -> list[Problem]:
     """Recordings and files that were listed before."""
     found = []
     first: dict[object, str] = {}

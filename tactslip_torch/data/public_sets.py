@@ -22,6 +22,7 @@ from tactslip_torch.data.manifest import (
     better_told,
     manifest_of,
     read_manifest,
+    twice,
 )
 from tactslip_torch.data.recording import Label, RecordingId, Timeline
 from tactslip_torch.hand import HandLayout
@@ -195,21 +196,11 @@ def _listed(
     return Listing(tuple(entries), tuple(problems))
 
 
-def _without_twins(listing: Listing) -> Listing:
-    """A listing without files that are called as another before them; each is a problem."""
-    first: dict[RecordingId, Entry] = {}
-    problems = list(listing.problems)
-    for entry in listing.entries:
-        if (other := first.setdefault(entry.recording, entry)) is not entry:
-            problems.append(Problem(entry.file, f"is {entry.recording}, as {other.file} is"))
-    return Listing(tuple(first.values()), tuple(problems), listing.warnings)
-
-
 def _set_of(
     listing: Listing, root: str | Path, manifest: str | None, options: Mapping[str, Any]
 ) -> FileRecordings:
     """The recordings of a listing, better told by a manifest if there is one."""
-    listing = _without_twins(listing)
+    listing = listing._replace(problems=(*listing.problems, *twice(listing.entries)))
     if manifest is not None:
         told = read_manifest(manifest_of(Path(root), manifest), Path(root))
         listing = better_told(listing, told)
