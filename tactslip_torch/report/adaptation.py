@@ -6,18 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tactslip_torch.report.style import (
-    BLUE,
-    UPPER_LEFT_OUTSIDE,
-    VERMILION,
-    lanes,
-    marked,
-    new_figure,
-    percent,
-    save,
-    styled,
-    table,
-)
+from tactslip_torch.report import style
 
 _BEFORE = "#999999"
 
@@ -32,15 +21,15 @@ def adaptation_table(content: Mapping[str, Any]) -> str:
     for name, before, after in _scores(content):
         row: dict[str, object] = {
             "balanced accuracy %": name,
-            "before": percent(before),
-            "after": percent(after),
+            "before": style.percent(before),
+            "after": style.percent(after),
         }
         rows.append(row | {"points": None if after is None else f"{100 * (after - before):+.2f}"})
-    blocks = [marked(content["simulated"], _action(content)), table(rows)]
+    blocks = [style.marked(content["simulated"], _action(content)), style.table(rows)]
     if len(content["tried"]) > 1:
         names = ("weight, in average old materials", "old lose, points")
-        tried = [(f"{factor:g}", percent(loss)) for factor, loss in content["tried"]]
-        blocks.append(table([dict(zip(names, row, strict=True)) for row in tried]))
+        tried = [(f"{factor:g}", style.percent(loss)) for factor, loss in content["tried"]]
+        blocks.append(style.table([dict(zip(names, row, strict=True)) for row in tried]))
     seconds = ", ".join(f"{name} {value:.1f} s" for name, value in content["seconds"].items())
     return "\n\n".join([*blocks, f"took {seconds}"])
 
@@ -55,10 +44,10 @@ def journal_table(steps: Sequence[Mapping[str, Any]]) -> str:
         row |= {"material": ", ".join(step["materials"]), "recordings": len(step["recordings"])}
         row |= {"weight": None if step["weight"] is None else f"{step['weight']:.3g}"}
         rows.append(row | {"slip-free": bool(step["slip_free"]), "forced": bool(step["forced"])})
-    return table(rows, num_left=4)
+    return style.table(rows, num_left=4)
 
 
-@styled
+@style.styled
 def adaptation_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write before and after of every material as a line between two dots.
 
@@ -67,26 +56,28 @@ def adaptation_figure(content: Mapping[str, Any], path: str | Path) -> None:
         path: the PNG to write, replaced as a whole if it exists.
     """
     rows = _scores(content)
-    figure = new_figure(7.2, 1.7 + 0.36 * len(rows))
+    figure = style.new_figure(7.2, 1.7 + 0.36 * len(rows))
     axes = figure.subplots()
     for place, (name, before, after) in enumerate(rows):
         is_new = bool(content["new"]) and place == len(rows) - 1 and name.endswith("(new)")
-        colour = VERMILION if is_new else BLUE
+        colour = style.VERMILION if is_new else style.BLUE
         if after is not None:
             between = [100 * before, 100 * after]
             axes.plot(between, [place] * 2, color=colour, lw=2, alpha=0.5, zorder=1)
             axes.scatter(100 * after, place, color=colour, s=42, zorder=3)
         axes.scatter(100 * before, place, color=_BEFORE, s=42, zorder=2)
-    labels = {_BEFORE: "before", BLUE: "after, old"}
-    for colour, label in (labels | ({VERMILION: "after, new"} if content["new"] else {})).items():
+    labels = {_BEFORE: "before", style.BLUE: "after, old"}
+    for colour, label in (
+        labels | ({style.VERMILION: "after, new"} if content["new"] else {})
+    ).items():
         axes.scatter([], [], color=colour, s=42, label=label)
-    lanes(axes, [name for name, _, _ in rows])
+    style.lanes(axes, [name for name, _, _ in rows])
     axes.set_xlabel("balanced accuracy by the machine without the recording, %")
     result = "accepted" if content["accepted"] else "refused"
     kind = ", SIMULATED data" if content["simulated"] else ""
     axes.set_title(f"{_action(content)}: {result}{kind}")
-    axes.legend(**UPPER_LEFT_OUTSIDE)
-    save(figure, path)
+    axes.legend(**style.UPPER_LEFT_OUTSIDE)
+    style.save(figure, path)
 
 
 def _action(content: Mapping[str, Any]) -> str:

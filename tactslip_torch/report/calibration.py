@@ -6,18 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tactslip_torch.report.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    VERMILION,
-    marked,
-    new_figure,
-    percent,
-    save,
-    styled,
-    table,
-)
+from tactslip_torch.report import style
 
 
 def calibration_table(content: Mapping[str, Any]) -> str:
@@ -31,18 +20,18 @@ def calibration_table(content: Mapping[str, Any]) -> str:
     for point in _by_difficulty(content):
         row = {"d": f"{point['difficulty']:+.2f}"}
         row |= {name.rsplit("_", 1)[0]: _value(v) for name, v in point["parameters"].items()}
-        row |= {"accuracy %": percent(point["accuracy"])}
+        row |= {"accuracy %": style.percent(point["accuracy"])}
         by_seed = zip(content["seeds"], point["accuracy_by_seed"], strict=True)
-        row |= {f"seed {seed}": percent(accuracy) for seed, accuracy in by_seed}
+        row |= {f"seed {seed}": style.percent(accuracy) for seed, accuracy in by_seed}
         rows.append(row | {"signal checks": _checks(point)})
     blocks = [
-        marked(
+        style.marked(
             True,
             "test accuracy on seen materials; d: prior standard deviations harder than the "
             "starting values",
-            f"published: {percent(target['accuracy'])} % ({target['row']}; {target['source']})",
+            f"published: {100 * target['accuracy']:.2f} % ({target['row']}; {target['source']})",
         ),
-        table(rows),
+        style.table(rows),
     ]
     if content["signal_checks"]:
         checks = []
@@ -52,18 +41,18 @@ def calibration_table(content: Mapping[str, Any]) -> str:
             values = " ".join(f"{value:.3g}" for value in check["values"].values())
             row = {"signal check": check["says"], "range": span}
             checks.append(row | {"values at the point kept": values})
-        blocks.append(table(checks, num_left=3))
+        blocks.append(style.table(checks, num_left=3))
     return "\n\n".join([*blocks, f"kept: {_kept(content)}\n{content['outcome']}"])
 
 
 def point_line(point: Mapping[str, Any]) -> str:
     """A point in one line, as soon as it is tried."""
-    by_seed = " ".join(map(percent, point["accuracy_by_seed"]))
-    accuracy = percent(point["accuracy"])
+    by_seed = " ".join(map(style.percent, point["accuracy_by_seed"]))
+    accuracy = style.percent(point["accuracy"])
     return f"d {point['difficulty']:+.2f}: {accuracy} % ({by_seed}), signal checks {_checks(point)}"
 
 
-@styled
+@style.styled
 def calibration_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write accuracy against difficulty, with the target and the point kept, as a PNG.
 
@@ -71,19 +60,19 @@ def calibration_figure(content: Mapping[str, Any], path: str | Path) -> None:
         content: of ``calibration.json``.
         path: the PNG to write, replaced as a whole if it exists.
     """
-    figure = new_figure(7.5, 4.6)
+    figure = style.new_figure(7.5, 4.6)
     axes = figure.subplots()
     points = _by_difficulty(content)
     target = 100 * content["target"]["accuracy"]
     tolerance = 100 * content["protocol"]["tolerance"]
-    axes.axhspan(target - tolerance, target + tolerance, color=GREY, alpha=0.15, linewidth=0)
-    axes.axhline(target, color=GREY, linestyle="--", label=f"published, {target:.2f} %")
+    axes.axhspan(target - tolerance, target + tolerance, color=style.GREY, alpha=0.15, linewidth=0)
+    axes.axhline(target, color=style.GREY, linestyle="--", label=f"published, {target:.2f} %")
     place = [point["difficulty"] for point in points]
     means = [100 * point["accuracy"] for point in points]
-    axes.plot(place, means, color=BLUE, linewidth=1.5)
+    axes.plot(place, means, color=style.BLUE, linewidth=1.5)
     for holds, colour, label in (
-        (True, BLUE, "mean over seeds"),
-        (False, VERMILION, "the same, signal checks fail"),
+        (True, style.BLUE, "mean over seeds"),
+        (False, style.VERMILION, "the same, signal checks fail"),
     ):
         shown = [at for at, point in enumerate(points) if point["holds"] == holds]
         if shown:
@@ -92,14 +81,14 @@ def calibration_figure(content: Mapping[str, Any], path: str | Path) -> None:
     for number in range(len(content["seeds"])):
         by_seed = [100 * point["accuracy_by_seed"][number] for point in points]
         label = "" if number else "one seed"
-        axes.plot(place, by_seed, ".", color=BLUE, alpha=0.45, label=label)
-    style: dict[str, Any] = {"color": GREEN, "ms": 13, "fillstyle": "none", "mew": 2}
-    axes.plot(content["difficulty"], 100 * content["accuracy"], "o", label="kept", **style)
+        axes.plot(place, by_seed, ".", color=style.BLUE, alpha=0.45, label=label)
+    look: dict[str, Any] = {"color": style.GREEN, "ms": 13, "fillstyle": "none", "mew": 2}
+    axes.plot(content["difficulty"], 100 * content["accuracy"], "o", label="kept", **look)
     axes.set_xlabel("d, prior standard deviations harder than the starting values")
     axes.set_ylabel("test accuracy on seen materials, %")
     axes.set_title(f"SIMULATED hand\nkept: {_kept(content)}")
     axes.legend(loc="upper right")
-    save(figure, path)
+    style.save(figure, path)
 
 
 def _by_difficulty(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:

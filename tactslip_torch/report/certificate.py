@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from tactslip_torch.report.style import GREY, INK, colours_of, lanes, new_figure, save, styled
+from tactslip_torch.report import style
 
 Points = Mapping[str, Mapping[str, Sequence[Any]]]
 """By set or kind, of each bin ``score`` (its size), its ``error`` and whether it ``flips``."""
@@ -37,7 +37,7 @@ def conclusion(content: Mapping[str, Any]) -> str:
     )
 
 
-@styled
+@style.styled
 def certificate_figure(content: Mapping[str, Any], points: Points, path: str | Path) -> None:
     """Write error against ``|score|`` with margin and bound, and errors of generated extremes.
 
@@ -46,14 +46,14 @@ def certificate_figure(content: Mapping[str, Any], points: Points, path: str | P
         points: of every set.
         path: the PNG to write, replaced as a whole if it exists.
     """
-    figure = new_figure(11.0, 4.9)
+    figure = style.new_figure(11.0, 4.9)
     left, right = figure.subplots(1, 2, width_ratios=[1.15, 1])
     _scatter(left, content, {name: points[name] for name in content["sets"]})
     _bars(right, content["extremes"])
     kind = "SIMULATED recordings" if content["simulated"] else "recordings"
     left.set_title(f"(a) every bin of {kind}")
     right.set_title("(b) generated extremes (grey: flagged)")
-    save(figure, path, dpi=170)
+    style.save(figure, path, dpi=170)
 
 
 def _scatter(axes: Axes, content: Mapping[str, Any], points: Points) -> None:
@@ -67,7 +67,7 @@ def _scatter(axes: Axes, content: Mapping[str, Any], points: Points) -> None:
     low = _least_positive([*scores.tolist(), *known]) / 2
     high = 2 * max(scores.max(), *known, 1e-300)
     top = 5 * max(np.max(errors, where=np.isfinite(errors), initial=floor), *known, floor)
-    colours = colours_of(points)
+    colours = style.colours_of(points)
     for name, own in points.items():
         x, y = np.maximum(own["score"], low), np.clip(own["error"], floor, top / 1.5)
         axes.scatter(x, y, s=5, color=colours[name], alpha=0.45, linewidths=0, label=name)
@@ -75,7 +75,7 @@ def _scatter(axes: Axes, content: Mapping[str, Any], points: Points) -> None:
         axes.scatter(x[flipped], y[flipped], s=34, marker="x", color=_BAD, zorder=4)
     axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(floor / 2, top))
     axes.minorticks_off()  # of hundreds of decades they take seconds
-    axes.plot([low, high], [low, high], color=GREY, linewidth=0.9, linestyle=":")
+    axes.plot([low, high], [low, high], color=style.GREY, linewidth=0.9, linestyle=":")
     if margin:
         axes.axvspan(low, margin, color="#F3E3D3", zorder=0)
         axes.axvline(margin, color=_BAD, linewidth=1.2)
@@ -83,8 +83,8 @@ def _scatter(axes: Axes, content: Mapping[str, Any], points: Points) -> None:
         text = "  margin: to its left  \n  a decision may change  "
         axes.text(margin, 3 * floor, text, color=_BAD, ha=side, multialignment=side)
     if bound:
-        axes.axhline(bound, color=INK, linewidth=1.0, linestyle="--")
-        axes.text(high, bound / 1.15, "bound of the head ", color=INK, ha="right", va="top")
+        axes.axhline(bound, color=style.INK, linewidth=1.0, linestyle="--")
+        axes.text(high, bound / 1.15, "bound of the head ", color=style.INK, ha="right", va="top")
     axes.set_xlabel("|score| in float64; dotted: as large as its error")
     axes.set_ylabel("error of the float32 score")
     place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (0.08, 0.88)}
@@ -96,8 +96,8 @@ def _bars(axes: Axes, extremes: Mapping[str, Mapping[str, Any]]) -> None:
     errors = [kind["error"] for kind in extremes.values()]
     floor = _least_positive(error[key] for error in errors for key in ("worst", "median")) / 2
     ends = [error["worst"] or floor for error in errors]  # none if not finite: the note says so
-    axes.plot([error["median"] or floor for error in errors], range(len(errors)), "|", color=INK,
-              markersize=11)  # fmt: skip
+    medians = [error["median"] or floor for error in errors]
+    axes.plot(medians, range(len(errors)), "|", color=style.INK, markersize=11)
     for place, (kind, end) in enumerate(zip(extremes.values(), ends, strict=True)):
         shade = _VALID + kind["invalid"] / kind["bins"] * (_FLAGGED - _VALID)
         axes.barh(place, end, 0.62, left=0, color=shade)
@@ -105,11 +105,11 @@ def _bars(axes: Axes, extremes: Mapping[str, Mapping[str, Any]]) -> None:
         notes = [f"{kind['invalid']} of {kind['bins']} flagged"] if kind["invalid"] else []
         notes += [f"{flips} flipped"] if flips else []
         notes += ["not finite"] if kind["not_finite"] else []
-        colour = _BAD if flips or kind["not_finite"] else GREY
+        colour = _BAD if flips or kind["not_finite"] else style.GREY
         axes.text(1.25 * end, place, ", ".join(notes), va="center", color=colour)
     axes.set(xscale="log", xlim=(floor, 60 * max(*ends, floor)))
     axes.minorticks_off()
-    lanes(axes, list(extremes))
+    style.lanes(axes, list(extremes))
     axes.set_xlabel("error of the float32 score: bar worst, tick median")
 
 

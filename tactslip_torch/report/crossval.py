@@ -9,7 +9,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from tactslip_torch.report.style import colours_of, marked, new_figure, percent, save, styled, table
+from tactslip_torch.report import style
 
 PAPERS_UNSEEN = frozenset({"iron", "cloth", "copper", "wood"})
 
@@ -25,8 +25,8 @@ def crossval_table(content: Mapping[str, Any]) -> str:
         f"{len(content['materials'])}; fitted on {content['train_bins']} bins of each material and "
         "class"
     )
-    tables = (table(split_rows(content), num_left=2), table(material_rows(content)))
-    return marked(content["simulated"], line, "", "\n\n".join(tables))
+    tables = (style.table(split_rows(content), num_left=2), style.table(material_rows(content)))
+    return style.marked(content["simulated"], line, "", "\n\n".join(tables))
 
 
 def split_rows(content: Mapping[str, Any]) -> list[dict[str, object]]:
@@ -46,7 +46,7 @@ def split_rows(content: Mapping[str, Any]) -> list[dict[str, object]]:
                 "most": known[-1],
                 "the paper's four": papers,
             }
-            row = {title: percent(value) for title, value in numbers.items()}
+            row = {title: style.percent(value) for title, value in numbers.items()}
             rows.append({"recipe": name, "evaluated on": role, **row, "splits": len(scores)})
     return rows
 
@@ -58,13 +58,13 @@ def material_rows(content: Mapping[str, Any]) -> list[dict[str, object]]:
         row: dict[str, object] = {"unseen material": material}
         for name, splits in content["splits"].items():
             scores = material_scores(splits, material)
-            row[f"{name} mean"] = percent(mean(scores) if scores else None)
-            row[f"{name} sd"] = percent(_spread(scores))
+            row[f"{name} mean"] = style.percent(mean(scores) if scores else None)
+            row[f"{name} sd"] = style.percent(_spread(scores))
         rows.append(row)
     return rows
 
 
-@styled
+@style.styled
 def crossval_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write the distribution over splits, and the scores of each unseen material, as a PNG.
 
@@ -75,12 +75,12 @@ def crossval_figure(content: Mapping[str, Any], path: str | Path) -> None:
     title = (
         f"Every choice of {content['num_unseen']} unseen materials of {len(content['materials'])}"
     )
-    figure = new_figure(11, 4.6, title, simulated=content["simulated"])
+    figure = style.new_figure(11, 4.6, title, simulated=content["simulated"])
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.25))
-    colours = colours_of(content["splits"])
+    colours = style.colours_of(content["splits"])
     _distribution(left, content, colours)
     _by_material(right, content, colours)
-    save(figure, path)
+    style.save(figure, path)
 
 
 def material_scores(splits: Sequence[Mapping[str, Any]], material: str) -> list[float]:
@@ -113,9 +113,9 @@ def _by_material(axes: Axes, content: Mapping[str, Any], colours: Mapping[str, s
         aside = (number - (len(colours) - 1) / 2) * 0.25
         for place, material in enumerate(content["materials"]):
             if scores := material_scores(splits, material):
-                style: dict[str, Any] = {"fmt": "o", "color": colours[name], "capsize": 3}
+                look: dict[str, Any] = {"fmt": "o", "color": colours[name], "capsize": 3}
                 spread = 100 * _spread(scores)
-                axes.errorbar(place + aside, 100 * mean(scores), yerr=spread, **style)
+                axes.errorbar(place + aside, 100 * mean(scores), yerr=spread, **look)
     axes.set_xticks(range(len(content["materials"])), content["materials"], rotation=30)
     axes.set_ylabel("balanced accuracy, %")
     axes.set_title("each material where it is unseen: mean and sd over splits")

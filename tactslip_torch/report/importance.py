@@ -17,23 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.patches import FancyBboxPatch
 
-from tactslip_torch.report.style import (
-    GREEN,
-    GREY,
-    INK,
-    VERMILION,
-    csv_writer,
-    is_fast,
-    kind_colours,
-    lanes,
-    marked,
-    new_figure,
-    percent,
-    save,
-    styled,
-    table,
-    words,
-)
+from tactslip_torch.report import style
 
 Row = Mapping[str, str]
 """A channel as ``HandLayout.to_rows`` has it."""
@@ -47,7 +31,7 @@ BEST_LINE = (
     "best few, greedily by held-out accuracy (which is optimistic for it; test and unseen choose "
     "nothing):"
 )
-_ROLE_COLOURS = {"held_out": GREY, "test": GREEN, "unseen": VERMILION}
+_ROLE_COLOURS = {"held_out": style.GREY, "test": style.GREEN, "unseen": style.VERMILION}
 _MOST_CHANNELS = 24  # whose absence is drawn, the most important first
 
 
@@ -58,9 +42,9 @@ def sensors_table(content: Mapping[str, Any]) -> str:
     Args:
         content: of ``sensors.json``.
     """
-    tables = [table(unit_rows(content, unit)) for unit in content["best"]]
+    tables = [style.table(unit_rows(content, unit)) for unit in content["best"]]
     head = [*lines_about(content), with_all_line(content)]
-    return marked(content["simulated"], *head, "", "\n\n".join(tables))
+    return style.marked(content["simulated"], *head, "", "\n\n".join(tables))
 
 
 def lines_about(content: Mapping[str, Any]) -> list[str]:
@@ -87,7 +71,7 @@ def unit_rows(content: Mapping[str, Any], unit: str) -> list[dict[str, object]]:
         for key, title in (("lost", "lost"), ("lost_reselected", "reselected")):
             for role, lost in row[key].items():
                 cells[f"{title} {ROLE_WORDS[role]}"] = _interval(lost)
-        rows.append(cells | {"alone, held-out %": percent(row["alone"]["held_out"])})
+        rows.append(cells | {"alone, held-out %": style.percent(row["alone"]["held_out"])})
     return rows
 
 
@@ -96,14 +80,14 @@ def with_all_line(content: Mapping[str, Any]) -> str:
     reached = []
     for name, result in content["with_all"].items():
         scores = result["balanced_accuracy"].items()
-        listed = ", ".join(f"{ROLE_WORDS[role]} {percent(score)}" for role, score in scores)
-        reached.append(f"{words(name)}: {listed} %")
+        listed = ", ".join(f"{ROLE_WORDS[role]} {style.percent(score)}" for role, score in scores)
+        reached.append(f"{style.words(name)}: {listed} %")
     return "all sensors, features " + "; ".join(reached)
 
 
 def best_table(content: Mapping[str, Any]) -> str:
     """Accuracy kept with the best few, in the order in which they join; of all units."""
-    tables = [table(best_rows(content, unit), num_left=2) for unit in content["best"]]
+    tables = [style.table(best_rows(content, unit), num_left=2) for unit in content["best"]]
     return f"{BEST_LINE}\n\n" + "\n\n".join(tables)
 
 
@@ -114,7 +98,7 @@ def best_rows(content: Mapping[str, Any], unit: str) -> list[dict[str, object]]:
         cells: dict[str, object] = {f"{unit}s": number, "joins": step["joins"]}
         cells["features"] = step["num_features"]
         for role, score in step["balanced_accuracy"].items():
-            cells[f"{ROLE_WORDS[role]} %"] = percent(score)
+            cells[f"{ROLE_WORDS[role]} %"] = style.percent(score)
         for role, lost in step["lost"].items():
             cells[f"lost {ROLE_WORDS[role]}"] = _interval(lost)
         rows.append(cells)
@@ -144,7 +128,7 @@ def sensors_csv(content: Mapping[str, Any], path: str | Path) -> None:
                 flat |= {f"{what}_{role}_{end}": value for end, value in numbers.items()}
         flat |= {f"alone_{role}": value for role, value in row["alone"].items()}
         rows.append(flat | {"simulated": content["simulated"]})
-    with csv_writer(path, list(rows[0])) as write:
+    with style.csv_writer(path, list(rows[0])) as write:
         write(row.values() for row in rows)
 
 
@@ -153,7 +137,7 @@ def _interval(lost: Mapping[str, float]) -> str:
 
 
 # Figure ------------------------------------------------------------------------------------------
-@styled
+@style.styled
 def sensors_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write the figure: two hands, the cost of absence, and accuracy against how many sensors.
 
@@ -161,7 +145,7 @@ def sensors_figure(content: Mapping[str, Any], path: str | Path) -> None:
         content: of ``sensors.json``.
         path: the PNG to write, replaced as a whole if it exists.
     """
-    figure = new_figure(13.6, 11.4, "Which sensors matter", simulated=content["simulated"])
+    figure = style.new_figure(13.6, 11.4, "Which sensors matter", simulated=content["simulated"])
     grid = figure.add_gridspec(2, 3, width_ratios=[1, 1, 0.62], height_ratios=[1.45, 1])
     units = {row["name"]: row for row in content["units"] if row["unit"] == "channel"}
     moved = {}
@@ -178,7 +162,7 @@ def sensors_figure(content: Mapping[str, Any], path: str | Path) -> None:
     _hand(axes, content["channels"], alone, (50.0, max(*alone.values(), 51.0)), "{:.0f}", unit)
     _absences(figure.add_subplot(grid[0, 2]), content)
     _best_few(figure.add_subplot(grid[1, :]), content)
-    save(figure, path)
+    style.save(figure, path)
 
 
 def _absences(axes: Axes, content: Mapping[str, Any]) -> None:
@@ -196,10 +180,10 @@ def _absences(axes: Axes, content: Mapping[str, Any]) -> None:
         colour = _ROLE_COLOURS[role]
         axes.hlines(at, low, high, color=colour, linewidth=1.2, alpha=0.6)
         axes.plot(lost, at, "o", color=colour, markersize=4.2, label=ROLE_WORDS[role])
-    axes.axvline(0, color=INK, linewidth=0.8)
-    lanes(axes, [row["name"] for row in rows])
+    axes.axvline(0, color=style.INK, linewidth=0.8)
+    style.lanes(axes, [row["name"] for row in rows])
     if 0 < len(fingers) < len(rows):
-        axes.axhline(len(rows) - len(fingers) - 0.5, color=GREY, linewidth=0.8, linestyle=":")
+        axes.axhline(len(rows) - len(fingers) - 0.5, color=style.GREY, linewidth=0.8, linestyle=":")
     axes.set_title("(c) lost without it")
     axes.set_xlabel("points of balanced accuracy, 95 % intervals")
     place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.03, 0.995)}
@@ -210,7 +194,7 @@ def _best_few(axes: Axes, content: Mapping[str, Any]) -> None:
     """Accuracy against the number of channels, their names in the order in which they join."""
     steps, whole = content["best"]["channel"], content["with_all"]["reselected"]
     kinds = {row["name"]: row["kind"] for row in content["channels"]}
-    colours = kind_colours(kinds.values())
+    colours = style.kind_colours(kinds.values())
     at = np.arange(1, len(steps) + 1)
     for role in content["num_bins"]:
         colour, of_all = _ROLE_COLOURS[role], 100 * whole["balanced_accuracy"][role]
@@ -223,7 +207,7 @@ def _best_few(axes: Axes, content: Mapping[str, Any]) -> None:
         label = "held-out (it chose the order)" if chose else ROLE_WORDS[role]
         line = "o--" if chose else "o-"
         axes.plot(at, kept, line, color=colour, markersize=4.5, label=label)
-    axes.plot([], [], ":", color=GREY, label="all sensors")
+    axes.plot([], [], ":", color=style.GREY, label="all sensors")
     axes.set_xticks(at, [f"+{step['joins']}" for step in steps], rotation=50)
     for tick, step in zip(axes.get_xticklabels(), steps, strict=True):
         tick.set(color=colours[kinds[step["joins"]]], fontweight="bold")
@@ -270,7 +254,7 @@ def _hand(
         known = [segment for segment in _FROM_TIP if segment in segments]
         order = [*known, *(segment for segment in segments if segment not in known)]
         root = -1.3 if finger == "thumb" and place else 0.0
-        axes.text(place, root + len(order) + 0.1, finger, ha="center", color=INK)
+        axes.text(place, root + len(order) + 0.1, finger, ha="center", color=style.INK)
         for up, segment in enumerate(reversed(order)):
             corner = (place - 0.46, root + up + 0.03)
             box = FancyBboxPatch(corner, 0.92, 0.94, boxstyle="round,pad=0,rounding_size=0.2")
@@ -279,12 +263,12 @@ def _hand(
                 marks[row["kind"]].append((place + x, root + up + 0.5 + y, row))
     most = max(len(rows) for segments in by_finger.values() for rows in segments.values())
     size = 1100 / max(math.ceil(math.sqrt(most)), 2) ** 2 / max(1, len(fingers) / 5)
-    for kind, colour in kind_colours(marks).items():
+    for kind, colour in style.kind_colours(marks).items():
         xs, ys, rows = zip(*marks[kind], strict=True)
         ramp = LinearSegmentedColormap.from_list("shade", ["#FFFFFF", colour])
         shown = axes.scatter(
             xs, ys, s=size, c=[values[row["name"]] for row in rows], cmap=ramp, vmin=limits[0],
-            vmax=limits[1], marker="o" if is_fast(rows[0]) else "s", edgecolors=colour,
+            vmax=limits[1], marker="o" if style.is_fast(rows[0]) else "s", edgecolors=colour,
         )  # fmt: skip
         bar = axes.figure.colorbar(
             shown, ax=axes, location="bottom", shrink=0.6, aspect=40, pad=0.01
@@ -293,10 +277,10 @@ def _hand(
         for x, y, row in marks[kind] if most <= _MOST_NAMED else ():
             value = values[row["name"]]
             is_deep = value > limits[0] + 0.6 * (limits[1] - limits[0])
-            style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6.5}
+            look: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6.5}
             text = written.format(value) if value else "0"
-            axes.text(x, y, text, color="white" if is_deep else INK, **style)
-            axes.text(x, y + 0.3, row["name"], color=GREY, **style)
+            axes.text(x, y, text, color="white" if is_deep else style.INK, **look)
+            axes.text(x, y + 0.3, row["name"], color=style.GREY, **look)
     axes.set_xlim(-0.6, len(fingers) - 0.4)
     axes.set_ylim(-1.4 if "thumb" in fingers[1:] else -0.1, max(map(len, by_finger.values())) + 0.5)
     axes.set_aspect("equal", anchor="N")
@@ -309,7 +293,7 @@ def _placed(rows: Sequence[Row]) -> list[tuple[tuple[float, float], Row]]:
     lines = math.ceil(len(rows) / columns)
     pitch = 0.86 / max(columns, lines, 2)
     placed = []
-    for number, row in enumerate(sorted(rows, key=is_fast)):
+    for number, row in enumerate(sorted(rows, key=style.is_fast)):
         line, column = divmod(number, columns)
         in_line = min(columns, len(rows) - line * columns)
         at = pitch * (column - (in_line - 1) / 2), -pitch * (line - (lines - 1) / 2)

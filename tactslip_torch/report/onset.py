@@ -19,27 +19,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from tactslip_torch.report.style import (
-    ALARM,
-    BLUE,
-    GREY,
-    INK,
-    ORANGE,
-    csv_writer,
-    legend_below,
-    marked,
-    new_figure,
-    save,
-    styled,
-    table,
-)
+from tactslip_torch.report import style
 from tactslip_torch.runtime import write_json
 
 Array = NDArray[np.float64]
 Segments = Sequence[tuple[float, float]]
 """Start and end of each, in seconds."""
 
-REST, SLIP = BLUE, ORANGE
+REST, SLIP = style.BLUE, style.ORANGE
 COLUMNS = (
     *("file", "alarm_s", "onset_s", "end_s", "score", "probability", "statistic", "is_valid"),
     "raised_by",
@@ -55,10 +42,10 @@ _INVALID: dict[str, Any] = {
 }  # fmt: skip
 _ABSTAINS: dict[str, Any] = {"facecolor": "#DDD6E8", "edgecolor": "none", "zorder": 0.2}
 _MOST_DELAYS = 12  # told beside their alarms
-_ONSET: dict[str, Any] = {"color": INK, "linestyle": "-."}
-_RELEASE: dict[str, Any] = {"color": GREY, "linestyle": ":"}
-_ALARM: dict[str, Any] = {"color": ALARM, "linestyle": "-"}
-_ESTIMATE: dict[str, Any] = {"color": ALARM, "linestyle": ":"}
+_ONSET: dict[str, Any] = {"color": style.INK, "linestyle": "-."}
+_RELEASE: dict[str, Any] = {"color": style.GREY, "linestyle": ":"}
+_ALARM: dict[str, Any] = {"color": style.ALARM, "linestyle": "-"}
+_ESTIMATE: dict[str, Any] = {"color": style.ALARM, "linestyle": ":"}
 
 
 # While a stream passes ---------------------------------------------------------------------------
@@ -326,10 +313,10 @@ def onsets_table(content: Mapping[str, Any]) -> str:
             "delay s": _seconds(row["delay_s"]),
         }
         shown.append(cells | {"outcome": row["outcome"]})
-    lines = [table(shown, merged=1) if rows else "no alarm, and no slip missed"]
+    lines = [style.table(shown, merged=1) if rows else "no alarm, and no slip missed"]
     if len(rows) > _MOST_ROWS:
         lines.append(f"and {len(rows) - _MOST_ROWS} more, see onsets.csv")
-    return marked(content["simulated"], *lines)
+    return style.marked(content["simulated"], *lines)
 
 
 def onsets_summary(content: Mapping[str, Any], seconds: float) -> str:
@@ -379,12 +366,12 @@ def write_onsets(content: Mapping[str, Any], folder: Path) -> None:
         folder: where they go.
     """
     write_json(folder / "onsets.json", content)
-    with csv_writer(folder / "onsets.csv", COLUMNS) as write:
+    with style.csv_writer(folder / "onsets.csv", COLUMNS) as write:
         write(row.values() for row in _onset_rows(content))
 
 
 # Figure ------------------------------------------------------------------------------------------
-@styled
+@style.styled
 def onset_figure(
     traces: Traces,
     entry: Mapping[str, Any],
@@ -406,7 +393,7 @@ def onset_figure(
     """
     heights = [max(1.2, 0.3 * len(traces.channels)), 0.55, 1.3]
     heights += [] if onset_threshold is None else [1.3]
-    figure = new_figure(12.0, sum(heights) + 1.3, title)
+    figure = style.new_figure(12.0, sum(heights) + 1.3, title)
     panels = figure.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights})
     first, last = traces.view
     alarms, truth = entry["alarms"], entry["truth"]
@@ -421,24 +408,24 @@ def onset_figure(
     bars = {"decided": (max(decided_s[0], first) if len(decided_s) else last, slips)}
     bars |= {"truth": (first, truth["sliding_s"])} if truth else {}
     _draw_status(panels[1], bars, traces.view)
-    panels[2].plot(decided_s, probability, color=INK, linewidth=0.8, drawstyle="steps-post")
+    panels[2].plot(decided_s, probability, color=style.INK, linewidth=0.8, drawstyle="steps-post")
     panels[2].set(ylim=(-0.04, 1.04), yticks=[0, 0.5, 1])
     panels[2].set_ylabel("P(slip)")
     _shade(panels[2], doubtful, "abstains", **_ABSTAINS)
     if onset_threshold is not None:
-        panels[3].plot(decided_s, onset_score, color=INK, linewidth=0.8)
-        panels[3].axhline(onset_threshold, color=ALARM, linewidth=0.8, linestyle="--")
+        panels[3].plot(decided_s, onset_score, color=style.INK, linewidth=0.8)
+        panels[3].axhline(onset_threshold, color=style.ALARM, linewidth=0.8, linestyle="--")
         panels[3].set_ylabel("onset score")
     panels[0].set_xlim(first, last)
     raised_s, estimates_s = ([alarm[key] for alarm in alarms] for key in ("alarm_s", "onset_s"))
-    for axes, times, name, style in (
+    for axes, times, name, look in (
         (panels[0], first_s, "first release", _RELEASE),
         (panels[0], onsets_s, "onset", _ONSET),
         (panels[0], raised_s, "alarm", _ALARM),
         (panels[2], onsets_s, "onset", _ONSET),
         (panels[2], estimates_s, "estimate", _ESTIMATE),
     ):
-        _mark(axes, times, name, **style)
+        _mark(axes, times, name, **look)
     _tell_delays(panels[0], alarms)
     panels[-1].set_xlabel("time, s")
     handles: list[Any] = [
@@ -451,8 +438,8 @@ def onset_figure(
     handles += [Line2D([], [], label="onset, true", **_ONSET)] if onsets_s else []
     handles += [Patch(label="abstains", **_ABSTAINS)] if doubtful else []
     handles += [Patch(label="not valid", **_INVALID)] if invalid else []
-    legend_below(figure, handles, len(handles))
-    save(figure, path, dpi=120)
+    style.legend_below(figure, handles, len(handles))
+    style.save(figure, path, dpi=120)
 
 
 def _draw_channels(axes: Axes, traces: Traces, slips: Segments) -> None:
@@ -485,11 +472,11 @@ def _tell_delays(axes: Axes, alarms: Sequence[Mapping[str, Any]]) -> None:
     first, last = axes.get_xlim()
     known = [alarm for alarm in alarms if alarm.get("delay_s") is not None]
     told = [alarm for alarm in known if first <= alarm["alarm_s"] <= last]
-    style: dict[str, Any] = {"color": ALARM, "fontsize": 8, "va": "bottom"}
-    style |= {"xycoords": axes.get_xaxis_transform(), "textcoords": "offset points"}
+    look: dict[str, Any] = {"color": style.ALARM, "fontsize": 8, "va": "bottom"}
+    look |= {"xycoords": axes.get_xaxis_transform(), "textcoords": "offset points"}
     for alarm in told if len(told) <= _MOST_DELAYS else ():
         text = f"{1000 * alarm['delay_s']:+.0f} ms"
-        axes.annotate(text, (alarm["alarm_s"], 1.0), xytext=(4, 2), **style)
+        axes.annotate(text, (alarm["alarm_s"], 1.0), xytext=(4, 2), **look)
 
 
 def lane_height(lines: Iterable[Array]) -> float:
@@ -527,21 +514,21 @@ def _draw_status(
     axes.grid(visible=False)
 
 
-def _mark(axes: Axes, times: Sequence[float], name: str, **style: Any) -> None:
+def _mark(axes: Axes, times: Sequence[float], name: str, **look: Any) -> None:
     """Lines from top to bottom, the finer the more there are; a triangle above an alarm."""
     first, last = axes.get_xlim()
     if seen := [time for time in times if first <= time <= last]:  # of nothing there is no layout
         width = max(0.2, _WIDTH * min(1.0, _ROOM / len(seen)) ** 0.5)
         through = axes.get_xaxis_transform()
-        axes.vlines(seen, 0, 1, transform=through, linewidth=width, gid=name, **style)
+        axes.vlines(seen, 0, 1, transform=through, linewidth=width, gid=name, **look)
         if name == "alarm":
-            dots: dict[str, Any] = {"color": ALARM, "markersize": 4, "clip_on": False}
+            dots: dict[str, Any] = {"color": style.ALARM, "markersize": 4, "clip_on": False}
             axes.plot(seen, np.ones(len(seen)), "v", transform=through, **dots)
 
 
-def _shade(axes: Axes, segments: Segments, name: str, **style: Any) -> None:
+def _shade(axes: Axes, segments: Segments, name: str, **look: Any) -> None:
     if beams := [(start, end - start) for start, end in segments]:
-        axes.broken_barh(beams, (0, 1), transform=axes.get_xaxis_transform(), gid=name, **style)
+        axes.broken_barh(beams, (0, 1), transform=axes.get_xaxis_transform(), gid=name, **look)
 
 
 def _spans(times: NDArray[np.floating], status: Array, end_s: float) -> list[tuple[float, float]]:

@@ -9,20 +9,9 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from tactslip_torch.report.style import (
-    BLUE,
-    GREEN,
-    VERMILION,
-    legend_below,
-    marked,
-    new_figure,
-    percent,
-    save,
-    styled,
-    table,
-)
+from tactslip_torch.report import style
 
-_ALIGN_COLOURS = {"centred": BLUE, "causal": VERMILION, "trailing": GREEN}
+_ALIGN_COLOURS = {"centred": style.BLUE, "causal": style.VERMILION, "trailing": style.GREEN}
 _BUSY = 0.05  # fraction of interrupted calls from which it is said
 _NAMED = {  # B takes a third in onnxruntime; the axes are of the detector here
     "most_accurate": ("A", "most accurate"),
@@ -50,9 +39,9 @@ def pareto_table(content: Mapping[str, Any]) -> str:
         f"{_busy(interrupted)} (the most of any detector on the front)",
     ]
     front = sorted(content["front"], key=lambda row: float(row["latency"]["worst_ms"]))
-    rows = table(list(map(_front_row, front)), num_left=0)
+    rows = style.table(list(map(_front_row, front)), num_left=0)
     named, chosen = _named_lines(content), _chosen_lines(content)
-    return marked(content["simulated"], *head, "", rows, "", *named, "", *chosen)
+    return style.marked(content["simulated"], *head, "", rows, "", *named, "", *chosen)
 
 
 _FRONT = {
@@ -70,7 +59,7 @@ def _front_row(row: Mapping[str, Any]) -> dict[str, object]:
     for title in ("look-ahead", "bin", "hop"):
         cells[title] = f"{latency[title.replace('-', '_') + '_ms']:g}"
     cells |= {"compute us": f"{row['p99_us']:.0f}", "p50 us": f"{row['p50_us']:.0f}"}
-    cells |= {"valid. %": percent(row["validation"])}
+    cells |= {"valid. %": style.percent(row["validation"])}
     return cells | {title: row[key] for title, key in _FRONT.items()}
 
 
@@ -84,7 +73,7 @@ def _named_lines(content: Mapping[str, Any]) -> list[str]:
             lines.append(f"{letter} {what}: none of those timed")
             continue
         lines.append(
-            f"{letter} {what}: {percent(row['validation'])} %, {row['graph_p50_us']:.0f} us "
+            f"{letter} {what}: {style.percent(row['validation'])} %, {row['graph_p50_us']:.0f} us "
             f"({row['graph_p50_us'] / most:.2f} of A; without ONNX {row['p50_us']:.0f} us), "
             f"{row['num_features']} numbers ({row['columns']}, {row['components']}, "
             f"{row['channels']}) of {row['features_read']} features, degree {row['degree']}, "
@@ -113,9 +102,9 @@ def _chosen_lines(content: Mapping[str, Any]) -> list[str]:
         f"{chosen['fitted_to']}",
         f"  of those that kept both limits when timed {content['tried']} tried there, "
         f"{content['not_tried']} not tried; {_busy(chosen['interrupted'])}",
-        f"  balanced accuracy {percent(chosen['validation'])} % in validation, which chose it: a "
-        f"little too good; {percent(test['balanced_accuracy'])} % on {test['num_bins']} bins of "
-        "the test cycles of seen materials",
+        f"  balanced accuracy {style.percent(chosen['validation'])} % in validation, which chose "
+        f"it: a little too good; {style.percent(test['balanced_accuracy'])} % on "
+        f"{test['num_bins']} bins of the test cycles of seen materials",
     ]
 
 
@@ -146,13 +135,13 @@ def none_meets(content: Mapping[str, Any]) -> str:
 
 def _busy(interrupted: float) -> str:
     """Which fraction of calls does not count."""
-    calls = f"{percent(interrupted, 1)} % of calls interrupted"
+    calls = f"{style.percent(interrupted, 1)} % of calls interrupted"
     if interrupted > _BUSY:
         return f"machine busy: {calls}, which do not count; time again"
     return f"{calls} by the system, which do not count"
 
 
-@styled
+@style.styled
 def pareto_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write accuracy against latency and against compute as a PNG, the chosen detector marked.
 
@@ -161,7 +150,7 @@ def pareto_figure(content: Mapping[str, Any], path: str | Path) -> None:
         path: the PNG to write, replaced as a whole if it exists.
     """
     title = f"Accuracy by latency and compute, {content['searched']} candidates"
-    figure = new_figure(11, 4.8, title, simulated=content["simulated"])
+    figure = style.new_figure(11, 4.8, title, simulated=content["simulated"])
     left, right = figure.subplots(1, 2, sharey=True)
     limits = content["limits"]
     for axes, key, limit in (
@@ -183,8 +172,8 @@ def pareto_figure(content: Mapping[str, Any], path: str | Path) -> None:
     right.set_xlabel("compute, raw samples to decision, p99, us")
     right.set_title("one bin, one thread; dotted: the limit")
     handles, _ = right.get_legend_handles_labels()
-    legend_below(figure, handles, 3)
-    save(figure, path)
+    style.legend_below(figure, handles, 3)
+    style.save(figure, path)
 
 
 def _plain_ticks(axes: Axes) -> None:
@@ -223,7 +212,7 @@ def _front(axes: Axes, content: Mapping[str, Any], key: str) -> None:
             axes.annotate(letter, at, (4, -13), textcoords="offset points", weight="bold")
     if chosen := content["chosen"]:
         at = _point(chosen, key)
-        axes.plot(*at, "*", color=GREEN, markersize=17, mec="black", label="chosen")
+        axes.plot(*at, "*", color=style.GREEN, markersize=17, mec="black", label="chosen")
 
 
 def _point(row: Mapping[str, Any], key: str) -> tuple[float, float]:

@@ -21,23 +21,8 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tactslip_torch.report import style
 from tactslip_torch.report.onset import Array, Envelope, Segments, lane_height, median, span
-from tactslip_torch.report.style import (
-    BLUE,
-    GREY,
-    INK,
-    VERMILION,
-    colours_of,
-    is_fast,
-    lanes,
-    legend_below,
-    marked,
-    new_figure,
-    save,
-    stack,
-    styled,
-    table,
-)
 
 Channels = Sequence[Mapping[str, str]]
 """Rows of ``name``, ``kind``, ``finger``, ``segment``, ``adapting`` where the kind does not say it,
@@ -45,9 +30,9 @@ as ``HandLayout.to_rows`` gives them."""
 
 _UNKNOWN = "#D9D9D9"
 _PALER = {"distal": 0.0, "middle": 0.3, "proximal": 0.5}
-_SLIP: dict[str, Any] = {"facecolor": VERMILION, "alpha": 0.14, "linewidth": 0, "zorder": 0}
-_NON_SLIP: dict[str, Any] = {"facecolor": BLUE, "alpha": 0.12, "linewidth": 0, "zorder": 0}
-_ONSET: dict[str, Any] = {"color": INK, "linestyle": "-.", "linewidth": 1.0, "zorder": 1}
+_SLIP: dict[str, Any] = {"facecolor": style.VERMILION, "alpha": 0.14, "linewidth": 0, "zorder": 0}
+_NON_SLIP: dict[str, Any] = {"facecolor": style.BLUE, "alpha": 0.12, "linewidth": 0, "zorder": 0}
+_ONSET: dict[str, Any] = {"color": style.INK, "linestyle": "-.", "linewidth": 1.0, "zorder": 1}
 _NUM_SEGMENTS = 1200  # of each line, of which the least and the greatest sample are drawn
 _LANE = 0.13  # least height of one, in inches, for its name to be read
 _MOST_LANES = 24
@@ -137,7 +122,7 @@ def trials_table(trials: Sequence[Trial], *, simulated: bool) -> str:
     tables = [_grouped("material", [(trial.material, trial) for trial in trials], cells)]
     if len({trial.scene for trial in trials}) > 1:
         tables.append(_grouped("scene", [(trial.scene, trial) for trial in trials], cells))
-    return marked(simulated, "\n\n".join(tables))
+    return style.marked(simulated, "\n\n".join(tables))
 
 
 def _grouped(
@@ -151,7 +136,7 @@ def _grouped(
         groups.setdefault(name, []).append(each)
     if len(groups) > 1:
         groups["all"] = [each for _, each in named]
-    return table([{key: name, **cells(group)} for name, group in groups.items()])
+    return style.table([{key: name, **cells(group)} for name, group in groups.items()])
 
 
 def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
@@ -173,7 +158,7 @@ def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
 
     rows = _grouped("scene", [(one["line"]["scene"], one) for one in written], cells)
     simulated = any(one["line"]["simulated"] == "true" for one in written)
-    return marked(simulated, rows, f"took {seconds:.1f} s")
+    return style.marked(simulated, rows, f"took {seconds:.1f} s")
 
 
 def ranges_table(channels: Channels, ranges: Array, units: str) -> str:
@@ -190,10 +175,10 @@ def ranges_table(channels: Channels, ranges: Array, units: str) -> str:
         row: dict[str, object] = {"kind": kind, "channels": len(places)}
         row |= {f"least, {units}": f"{least:.6g}", f"greatest, {units}": f"{greatest:.6g}"}
         rows.append(row)
-    return table(rows)
+    return style.table(rows)
 
 
-@styled
+@style.styled
 def dataset_figure(
     trials: Sequence[Trial],
     example: DrawnRecording,
@@ -216,18 +201,18 @@ def dataset_figure(
     materials = list(dict.fromkeys(trial.material for trial in trials))
     num_lanes = min(len(names), _MOST_LANES)
     heights = [0.28 * len(materials) + 0.8, 0.2 * num_lanes + 0.9]
-    figure = new_figure(11.0, sum(heights) + 0.9, title)
+    figure = style.new_figure(11.0, sum(heights) + 0.9, title)
     bars, traces = figure.subplots(2, 1, gridspec_kw={"height_ratios": heights})
-    colours = {VERMILION: "slip", BLUE: "non-slip", _UNKNOWN: "not labelled"}
+    colours = {style.VERMILION: "slip", style.BLUE: "non-slip", _UNKNOWN: "not labelled"}
     for lane, material in enumerate(materials):
         group = [trial for trial in trials if trial.material == material]
         slip = sum(trial.slip_s for trial in group)
         quiet = sum(trial.non_slip_s for trial in group)
         whole = max(sum(trial.duration_s for trial in group), slip + quiet)
-        stack(bars, lane, (slip, quiet, whole - slip - quiet), colours)
+        style.stack(bars, lane, (slip, quiet, whole - slip - quiet), colours)
         text = f"  {len(group)} recording{'s' * (len(group) != 1)}"
-        bars.text(whole, lane, text, va="center", fontsize=7, color=GREY)
-    lanes(bars, materials)
+        bars.text(whole, lane, text, va="center", fontsize=7, color=style.GREY)
+    style.lanes(bars, materials)
     bars.margins(x=0.12)
     bars.set_xlabel("seconds of signal")
 
@@ -240,7 +225,7 @@ def dataset_figure(
         for place, wide in zip(chosen, spans, strict=True)
     ]
     scales = [1.25 * wide or 1.0 for wide in spans]
-    _draw_lanes(traces, times, values, labels, [INK] * len(chosen), scales, most=1.2)
+    _draw_lanes(traces, times, values, labels, [style.INK] * len(chosen), scales, most=1.2)
     traces.set_ylim(-len(chosen) + 0.2, 0.8)
     _mark(traces, example, view)
     traces.set_xlabel("time, s")
@@ -249,12 +234,12 @@ def dataset_figure(
     traces.set_title(what)
     handles: list[Any] = [Patch(color=colour, label=label) for colour, label in colours.items()]
     handles += [Line2D([], [], label="onset", **_ONSET)] if example.onsets_s else []
-    legend_below(figure, handles, 4)
-    save(figure, path, dpi=120)
+    style.legend_below(figure, handles, 4)
+    style.save(figure, path, dpi=120)
 
 
 # Signals -----------------------------------------------------------------------------------------
-@styled
+@style.styled
 def signals_figure(
     rows: Sequence[DrawnRecording],
     channels: Channels,
@@ -276,7 +261,7 @@ def signals_figure(
     columns = _columns(channels)
     colours = _channel_colours(channels)
     height = max(1.9, *(_LANE * len(places) for _, places, _ in columns))
-    figure = new_figure(13.0, height * len(rows) + 1.3, title)
+    figure = style.new_figure(13.0, height * len(rows) + 1.3, title)
     widths = {"width_ratios": [1.0 if in_lanes else 0.75 for _, _, in_lanes in columns]}
     grid = figure.subplots(len(rows), len(columns), squeeze=False, gridspec_kw=widths)
     for panels, row, view in zip(grid, rows, views, strict=True):
@@ -293,21 +278,21 @@ def signals_figure(
                     axes.plot(times, line, color=colour, linewidth=0.7, label=name)
             _mark(axes, row, view)
         unit = "volts" if row.units == "V" else row.units
-        panels[0].set_ylabel(f"{row.title}\n{unit}", color=INK)
+        panels[0].set_ylabel(f"{row.title}\n{unit}", color=style.INK)
     for axes, (kind, _, in_lanes) in zip(grid[0], columns, strict=True):
         how = "offsets removed" if in_lanes else "as measured"
         axes.set_title(f"{kind}, {how}")
     for axes in grid[-1]:
         axes.set_xlabel("time, s")
-    legend_below(figure, _legend(rows, channels), 9)
-    save(figure, path, dpi=120)
+    style.legend_below(figure, _legend(rows, channels), 9)
+    style.save(figure, path, dpi=120)
 
 
 def _columns(channels: Channels) -> list[tuple[str, list[int], bool]]:
     """Kind, channels and whether in lanes: of every slow kind two columns, of every other one."""
     groups: dict[tuple[bool, str], list[int]] = {}
     for place, channel in enumerate(channels):
-        groups.setdefault((is_fast(channel), channel["kind"]), []).append(place)
+        groups.setdefault((style.is_fast(channel), channel["kind"]), []).append(place)
     return [
         (kind, places, in_lanes)
         for (fast, kind), places in sorted(groups.items(), key=lambda item: item[0][0])
@@ -317,7 +302,7 @@ def _columns(channels: Channels) -> list[tuple[str, list[int], bool]]:
 
 def _channel_colours(channels: Channels) -> list[tuple[float, float, float]]:
     """A colour per channel: the hue is its finger's, paler towards the palm."""
-    hues = colours_of(channel["finger"] for channel in channels)
+    hues = style.colours_of(channel["finger"] for channel in channels)
     colours = []
     for channel in channels:
         pale, own = _PALER.get(channel["segment"], 0.0), to_rgb(hues[channel["finger"]])
@@ -358,10 +343,10 @@ def _draw_lanes(
 
 def _mark(axes: Axes, row: DrawnRecording, view: tuple[float, float]) -> None:
     """Onsets, slip and non-slip, as far as they are in view."""
-    for segments, style in ((row.slip_s, _SLIP), (row.non_slip_s, _NON_SLIP)):
+    for segments, look in ((row.slip_s, _SLIP), (row.non_slip_s, _NON_SLIP)):
         for start, end in segments:
             if start < view[1] and end > view[0]:
-                axes.axvspan(max(start, view[0]), min(end, view[1]), **style)
+                axes.axvspan(max(start, view[0]), min(end, view[1]), **look)
     for onset in row.onsets_s:
         if view[0] <= onset <= view[1]:
             axes.axvline(onset, **_ONSET)
@@ -372,7 +357,7 @@ def _mark(axes: Axes, row: DrawnRecording, view: tuple[float, float]) -> None:
 
 def _legend(rows: Sequence[DrawnRecording], channels: Channels) -> list[Any]:
     """A line per finger, and the marks that there are."""
-    fingers = colours_of(channel["finger"] for channel in channels)
+    fingers = style.colours_of(channel["finger"] for channel in channels)
     handles: list[Any] = [
         Line2D([], [], color=colour, linewidth=2, label=finger)
         for finger, colour in fingers.items()

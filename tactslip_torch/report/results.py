@@ -19,33 +19,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from tactslip_torch.report import published
+from tactslip_torch.report import published, style
 from tactslip_torch.report.metrics import CLASSES
-from tactslip_torch.report.style import (
-    ALARM,
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PALETTE,
-    PURPLE,
-    UPPER_LEFT_OUTSIDE,
-    VERMILION,
-    colours_of,
-    grouped,
-    kind_colours,
-    lanes,
-    legend_below,
-    marked,
-    new_figure,
-    percent,
-    save,
-    stack,
-    styled,
-    table,
-    words,
-)
 from tactslip_torch.runtime import write_json
 
 PAPER_LINE = f"paper: {published.PAPER}; real hand, random split over bins"
@@ -63,7 +38,7 @@ _SCORES = {
     "non_slip_recall": "non-slip %",
     "slip_recall": "slip %",
 }
-_OUTCOMES = {"found": GREEN, "early": ORANGE, "missed": "#999999"}
+_OUTCOMES = {"found": style.GREEN, "early": style.ORANGE, "missed": "#999999"}
 _Metrics = Mapping[str, Any]
 """The content of ``metrics.json``, or a part of it."""
 _Row = dict[str, object]
@@ -125,7 +100,7 @@ def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> N
 # Scores per bin ----------------------------------------------------------------------------------
 def _percents(scores: Mapping[str, Any], titles: Mapping[str, str]) -> _Row:
     """Scores in percent, by what they are called."""
-    return {title: percent(scores[key]) for key, title in titles.items()}
+    return {title: style.percent(scores[key]) for key, title in titles.items()}
 
 
 def _score_cells(scores: Mapping[str, Any]) -> _Row:
@@ -150,7 +125,7 @@ def splits_table(metrics: _Metrics) -> str:
         if paper := _beside(metrics, name):
             rows.append({"split": "  paper"} | _score_cells(vars(paper)))
     source = [PAPER_LINE] if metrics.get("is_papers_hand", True) else []
-    return marked(metrics["simulated"], table(rows), *source)
+    return style.marked(metrics["simulated"], style.table(rows), *source)
 
 
 def materials_table(metrics: _Metrics) -> str:
@@ -172,7 +147,7 @@ def materials_table(metrics: _Metrics) -> str:
             head = [PAPER_SCENE_LINE]
             groups |= {f"scene {scene}": scores for scene, scores in scenes.items()}
         rows += [{"split": name, "group": group} | _score_cells(of) for group, of in groups.items()]
-    return marked(metrics["simulated"], *head, table(rows, num_left=2, merged=1))
+    return style.marked(metrics["simulated"], *head, style.table(rows, num_left=2, merged=1))
 
 
 def _trained_on_lines(metrics: _Metrics) -> list[str]:
@@ -202,9 +177,9 @@ def timing_table(timing_s: Mapping[str, float]) -> str:
     total = float(timing_s.get("total", sum(stages.values())))
     rows = []
     for name, seconds in (stages | {"total": total}).items():
-        fraction = percent(seconds / total if total else None)
+        fraction = style.percent(seconds / total if total else None)
         rows.append({"stage": name, "seconds": f"{seconds:.2f}", "of all %": fraction})
-    return table(rows)
+    return style.table(rows)
 
 
 def solve_line(solve: Mapping[str, Any]) -> str:
@@ -217,7 +192,7 @@ def solve_line(solve: Mapping[str, Any]) -> str:
     return f"{line}, unless what is left out is null" if solve.get("left_out") else line
 
 
-@styled
+@style.styled
 def confusion_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write one confusion matrix per split: bins counted, and percent of each true class.
 
@@ -231,13 +206,13 @@ def confusion_figure(metrics: _Metrics, path: str | Path) -> None:
     num_columns = min(4, len(splits))
     num_rows = -(-len(splits) // num_columns)
     size = (max(4.6, 3.4 * num_columns), 3.8 * num_rows + 0.6)
-    figure = new_figure(*size, "Contact status per bin", simulated=metrics["simulated"])
+    figure = style.new_figure(*size, "Contact status per bin", simulated=metrics["simulated"])
     panels = figure.subplots(num_rows, num_columns, squeeze=False).ravel()
     for axes, (name, scores) in zip(panels, splits.items(), strict=False):
         _confusion_panel(axes, name, scores, _beside(metrics, name))
     for axes in panels[len(splits) :]:
         axes.set_axis_off()
-    save(figure, path, dpi=180)
+    style.save(figure, path, dpi=180)
 
 
 def _confusion_panel(
@@ -248,12 +223,12 @@ def _confusion_panel(
     fractions = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     axes.imshow(fractions, cmap="Blues", vmin=0, vmax=1.15)
     for row, column in np.ndindex(2, 2):
-        style: dict[str, Any] = {"ha": "center", "va": "center"}
-        style["color"] = "white" if fractions[row, column] > 0.6 else INK
-        value = percent(fractions[row, column] if counts[row].any() else None)
-        axes.text(column, row - 0.06, f"{value} %", fontsize=13, **style)
-        number = f"{grouped(int(counts[row, column]))} bins"
-        axes.text(column, row + 0.16, number, **style)
+        look: dict[str, Any] = {"ha": "center", "va": "center"}
+        look["color"] = "white" if fractions[row, column] > 0.6 else style.INK
+        value = style.percent(fractions[row, column] if counts[row].any() else None)
+        axes.text(column, row - 0.06, f"{value} %", fontsize=13, **look)
+        number = f"{style.grouped(int(counts[row, column]))} bins"
+        axes.text(column, row + 0.16, number, **look)
     names = ["non-slip", "slip"]
     axes.set_xticks([0, 1], names)
     axes.set_yticks([0, 1], names, rotation=90, va="center")
@@ -265,16 +240,18 @@ def _confusion_panel(
     axes.set_title(name, fontweight="bold", pad=21)
 
     def accuracies(of: Mapping[str, Any]) -> str:
-        both = percent(of["accuracy"]), percent(of["balanced_accuracy"])
+        both = style.percent(of["accuracy"]), style.percent(of["balanced_accuracy"])
         return "accuracy {} %, balanced {} %".format(*both)
 
     axes.text(0.5, -0.545, accuracies(scores), ha="center")  # below the title
     lines = ["prediction", "", ""]
     if paper and paper.non_slip_recall is not None:
-        recalls = (percent(recall, 1) for recall in (paper.non_slip_recall, paper.slip_recall))
+        recalls = (
+            style.percent(recall, 1) for recall in (paper.non_slip_recall, paper.slip_recall)
+        )
         lines[1:] = "paper: non-slip {} %, slip {} %".format(*recalls), accuracies(vars(paper))
     elif paper:
-        lines[1] = f"paper: accuracy {percent(paper.accuracy)} %"
+        lines[1] = f"paper: accuracy {style.percent(paper.accuracy)} %"
     axes.set_xlabel("\n".join(lines))
 
 
@@ -314,17 +291,17 @@ def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
             rows.append(row | ({"paper": shown.get(value)} if is_papers else {}))
     rows.append({"selected by": "all", "": "", "ours": len(selected)})
     if not is_papers:
-        return table(rows, num_left=2, merged=1)
+        return style.table(rows, num_left=2, merged=1)
     rows[-1]["paper"] = published.NUM_SELECTED
     said = f"paper, in words: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
-    return f"{table(rows, num_left=2, merged=1)}\n{said}"
+    return f"{style.table(rows, num_left=2, merged=1)}\n{said}"
 
 
 _COMPONENTS = ("raw", "A1", "A2", "A3", "A4", "D1", "D2", "D3", "D4")
 _DOMAIN_WORDS = {"time": "time domain", "freq": "frequency domain"}
 
 
-@styled
+@style.styled
 def selected_features_figure(
     selected: Sequence[Mapping[str, str]], path: str | Path, *, simulated: bool
 ) -> None:
@@ -342,7 +319,7 @@ def selected_features_figure(
         simulated: whether the bins they were ranked on are.
     """
     title = f"Where the {len(selected)} selected features come from"
-    figure = new_figure(12.0, 8.4, title, simulated=simulated)
+    figure = style.new_figure(12.0, 8.4, title, simulated=simulated)
     grid = figure.add_gridspec(3, 2, width_ratios=[1.15, 1], height_ratios=[0.5, 1.1, 1])
     kind, component, finger = (figure.add_subplot(grid[row, 0]) for row in range(3))
     descriptor = figure.add_subplot(grid[:, 1])
@@ -350,13 +327,13 @@ def selected_features_figure(
     by_kind = published.SELECTED_BY_KIND if is_papers else {}
     by_finger = published.SELECTED_BY_FINGER if is_papers else {}
     kinds = [feature["kind"] for feature in selected]
-    colours = kind_colours([*by_kind, *sorted(set(kinds))])
+    colours = style.kind_colours([*by_kind, *sorted(set(kinds))])
 
     of_paper = {name: {name: count} for name, count in by_kind.items()}
     _counts(kind, "(a) sensor kind", zip(kinds, kinds, strict=True), colours, colours, of_paper)
 
     pairs = [(_DOMAIN_WORDS[feature["domain"]], feature["component"]) for feature in selected]
-    domains = dict(zip(_DOMAIN_WORDS.values(), (PURPLE, GREEN), strict=True))
+    domains = dict(zip(_DOMAIN_WORDS.values(), (style.PURPLE, style.GREEN), strict=True))
     _counts(component, "(b) signal component", pairs, _COMPONENTS, domains)
 
     is_pooled = any(feature.get("statistic") for feature in selected)
@@ -374,10 +351,10 @@ def selected_features_figure(
     if is_papers:
         said = f"paper: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
         component.set_xlabel(said)
-        lanes(descriptor, [f"{words(name)}  [{ranks[name]}]" for name in names])
+        style.lanes(descriptor, [f"{style.words(name)}  [{ranks[name]}]" for name in names])
         unit = "features; the paper never selects [-]"
         descriptor.set_xlabel(unit)
-    save(figure, path, dpi=180)
+    style.save(figure, path, dpi=180)
 
 
 def _counts(
@@ -396,18 +373,18 @@ def _counts(
     for shown, at, hatch in ((ours, -aside, ""), (of_paper or {}, aside, "////")):
         ends = dict.fromkeys(names, 0)
         for layer, by_name in shown.items():
-            style: dict[str, Any] = {"color": colours[layer], "label": layer}
+            look: dict[str, Any] = {"color": colours[layer], "label": layer}
             if hatch:
-                style = {"fc": "white", "ec": colours[layer], "label": f"{layer}, paper"}
+                look = {"fc": "white", "ec": colours[layer], "label": f"{layer}, paper"}
             if not (has := [name for name in names if by_name.get(name)]):
                 continue
             lefts, widths = [ends[name] for name in has], [by_name[name] for name in has]
             lanes_at = [names.index(name) + at for name in has]
-            axes.barh(lanes_at, widths, height, left=lefts, hatch=hatch, **style)
+            axes.barh(lanes_at, widths, height, left=lefts, hatch=hatch, **look)
             ends |= {name: ends[name] + by_name[name] for name in has}
         for lane, end in enumerate(ends.values() if shown else ()):
-            axes.text(end, lane + at, f" {end}", va="center", color=GREY)
-    lanes(axes, list(map(words, names)))
+            axes.text(end, lane + at, f" {end}", va="center", color=style.GREY)
+    style.lanes(axes, list(map(style.words, names)))
     axes.set_title(title)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
     axes.margins(x=0.1)
@@ -440,22 +417,24 @@ def validation_table(metrics: _Metrics) -> str:
         titles = [*(["features"] if is_nested else []), "K", "kernel"]
         cells: _Row = {"chosen": "*" if row is chosen else ""}
         cells |= dict(zip(titles, _structure(row), strict=True))
-        cells |= {"C": f"{row['penalty']:g}", "validation %": percent(row["mean"])}
-        cells |= {"worst %": percent(scores[worst]), "group": worst}
+        cells |= {"C": f"{row['penalty']:g}", "validation %": style.percent(row["mean"])}
+        cells |= {"worst %": style.percent(scores[worst]), "group": worst}
         if is_nested:
-            cells["at its best threshold %"] = percent(row["worst"]["at_best_threshold"])
+            cells["at its best threshold %"] = style.percent(row["worst"]["at_best_threshold"])
         rows.append(cells)
-    lines = [table(rows)]
+    lines = [style.table(rows)]
     if nested := metrics.get("nested_validation"):
-        by_group = ", ".join(f"{g} {percent(s)}" for g, s in nested["balanced_accuracy"].items())
+        by_group = ", ".join(
+            f"{g} {style.percent(s)}" for g, s in nested["balanced_accuracy"].items()
+        )
         lines.append(
             "the choice itself, made without each group and evaluated on it: "
-            f"{percent(nested['mean'])} % ({by_group})"
+            f"{style.percent(nested['mean'])} % ({by_group})"
         )
-    return marked(metrics["simulated"], *lines)
+    return style.marked(metrics["simulated"], *lines)
 
 
-@styled
+@style.styled
 def validation_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the balanced accuracy on left-out groups over C, one line for each structure.
 
@@ -467,13 +446,13 @@ def validation_figure(metrics: _Metrics, path: str | Path) -> None:
     """
     choices = metrics["validation"]
     title = "Choice on training groups left out one at a time"
-    figure = new_figure(8.4, 4.6, title, simulated=metrics["simulated"])
+    figure = style.new_figure(8.4, 4.6, title, simulated=metrics["simulated"])
     axes = figure.subplots()
     chosen = _chosen(choices)
     structures = list(dict.fromkeys(map(_structure, choices)))
     is_nested = len({structure[:-2] for structure in structures}) > 1
     kinds = ["".join(structure[:-2] if is_nested else structure) for structure in structures]
-    colours = colours_of(kinds)
+    colours = style.colours_of(kinds)
     rests = list(dict.fromkeys(structure[-2:] for structure in structures))
     for kind, structure in zip(kinds, structures, strict=True):
         rows = sorted(
@@ -489,8 +468,8 @@ def validation_figure(metrics: _Metrics, path: str | Path) -> None:
     axes.set_xscale("log")
     axes.set_xlabel("C")
     axes.set_ylabel("balanced accuracy on the group left out, %")
-    axes.legend(handlelength=6.0, **UPPER_LEFT_OUTSIDE)
-    save(figure, path)
+    axes.legend(handlelength=6.0, **style.UPPER_LEFT_OUTSIDE)
+    style.save(figure, path)
 
 
 def _chosen(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
@@ -541,12 +520,12 @@ def tuning_tables(metrics: _Metrics) -> list[str]:
             }
             detectors = fold["splits"] if way == "tuned" else tuning["splits"][way]
             scores = {
-                f"{role} %": percent(detectors[role]["balanced_accuracy"])
+                f"{role} %": style.percent(detectors[role]["balanced_accuracy"])
                 for role, of in fold["splits"].items()
                 if of["balanced_accuracy"] is not None
             }
             cells = {"held-out loss": f"{held['loss']:.4f}"}
-            cells |= {"held-out %": percent(held["balanced_accuracy"])}
+            cells |= {"held-out %": style.percent(held["balanced_accuracy"])}
             rows.append({f"tuning {name}".strip(): label, **cells, **scores})
         start = tuning["start"]
         steps = (
@@ -555,11 +534,11 @@ def tuning_tables(metrics: _Metrics) -> list[str]:
             f"{', '.join(tuning['learned'])}; {tuning['bins']} bins; tuning took "
             f"{tuning['seconds']:.0f} s, the first fit with its grid {tuning['fit_s']:.0f} s"
         )
-        texts.append(marked(metrics["simulated"], table(rows), _HELD_NOTE, steps))
+        texts.append(style.marked(metrics["simulated"], style.table(rows), _HELD_NOTE, steps))
     return texts
 
 
-@styled
+@style.styled
 def tuning_figure(tuning: Mapping[str, Any], path: str | Path, *, simulated: bool) -> None:
     """Write the descents of every held-out group, the one on all, and the learned scales.
 
@@ -569,33 +548,35 @@ def tuning_figure(tuning: Mapping[str, Any], path: str | Path, *, simulated: boo
         simulated: whether the data is.
     """
     scales = tuning["scales"] if "scales" in tuning["learned"] else {}
-    figure = new_figure(12.5 if scales else 7.5, 4.2, "Tuning through the fit", simulated=simulated)
+    figure = style.new_figure(
+        12.5 if scales else 7.5, 4.2, "Tuning through the fit", simulated=simulated
+    )
     panels = figure.subplots(1, 1 + bool(scales), squeeze=False)[0]
     axes = panels[0]
     losses = np.array([[row["held_loss"] for row in group["history"]] for group in tuning["held"]])
     for place, group in enumerate(tuning["held"]):
-        colour, steps = PALETTE[place % len(PALETTE)], group["tuned"]["steps"]
+        colour, steps = style.PALETTE[place % len(style.PALETTE)], group["tuned"]["steps"]
         axes.plot(losses[place], color=colour, lw=1, label=group["held"])
         axes.plot(steps, losses[place, steps], "o", color=colour, markersize=4)
     axes.plot(losses.mean(axis=0), "k-", lw=2.5, label="their mean, which decides")
     learning = [row["loss"] for row in tuning["history"]]
     axes.plot(learning, "k--", lw=1.5, label="what is learned on")
-    axes.axvline(tuning["steps"], color=GREY, lw=1, label="steps taken")
+    axes.axvline(tuning["steps"], color=style.GREY, lw=1, label="steps taken")
     axes.set_ylim(bottom=0)
     axes.set_xlabel("steps")
     axes.set_ylabel("held-out log loss, nats")
     axes.set_title("groups held out; dots: steps chosen by the other groups")
-    axes.legend(**UPPER_LEFT_OUTSIDE)
+    axes.legend(**style.UPPER_LEFT_OUTSIDE)
     if scales:
         _draw_scales(panels[1], scales)
-    save(figure, path)
+    style.save(figure, path)
 
 
 def _draw_scales(axes: Axes, scales: Mapping[str, float]) -> None:
     """Learned scales, the largest first; the first and last few are named."""
     ordered = sorted(scales.items(), key=lambda item: -item[1])
-    axes.bar(range(len(ordered)), [value for _, value in ordered], color=BLUE, width=0.8)
-    axes.axhline(1, color=GREY, lw=1)
+    axes.bar(range(len(ordered)), [value for _, value in ordered], color=style.BLUE, width=0.8)
+    axes.axhline(1, color=style.GREY, lw=1)
     for x, side, heading, named in (
         (0.02, "left", "largest", ordered[:3]),
         (0.98, "right", "smallest", ordered[-3:][::-1]),
@@ -670,10 +651,10 @@ def confound_table(metrics: _Metrics) -> str:
         cells |= {"detector": row["detector"], "trained on it": row["is_trained"]}
         cells |= {"bins": row["scores"]["num_bins"]}
         rows.append(cells | _percents(row["scores"], {key: _SCORES[key] for key in recalls}))
-    return marked(metrics["simulated"], table(rows, num_left=4))
+    return style.marked(metrics["simulated"], style.table(rows, num_left=4))
 
 
-@styled
+@style.styled
 def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write false slips and slips found of each detector on each kind of scene, as a PNG.
 
@@ -687,10 +668,10 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
     """
     rows = _scene_rows(metrics)
     roles, scenes = (list(dict.fromkeys(row[key] for row in rows)) for key in ("role", "scene"))
-    colours = colours_of(row["detector"] for row in rows)
+    colours = style.colours_of(row["detector"] for row in rows)
     height = 1.7 + len(roles) * (0.8 + 0.28 * len(scenes))
     title = "Does it detect slip, or the motion of the arm?"
-    figure = new_figure(10.5, height, title, simulated=metrics["simulated"])
+    figure = style.new_figure(10.5, height, title, simulated=metrics["simulated"])
     panels = figure.subplots(len(roles), 2, sharex="col", sharey=True, squeeze=False)
     dot: dict[str, Any] = {"marker": "o", "ls": "", "ms": 7.5, "mew": 1.8}
     for role, pair in zip(roles, panels, strict=True):
@@ -713,11 +694,14 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
                     axes.plot(value, at, color=colour, mfc=fill, clip_on=False, zorder=2, **dot)
                 if not own:
                     text = "nothing but slip" if axes is pair[0] else "no slip in this scene"
-                    style: dict[str, Any] = {"color": GREY, "ha": "center"}
+                    look: dict[str, Any] = {"color": style.GREY, "ha": "center"}
                     axes.text(
-                        0.5, lane, text, va="center", transform=axes.get_yaxis_transform(), **style
+                        0.5, lane, text, va="center", transform=axes.get_yaxis_transform(), **look
                     )
-            lanes(axes, ["paper's protocol" if name == "paper" else words(name) for name in scenes])
+            style.lanes(
+                axes,
+                ["paper's protocol" if name == "paper" else style.words(name) for name in scenes],
+            )
         named = {"test": "test cycles of seen materials", "unseen": "unseen materials"}
         pair[0].set_title(named.get(role, role))
     left, right = panels[-1]
@@ -727,11 +711,14 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
     right.set_xlabel("slips found, % of slip bins: more is better")
     handles = [Line2D([], [], color=colours[name], label=name, **dot) for name in colours]
     if any(row["is_trained"] is False for row in rows):
-        labels = {GREY: "trained on other cycles of that scene", "white": "scene not trained on"}
+        labels = {
+            style.GREY: "trained on other cycles of that scene",
+            "white": "scene not trained on",
+        }
         for fill, label in labels.items():
-            handles.append(Line2D([], [], color=GREY, mfc=fill, label=label, **dot))
-    legend_below(figure, handles, 4)
-    save(figure, path)
+            handles.append(Line2D([], [], color=style.GREY, mfc=fill, label=label, **dot))
+    style.legend_below(figure, handles, 4)
+    style.save(figure, path)
 
 
 def _spread(number: int, width: float) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -762,10 +749,10 @@ def reliability_table(metrics: _Metrics) -> str:
         row |= _percents(scores, {"ece": "ECE %", "mce": "worst cell %"})
         row |= {"Brier": f"{scores['brier']:.4f}", "log loss": f"{scores['log_loss']:.4f}"}
         rows.append(row)
-    return marked(metrics["simulated"], table(rows, num_left=2, merged=1))
+    return style.marked(metrics["simulated"], style.table(rows, num_left=2, merged=1))
 
 
-@styled
+@style.styled
 def reliability_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the reliability curve of each role with its counts, and the error of each material.
 
@@ -776,18 +763,19 @@ def reliability_figure(metrics: _Metrics, path: str | Path) -> None:
     rows = _reliabilities(metrics)
     title = "Does a stated probability of slip come true?"
     height = max(5.2, 1.6 + 0.26 * len(rows))
-    figure = new_figure(10.5, height, title, simulated=metrics["simulated"])
+    figure = style.new_figure(10.5, height, title, simulated=metrics["simulated"])
     grid = figure.add_gridspec(2, 2, height_ratios=(4, 1), width_ratios=(1.15, 1))
     curves = figure.add_subplot(grid[0, 0])
     counts = figure.add_subplot(grid[1, 0], sharex=curves)
     errors = figure.add_subplot(grid[:, 1])
     wholes = {role: scores for role, material, scores in rows if not material}
-    colours = colours_of(wholes)
-    curves.plot([0, 1], [0, 1], color=GREY, linewidth=1, linestyle="--", label="as stated")
+    colours = style.colours_of(wholes)
+    curves.plot([0, 1], [0, 1], color=style.GREY, linewidth=1, linestyle="--", label="as stated")
     for aside, (role, scores) in zip(_spread(len(wholes), 0.005), wholes.items(), strict=True):
-        label = f"{role}: {grouped(sum(scores['counts']))} bins, ECE {percent(scores['ece'])} %"
-        style: dict[str, Any] = {"color": colours[role], "linewidth": 1.5, "markersize": 5}
-        curves.plot(scores["probabilities"], scores["slip_shares"], "o-", label=label, **style)
+        number = style.grouped(sum(scores["counts"]))
+        label = f"{role}: {number} bins, ECE {style.percent(scores['ece'])} %"
+        look: dict[str, Any] = {"color": colours[role], "linewidth": 1.5, "markersize": 5}
+        curves.plot(scores["probabilities"], scores["slip_shares"], "o-", label=label, **look)
         at = np.array(scores["probabilities"]) + aside
         counts.bar(at, scores["counts"], width=0.01, color=colours[role])
     curves.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), ylabel="fraction of bins that slip")
@@ -797,12 +785,12 @@ def reliability_figure(metrics: _Metrics, path: str | Path) -> None:
     for lane, (role, material, scores) in enumerate(rows):
         value = 100 * scores["ece"]
         errors.barh(lane, value, color=colours[role], alpha=0.45 if material else 1.0)
-        errors.text(value, lane, f" {value:.2f}", va="center", color=GREY)
-    lanes(errors, [material or f"{role}, all" for role, material, _ in rows])
+        errors.text(value, lane, f" {value:.2f}", va="center", color=style.GREY)
+    style.lanes(errors, [material or f"{role}, all" for role, material, _ in rows])
     errors.margins(x=0.15)
     errors.set_xlim(left=0)
     errors.set_xlabel("expected calibration error, %")
-    save(figure, path)
+    style.save(figure, path)
 
 
 # Prediction sets ---------------------------------------------------------------------------------
@@ -837,10 +825,10 @@ def answers_table(metrics: _Metrics) -> str:
         "class in the mean over recordings of materials that were trained on; nothing is "
         "guaranteed of others"
     )
-    return marked(metrics["simulated"], table(rows), note)
+    return style.marked(metrics["simulated"], style.table(rows), note)
 
 
-@styled
+@style.styled
 def answers_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write how often each class is answered right, with "unsure", and wrong, by role, as a PNG.
 
@@ -851,25 +839,25 @@ def answers_figure(metrics: _Metrics, path: str | Path) -> None:
     answers: Mapping[str, Mapping[str, Any]] = metrics["answers"]
     rows = [(role, truth) for role in answers for truth in (1, 0)]
     title = 'Answers of a detector that may say "unsure"'
-    figure = new_figure(8.4, 1.7 + 0.5 * len(rows), title, simulated=metrics["simulated"])
+    figure = style.new_figure(8.4, 1.7 + 0.5 * len(rows), title, simulated=metrics["simulated"])
     axes = figure.subplots()
-    outcomes = {"right": GREEN, "unsure": "#BBBBBB", "wrong": ALARM}
+    outcomes = {"right": style.GREEN, "unsure": "#BBBBBB", "wrong": style.ALARM}
     for lane, (role, truth) in enumerate(rows):
         unsure, *rest = answers[role]["counts"][truth]
         scale = 100 / max(unsure + sum(rest), 1)
         widths = [scale * count for count in (rest[truth], unsure, rest[1 - truth])]
-        stack(axes, lane, widths, outcomes.values())
-    asked: dict[str, Any] = {"color": INK, "ls": "--", "lw": 1}
+        style.stack(axes, lane, widths, outcomes.values())
+    asked: dict[str, Any] = {"color": style.INK, "ls": "--", "lw": 1}
     for coverage in {scores["coverage"] for scores in answers.values()}:
         axes.axvline(100 * coverage, **asked)
-    lanes(axes, [f"{role}, {CLASSES[truth].replace('_', '-')}" for role, truth in rows])
+    style.lanes(axes, [f"{role}, {CLASSES[truth].replace('_', '-')}" for role, truth in rows])
     axes.grid(visible=False, axis="y")
     axes.set_xlabel("bins of the class, %")
     axes.set_xlim(0, 100)
     handles: list[Any] = [Patch(color=colour, label=label) for label, colour in outcomes.items()]
     limit = "asked: wrong only right of this line"
-    legend_below(figure, [*handles, Line2D([], [], label=limit, **asked)], 4)
-    save(figure, path)
+    style.legend_below(figure, [*handles, Line2D([], [], label=limit, **asked)], 4)
+    style.save(figure, path)
 
 
 # Events: slips found and false alarms ------------------------------------------------------------
@@ -928,36 +916,36 @@ def events_table(metrics: _Metrics) -> str:
         for rule, numbers in by_rule.items():
             hours, latency = numbers["quiet_hours"], numbers["latency_ms"] or {}
             slip_free = f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min"
-            row: _Row = {"events": role, "rule": words(rule), **_event_cells(numbers)}
+            row: _Row = {"events": role, "rule": style.words(rule), **_event_cells(numbers)}
             row |= {
                 "false alarms": _false_alarms(numbers),
                 "slip-free": slip_free if hours else "-",
             }
             rows.append(row | {"alarms a slip": _value(numbers["alarms_per_slip"], 2)})
-            delay: _Row = {"mean delay, ms": role, "rule": words(rule)}
+            delay: _Row = {"mean delay, ms": role, "rule": style.words(rule)}
             for name, title in _LATENCY_PARTS.items():
                 ms = latency.get(name)
                 delay[title] = None if ms is None else f"{ms:.1f}"
             delays.append(delay)
-    lines = [table(rows, num_left=2, merged=1)]
+    lines = [style.table(rows, num_left=2, merged=1)]
     found = [numbers for by_rule in metrics["events"].values() for numbers in by_rule.values()]
     if reasons := dict.fromkeys(of["reason"] for of in found if of.get("reason")):
         lines.append(f"no events: {'; '.join(reasons)}")
     if any(row["compute beside"] for row in delays):
-        lines += ["", table(delays, num_left=2, merged=1)]
-    return marked(metrics["simulated"], *lines)
+        lines += ["", style.table(delays, num_left=2, merged=1)]
+    return style.marked(metrics["simulated"], *lines)
 
 
 def _drawn_events(metrics: _Metrics) -> dict[str, dict[str, Mapping[str, Any]]]:
     """By role, the rules in words that were evaluated on some recording."""
     drawn = {
-        role: {words(rule): own for rule, own in by_rule.items() if own["num_recordings"]}
+        role: {style.words(rule): own for rule, own in by_rule.items() if own["num_recordings"]}
         for role, by_rule in metrics.get("events", {}).items()
     }
     return {role: by_rule for role, by_rule in drawn.items() if by_rule}
 
 
-@styled
+@style.styled
 def events_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write slips found by time since the onset, and what became of all, as a PNG.
 
@@ -971,20 +959,20 @@ def events_figure(metrics: _Metrics, path: str | Path) -> None:
     """
     events = _drawn_events(metrics)
     rules = list(dict.fromkeys(rule for by_rule in events.values() for rule in by_rule))
-    free = [colour for colour in PALETTE if colour not in _OUTCOMES.values()]
+    free = [colour for colour in style.PALETTE if colour not in _OUTCOMES.values()]
     styles: dict[str, dict[str, Any]] = {
         rule: {"color": free[place % len(free)], "ls": ("-", "--", ":")[place // len(free) % 3]}
         for place, rule in enumerate(rules)
     }
     heights = [1.3 + 0.3 * max(2, len(by_rule)) for by_rule in events.values()]
     title = "Which slips are found, how late, and how many alarms are false"
-    figure = new_figure(11.0, 1.3 + sum(heights), title, simulated=metrics["simulated"])
+    figure = style.new_figure(11.0, 1.3 + sum(heights), title, simulated=metrics["simulated"])
     ratios = {"width_ratios": [1.25, 1.0], "height_ratios": heights}
     panels = figure.subplots(len(events), 2, sharex="col", squeeze=False, gridspec_kw=ratios)
     earliest, latest = 0.0, _REFLEX_MS[1]
     for (role, by_rule), (left, right) in zip(events.items(), panels, strict=True):
         left.axvspan(*_REFLEX_MS, color="#F0E6C8", zorder=0, lw=0)
-        lanes(right, list(by_rule), least=2)
+        style.lanes(right, list(by_rule), least=2)
         for lane, (rule, numbers) in enumerate(by_rule.items()):
             if delay := numbers["delay_ms"]:
                 found = 100 * numbers["found"]["value"]
@@ -1004,27 +992,27 @@ def events_figure(metrics: _Metrics, path: str | Path) -> None:
     left.set_xlabel("time since the exact onset, ms (look-ahead within)")
     right.set_xlabel("of all slips, %")
     handles: list[Any] = [Line2D([], [], lw=2, label=rule, **styles[rule]) for rule in rules]
-    handles.append(Line2D([], [], color=GREY, marker="o", ls="", label="median"))
+    handles.append(Line2D([], [], color=style.GREY, marker="o", ls="", label="median"))
     handles.append(Patch(color="#F0E6C8", label="grip reflex of people, 60 to 90 ms"))
     handles += [Patch(color=colour, label=outcome) for outcome, colour in _OUTCOMES.items()]
-    legend_below(figure, handles, 6)
-    save(figure, path)
+    style.legend_below(figure, handles, 6)
+    style.save(figure, path)
 
 
 def _draw_outcomes(axes: Axes, lane: int, numbers: Mapping[str, Any]) -> None:
     """Found, early and missed of a rule in one bar, the false alarms behind it."""
     widths = [100 * (numbers[name] or {"value": 0.0})["value"] for name in _OUTCOMES]
-    stack(axes, lane, widths, _OUTCOMES.values())
-    style: dict[str, Any] = {"va": "center"}
+    style.stack(axes, lane, widths, _OUTCOMES.values())
+    look: dict[str, Any] = {"va": "center"}
     for width, end in zip(widths, np.cumsum(widths), strict=True):
         if width >= 7:
-            axes.text(end - width / 2, lane, f"{width:.1f}", color="white", ha="center", **style)
-    style |= {"xycoords": axes.get_yaxis_transform(), "annotation_clip": False}
-    axes.annotate(f"false alarms {_false_alarms(numbers)}", (1.02, lane), **style)
+            axes.text(end - width / 2, lane, f"{width:.1f}", color="white", ha="center", **look)
+    look |= {"xycoords": axes.get_yaxis_transform(), "annotation_clip": False}
+    axes.annotate(f"false alarms {_false_alarms(numbers)}", (1.02, lane), **look)
 
 
 # Alarm at a given false-alarm rate ---------------------------------------------------------------
-_STREAMS = {"test": ("seen materials", BLUE), "unseen": ("unseen materials", VERMILION)}
+_STREAMS = {"test": ("seen materials", style.BLUE), "unseen": ("unseen materials", style.VERMILION)}
 _LEAST_RATE = 0.1  # an hour: where the figure's axis begins, and rates of 0 are drawn
 
 
@@ -1049,7 +1037,7 @@ def rate_rows(metrics: _Metrics) -> list[_Row]:
                 reached = f"{rate['value']:.2f} {ends} in {hours:.1f} h"
                 against = "more" if rate["low"] > target else "as asked"
                 against = "fewer" if rate["high"] < target else against
-            row: _Row = {"materials": materials, "method": words(method)}
+            row: _Row = {"materials": materials, "method": style.words(method)}
             row |= {"false alarms an hour without slip": reached, "against target": against}
             rows.append(row | _event_cells(numbers))
     return rows
@@ -1077,10 +1065,10 @@ def target_line(metrics: _Metrics) -> str:
         if row["is_share"]:
             limit, amount = f"{100 * row['limit']:g} % of knocks", f"{row['amount']} knocks"
         few = f"{row['alarms']} of {row['allowed']} allowed in {amount}"
-        parts.append(f"{words(row['scene'])} {limit} ({few})")
+        parts.append(f"{style.words(row['scene'])} {limit} ({few})")
     return (
         f"budget of false alarms, at {100 * metadata['confidence']:g} % confidence: "
-        f"{', '.join(parts)}; {words(alarm['rule'])} is what the detector's file has"
+        f"{', '.join(parts)}; {style.words(alarm['rule'])} is what the detector's file has"
     )
 
 
@@ -1099,22 +1087,22 @@ def budget_rows(metrics: _Metrics) -> list[_Row]:
         cells = found.setdefault(
             (row["scene"], row["role"]),
             {
-                "scene": words(row["scene"]),
+                "scene": style.words(row["scene"]),
                 "materials": {"test": "seen"}.get(row["role"], row["role"]),
                 "budget": f"{factor * row['limit']:g} {unit}",
                 "of": amount,
             },
         )
         value, low, high = (factor * row[name] for name in ("rate", "low", "high"))
-        cells[words(row["method"])] = f"{value:.2f} [{low:.2f}, {high:.2f}]"
+        cells[style.words(row["method"])] = f"{value:.2f} [{low:.2f}, {high:.2f}]"
     return list(found.values())
 
 
 def alarm_table(metrics: _Metrics) -> str:
     """``target_line``, ``rate_rows`` and ``budget_rows`` for the terminal."""
-    rows = table(rate_rows(metrics), num_left=2, merged=1)
-    budget = table(budget_rows(metrics), num_left=3)
-    return marked(metrics["simulated"], target_line(metrics), rows, budget)
+    rows = style.table(rate_rows(metrics), num_left=2, merged=1)
+    budget = style.table(budget_rows(metrics), num_left=3)
+    return style.marked(metrics["simulated"], target_line(metrics), rows, budget)
 
 
 def scene_rows(metrics: _Metrics) -> list[_Row]:
@@ -1134,11 +1122,11 @@ def scene_rows(metrics: _Metrics) -> list[_Row]:
     for scene, by_role in alarm["scenes"].items():
         for role in (role for role in by_role if role != "trained"):
             numbers = by_role[role][alarm["rule"]]
-            row: _Row = {"scene": words(scene), "materials": {"test": "seen"}.get(role, role)}
+            row: _Row = {"scene": style.words(scene), "materials": {"test": "seen"}.get(role, role)}
             row |= {"trained on": bool(by_role["trained"])}
             row |= {"quiet min": f"{60 * numbers['quiet_hours']:.0f}"}
             rate = _value(numbers["false_alarms_per_hour"], 1)
-            row |= {f"{words(alarm['rule'])} /h": rate} | _event_cells(numbers, digits=0)
+            row |= {f"{style.words(alarm['rule'])} /h": rate} | _event_cells(numbers, digits=0)
             del row["p95 ms"], row["from first release ms"]
             for name in beside:
                 row[f"{name} /h"] = _value(by_role[role][name]["false_alarms_per_hour"], 1)
@@ -1148,10 +1136,10 @@ def scene_rows(metrics: _Metrics) -> list[_Row]:
 
 def _scenes_table(metrics: _Metrics) -> str:
     """``scene_rows`` for the terminal."""
-    return marked(metrics["simulated"], table(scene_rows(metrics), num_left=2))
+    return style.marked(metrics["simulated"], style.table(scene_rows(metrics), num_left=2))
 
 
-@styled
+@style.styled
 def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the false-alarm rates that were reached, and those of every scene, as a PNG.
 
@@ -1163,7 +1151,7 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
     scenes, target = alarm["scenes"], alarm["settings"]["target_per_hour"]
     title = f"Without slip at most {target:g} false alarms an hour (dashed)"
     height = 2.2 + 0.5 * max(len(alarm["methods"]), len(scenes))
-    figure = new_figure(12.0, height, title, simulated=metrics["simulated"])
+    figure = style.new_figure(12.0, height, title, simulated=metrics["simulated"])
     left, right = figure.subplots(1, 2)
     quiet = {role: _quiet_rates(metrics, role) for role in _STREAMS}
     methods = [name for name in alarm["methods"] if any(name in rates for rates in quiet.values())]
@@ -1178,20 +1166,22 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
         ]
         _draw_rates(right, of_scenes, aside, colour)
     left.set_title(f"Without slip: {' and '.join(hours)}")
-    left.axvline(target, color=INK, linewidth=1, linestyle="--", zorder=1)
-    what = f"Confounding scenes, by {words(alarm['rule'])} (bars: their budgets)"
+    left.axvline(target, color=style.INK, linewidth=1, linestyle="--", zorder=1)
+    what = f"Confounding scenes, by {style.words(alarm['rule'])} (bars: their budgets)"
     right.set_title(what)
     limits = {row["scene"]: row["limit"] for row in alarm["budget"] if not row["is_share"]}
     for lane, scene in enumerate(scenes):
         if scene in limits:
-            right.plot([limits[scene]] * 2, [lane - 0.35, lane + 0.35], color=INK, linewidth=1.6)
+            right.plot(
+                [limits[scene]] * 2, [lane - 0.35, lane + 0.35], color=style.INK, linewidth=1.6
+            )
     for axes, names in ((left, methods), (right, scenes)):
-        lanes(axes, list(map(words, names)))
+        style.lanes(axes, list(map(style.words, names)))
         axes.set_xscale("log")
         axes.set_xlim(left=0.8 * _LEAST_RATE)
         axes.set_xlabel("false alarms an hour, with interval (none: at the left edge)")
     left.legend(loc="best")
-    save(figure, path)
+    style.save(figure, path)
 
 
 def _draw_rates(
