@@ -147,7 +147,7 @@ def named(certificate, name):
 
 def test_a_sound_detector_holds():
     found = certified(small_detector(), held_out={"test": raw_bins(40, seed=7)})
-    assert found.holds
+    assert found.content["holds"]
     assert [row["holds"] for row in found.content["conditions"]] == [True] * 11
     json.dumps(found.content, allow_nan=False)
 
@@ -164,7 +164,7 @@ def test_held_out_bins_that_turn_refute():
     row = found.content["sets"]["test"]
     exact = liar.predict_raw(new).score.detach().abs()
     assert row["flips"]["outside_margin"] == int((exact > row_margin(found)).sum()) > 0
-    assert not found.holds
+    assert not found.content["holds"]
     assert named(found, "test: flips outside the margin")["holds"] is False
     assert named(found, "test: worst error, sd")["holds"] is False
     assert named(found, "calibration: flips outside the margin")["holds"] is True
@@ -259,7 +259,7 @@ def test_a_head_that_overflows_does_not_hold():
     assert named(found, "extremes: scores that are not finite")["found"] == silent > 0
     assert named(found, "extremes: scores that are not finite")["holds"] is False
     assert facts["conditions"][0]["holds"] is False
-    assert not found.holds
+    assert not found.content["holds"]
 
 
 @pytest.mark.parametrize(
@@ -282,7 +282,7 @@ def test_a_bound_far_above_the_worst_seen_does_not_hold():
     assert row["found"] == head["bound"] / head["worst_seen"] > LARGEST_RATIO
     assert row["wanted"] == "<= 10000"
     assert row["holds"] is False
-    assert not found.holds
+    assert not found.content["holds"]
 
 
 def test_a_held_out_set_does_not_replace_one_of_ours():

@@ -14,7 +14,7 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -184,33 +184,17 @@ def _tapped(detector: SlipDetector, samples: Tensor) -> tuple[Tensor, Tensor]:
     return taken[0], taken[1]
 
 
-@dataclass(frozen=True, eq=False)
-class Certificate:
+class Certificate(NamedTuple):
     """What ``certify`` found.
 
-    Args:
+    Attributes:
         content: everything that was found, as plain values; infinite where the head overflows.
+            ``holds`` says whether no condition failed.
         sets: ``calibration``, the held-out ones and the kinds of extremes, bin by bin.
     """
 
-    content: Mapping[str, Any]
+    content: dict[str, Any]
     sets: Mapping[str, Comparison]
-
-    @property
-    def holds(self) -> bool:
-        """Whether no condition failed."""
-        return bool(self.content["holds"])
-
-    def points(self) -> dict[str, dict[str, list[Any]]]:
-        """By set and kind, of each bin ``score`` (its size), ``error`` and whether it ``flips``."""
-        return {
-            name: {
-                "score": compared.exact.abs().tolist(),
-                "error": compared.error.tolist(),
-                "flips": compared.flips.tolist(),
-            }
-            for name, compared in self.sets.items()
-        }
 
 
 def certify(

@@ -7,12 +7,10 @@ ignore (the look-ahead of a film, 2.5 ms) another may not. Bins that straddle th
 slip earlier; nothing here counts on it.
 
 *Computing* is timed with one bin and one thread, as a live loop calls it, from raw samples to the
-decision; ``python -m tactslip_torch.analysis.latency detector.pt [calls [backend]]`` prints a line
-of JSON, p50 and p99 in microseconds. Calls in which the system gave the processor to someone else
-(an involuntary context switch, where the system counts them) are left out, and their fraction is
-reported, as is the p99 of all calls with them: what they took says how busy the machine was, and a
-robot keeps a processor for its loop. The bins are ordinary ones: one with a NaN goes another way,
-which takes longer.
+decision. Calls in which the system gave the processor to someone else (an involuntary context
+switch, where the system counts them) are left out, and their fraction is reported, as is the p99 of
+all calls with them: what they took says how busy the machine was, and a robot keeps a processor for
+its loop. The bins are ordinary ones: one with a NaN goes another way, which takes longer.
 
 *A cost model* prunes searches. A detector needs parts: a film that is read, a branch that is
 formed, its spectrum, a sort, a number that the machine takes. It costs the sum over the parts it
@@ -23,17 +21,15 @@ bin and one thread; what is stated of a detector is timed by itself.
 
 from __future__ import annotations
 
-import json
 import math
+import multiprocessing
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from statistics import median, median_high
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -253,15 +249,16 @@ def time_in_fresh_process(
     """``time_detector`` of a saved detector in a process that has done nothing else.
 
     Raises:
-        ValueError: if that process fails; its last line is named.
+        Exception: what that process raised.
     """
-    command = [sys.executable, "-m", "tactslip_torch.analysis.latency", os.fspath(path), str(calls)]
-    command.append(backend)
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        said = (done.stderr.strip() or f"exit status {done.returncode}").splitlines()[-1]
-        raise ValueError(f"timing {os.fspath(path)} in a fresh process failed: {said}")
-    return Timing(**json.loads(done.stdout.splitlines()[-1]))
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, context) as process:
+        return process.submit(_time_saved, path, calls, backend).result()
+
+
+def _time_saved(path: str | os.PathLike[str], calls: int, backend: BackendName) -> Timing:
+    with one_thread():
+        return time_detector(SlipDetector.load(path, backend), calls, runs=5)
 
 
 def _p99(taken_ns: Sequence[int]) -> float:
@@ -504,20 +501,3 @@ def _spread(items: Sequence[Any], number: int) -> list[Any]:
     """So many of the items, evenly."""
     number = min(number, len(items))
     return [items[place * len(items) // number] for place in range(number)]
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Print the timing of a saved detector as a line of JSON."""
-    if not 1 <= len(arguments) <= 3:
-        raise SystemExit(
-            "usage: python -m tactslip_torch.analysis.latency detector.pt [calls [backend]]"
-        )
-    path, calls, backend = [*arguments, *("1000", "auto")[len(arguments) - 1 :]]
-    with one_thread():
-        detector = SlipDetector.load(Path(path), cast(BackendName, backend))
-        timing = time_detector(detector, int(calls), runs=5)
-    print(json.dumps(timing._asdict()))
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

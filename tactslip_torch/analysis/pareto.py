@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,6 +35,7 @@ from tactslip_torch.analysis.latency import (
     time_detector,
 )
 from tactslip_torch.analysis.raw_bins import bins_inside
+from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
 from tactslip_torch.deploy.bins import bin_graph
 from tactslip_torch.deploy.check import session_of
@@ -394,8 +396,7 @@ class ParetoSearch:
                 "search.components"
             )
         self.makers, self.fold, self.search = makers, fold, search
-        offset = recipe.offsets[0] if isinstance(recipe.offsets, Sequence) else recipe.offsets
-        self._offset = float(offset)
+        self._offset = float(np.ravel(recipe.offsets)[0])
         self.recipe = replace(
             recipe, sample_bins=search.bins, kernel="polynomial", offsets=self._offset
         )
@@ -413,17 +414,13 @@ class ParetoSearch:
 
     def read(self) -> None:
         """One pass over the training recordings for each alignment; then measure costs."""
-        for align, data in self._data.items():
+        for align in self._data:
             statistics = TrainingStatistics(len(self.pool.names), self.search.bins)
-            with one_thread():  # the processors belong to those who make features
-                for batch in bar(data.loader(["train"]), f"features, {align}", "recording"):
-                    mask, group = batch.roles["train"], self.recipe.group(batch.recording)
-                    name = str(batch.recording)
-                    statistics.update(name, group, batch.features[mask], batch.is_slip[mask])
-            self.training_statistics[align], self._samples[align] = (
-                statistics,
-                statistics.sample.bins(),
-            )
+            for recording, features, is_slip in self._training(align, f"features, {align}"):
+                group = self.recipe.group(recording)
+                statistics.update(str(recording), group, features, is_slip)
+            self.training_statistics[align] = statistics
+            self._samples[align] = statistics.sample.bins()
         self.costs = measure_costs(
             self.pool,
             next(iter(self.makers.values())).channel_filter,
@@ -433,6 +430,13 @@ class ParetoSearch:
             calls=max(self.search.calls // 4, 10),
         )
         self._bill = self.costs.bill(self._needed)
+
+    def _training(self, align: Align, what: str) -> Iterator[tuple[RecordingId, Tensor, Tensor]]:
+        """Features of the training bins of each recording, and whether they are slip."""
+        with one_thread():  # the processors belong to those who make features
+            for batch in bar(self._data[align].loader(["train"]), what, "recording"):
+                mask = batch.roles["train"]
+                yield batch.recording, batch.features[mask], batch.is_slip[mask]
 
     def candidates(self) -> list[Candidate]:
         """All candidates, in an order that does not depend on the number of threads.
@@ -607,26 +611,19 @@ class ParetoSearch:
 
     def make(self, candidate: Candidate, *, from_all: bool = False) -> SlipDetector:
         """The detector of a candidate, fitted to the sample or to all training bins."""
-        statistics, data = (
-            self.training_statistics[candidate.group.align],
-            self._data[candidate.group.align],
-        )
+        align, size = candidate.group.align, candidate.selection.size
+        statistics = self.training_statistics[align]
         recipe = replace(
-            self.recipe,
-            num_features=candidate.selection.size,
-            degree=candidate.degree,
-            penalties=candidate.penalty,
+            self.recipe, num_features=size, degree=candidate.degree, penalties=candidate.penalty
         )
         plan = plan_detector(recipe, statistics, self.pool, candidate.selection)
-        if from_all and not (candidate.degree == 2 and plan.selection.size > self.most_summed):
+        if from_all and not (candidate.degree == 2 and size > self.most_summed):
             gathered = TrainingPass(plan)
-            with one_thread():
-                for batch in bar(data.loader(["train"]), "the machine, all bins", "recording"):
-                    mask, name = batch.roles["train"], str(batch.recording)
-                    gathered.update(name, batch.features[mask], batch.is_slip[mask])
+            for recording, features, is_slip in self._training(align, "the machine, all bins"):
+                gathered.update(str(recording), features, is_slip)
             head, bins = gathered.solve(), "all training bins"
         else:
-            training = plan.training_bins(statistics.sample.bins())
+            training = plan.training_bins(self._samples[align])
             head = fit_machine(training, plan.penalty, plan.kernel)
             bins = f"{self.search.bins} training bins of each material and class"
         info = plan.metadata | training_origin(self.source, self.fold)
@@ -637,7 +634,8 @@ class ParetoSearch:
         }
         facts = self.pool.facts() | {"arithmetic": candidate.arithmetic}
         pool = FeaturePool(self.pool.hand, **facts)
-        return plan.detector(pool, data.maker.channel_filter, head, info, self.backend)
+        channel_filter = self.makers[align].channel_filter
+        return plan.detector(pool, channel_filter, head, info, self.backend)
 
     def evaluated(self, detector: SlipDetector) -> dict[str, Any]:
         """Balanced accuracy on raw bins of the test cycles, scored as a live loop would."""

@@ -95,7 +95,7 @@ def certify(config: DictConfig) -> dict[str, Any]:
         "versions": versions(),
     }
     write_json(folder / "certificate.json", content)
-    certificate_figure(content, found.points(), folder / "certificate.png")
+    certificate_figure(content, found.sets, folder / "certificate.png")
     return content
 
 

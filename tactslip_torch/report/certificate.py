@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from tactslip_torch.report import style
-
-Points = Mapping[str, Mapping[str, Sequence[Any]]]
-"""By set or kind, of each bin ``score`` (its size), its ``error`` and whether it ``flips``."""
 
 _BAD = "#B84300"
 _VALID, _FLAGGED = np.array([0.34, 0.62, 0.80]), np.array([0.78, 0.78, 0.78])
@@ -38,17 +35,19 @@ def conclusion(content: Mapping[str, Any]) -> str:
 
 
 @style.styled
-def certificate_figure(content: Mapping[str, Any], points: Points, path: str | Path) -> None:
+def certificate_figure(
+    content: Mapping[str, Any], sets: Mapping[str, Any], path: str | Path
+) -> None:
     """Write error against ``|score|`` with margin and bound, and errors of generated extremes.
 
     Args:
         content: of ``certificate.json``.
-        points: of every set.
+        sets: by name its bins: ``exact`` scores, size of the ``error`` and whether it ``flips``.
         path: the PNG to write, replaced as a whole if it exists.
     """
     figure = style.new_figure(11.0, 4.9)
     left, right = figure.subplots(1, 2, width_ratios=[1.15, 1])
-    _scatter(left, content, {name: points[name] for name in content["sets"]})
+    _scatter(left, content, {name: sets[name] for name in content["sets"]})
     _bars(right, content["extremes"])
     kind = "SIMULATED recordings" if content["simulated"] else "recordings"
     left.set_title(f"(a) every bin of {kind}")
@@ -56,23 +55,21 @@ def certificate_figure(content: Mapping[str, Any], points: Points, path: str | P
     style.save(figure, path, dpi=170)
 
 
-def _scatter(axes: Axes, content: Mapping[str, Any], points: Points) -> None:
+def _scatter(axes: Axes, content: Mapping[str, Any], sets: Mapping[str, Any]) -> None:
     """Above the diagonal an error is larger than its score: only there a decision can flip."""
-    scores, errors = (
-        np.concatenate([own[key] for own in points.values()]) for key in ("score", "error")
-    )
+    scores = np.concatenate([own.exact.abs() for own in sets.values()])
+    errors = np.concatenate([own.error for own in sets.values()])
     margin, bound = content["margin"]["score"], content["head"]["bound"]
     known = [value for value in (margin, bound) if value]
     floor = _least_positive([*errors.tolist(), *known])
     low = _least_positive([*scores.tolist(), *known]) / 2
     high = 2 * max(scores.max(), *known, 1e-300)
     top = 5 * max(np.max(errors, where=np.isfinite(errors), initial=floor), *known, floor)
-    colours = style.colours_of(points)
-    for name, own in points.items():
-        x, y = np.maximum(own["score"], low), np.clip(own["error"], floor, top / 1.5)
+    colours = style.colours_of(sets)
+    for name, own in sets.items():
+        x, y = np.maximum(own.exact.abs(), low), np.clip(own.error, floor, top / 1.5)
         axes.scatter(x, y, s=5, color=colours[name], alpha=0.45, linewidths=0, label=name)
-        flipped = np.asarray(own["flips"], dtype=bool)
-        axes.scatter(x[flipped], y[flipped], s=34, marker="x", color=_BAD, zorder=4)
+        axes.scatter(x[own.flips], y[own.flips], s=34, marker="x", color=_BAD, zorder=4)
     axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(floor / 2, top))
     axes.minorticks_off()  # of hundreds of decades they take seconds
     axes.plot([low, high], [low, high], color=style.GREY, linewidth=0.9, linestyle=":")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 PAPER = "He et al. 2026, arXiv:2603.18370"
 
@@ -27,16 +26,14 @@ class PublishedSplit:
     slip_recall: float | None = None
 
 
-SPLITS: Mapping[str, PublishedSplit] = MappingProxyType(
-    {
-        # section V-B, text: six seen materials
-        "train": PublishedSplit(accuracy=0.9659),
-        # section V-B, text and figure 6; balanced accuracy is the mean of the two recalls
-        "test": PublishedSplit(0.9639, 0.9555, 0.938, 0.973),
-        # section V-C, text and figure 8: wood, iron, copper, cloth
-        "unseen": PublishedSplit(0.9195, 0.8605, 0.744, 0.977),
-    }
-)
+SPLITS: Mapping[str, PublishedSplit] = {
+    # section V-B, text: six seen materials
+    "train": PublishedSplit(accuracy=0.9659),
+    # section V-B, text and figure 6; balanced accuracy is the mean of the two recalls
+    "test": PublishedSplit(0.9639, 0.9555, 0.938, 0.973),
+    # section V-C, text and figure 8: wood, iron, copper, cloth
+    "unseen": PublishedSplit(0.9195, 0.8605, 0.744, 0.977),
+}
 
 
 LARGER_CLASS = 0.753
@@ -47,17 +44,13 @@ BINS_PER_MINUTE = 20 * 60
 
 NUM_SELECTED = 120
 
-SELECTED_BY_KIND: Mapping[str, int] = MappingProxyType({"SG": 6, "PVDF": 114})
+SELECTED_BY_KIND: Mapping[str, int] = {"SG": 6, "PVDF": 114}
 """Figure 7(a)."""
 
-SELECTED_BY_FINGER: Mapping[str, Mapping[str, int]] = MappingProxyType(
-    {
-        "SG": MappingProxyType({"little": 0, "ring": 2, "middle": 4, "index": 0, "thumb": 0}),
-        "PVDF": MappingProxyType(
-            {"little": 15, "ring": 21, "middle": 17, "index": 48, "thumb": 13}
-        ),
-    }
-)
+SELECTED_BY_FINGER: Mapping[str, Mapping[str, int]] = {
+    "SG": {"little": 0, "ring": 2, "middle": 4, "index": 0, "thumb": 0},
+    "PVDF": {"little": 15, "ring": 21, "middle": 17, "index": 48, "thumb": 13},
+}
 """Figure 7(c), by sensor kind."""
 
 
