@@ -197,7 +197,7 @@ def test_errors_beyond_the_limit_do_not_hold():
     )
     name = "calibration: worst error, sd"
     assert 1e-5 < named(fine, name)["found"] <= WORST_SD < named(coarse, name)["found"]
-    assert (fine.holds, coarse.holds) == (True, False)
+    assert (fine.content["holds"], coarse.content["holds"]) == (True, False)
 
 
 @pytest.mark.parametrize("jumps", [False, True])

@@ -208,15 +208,15 @@ def test_the_figures_show_each_material_filtered(tmp_path, drawn):
     run(tmp_path, "cycle=1", "features.frames.SG=31", figure=True)
     assert set(drawn) == {"recordings_paper.png", "onset_paper.png"}
     whole, near = drawn["recordings_paper.png"], drawn["onset_paper.png"]
-    assert [row.title for row in whole[0]] == ["A", "B"]
-    for row in whole[0]:
-        content, hand, _ = FORMATS["npz"].load(tmp_path / f"{row.title}_paper_01.npz")
+    assert [title for title, _ in whole[0]] == ["A", "B"]
+    for title, row in whole[0]:
+        content, hand, _ = FORMATS["npz"].load(tmp_path / f"{title}_paper_01.npz")
         assert whole[1] == hand.to_rows()
         for channel, raw, seen in zip(hand.channels, content.samples, row.samples, strict=True):
             frame = 31 if channel.kind == "SG" else 11
             np.testing.assert_allclose(seen, savgol(raw.double().numpy(), frame), atol=1e-12)
         assert row.onsets_s == content.onsets_s
-        assert row.slip_s == content.sliding_s
+        assert row.sliding_s == content.sliding_s
     assert whole[2] == near[2] == "Recordings: scene paper, cycle 1"
     assert whole[3] is None
     assert near[3] == [(pytest.approx(1.1), 4.5)] * 2  # two seconds before 3.1 s, to the end

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_hex
 
 from tactslip_torch.report.onset import (
-    ALARM,
     REST,
     SLIP,
     DecisionCounts,
@@ -21,6 +20,7 @@ from tactslip_torch.report.onset import (
     onsets_table,
     view_of,
 )
+from tactslip_torch.report.style import ALARM
 
 RATE_HZ, HOP_S = 2000.0, 0.01
 seeds = st.integers(0, 2**32 - 1)

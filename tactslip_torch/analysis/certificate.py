@@ -413,33 +413,32 @@ def _conditions(content: Mapping[str, Any]) -> list[dict[str, Any]]:
     def check(name: str, found: float | None, wanted: str, holds: bool | None) -> None:
         rows.append({"name": name, "found": found, "wanted": wanted, "holds": holds})
 
-    head = content["head"]
+    def at_most(name: str, found: float | None, most: float, remedy: str = "") -> None:
+        check(name, found, f"<= {most:g}{remedy}", None if found is None else found <= most)
+
+    def none(name: str, count: int) -> None:
+        check(name, count, "0", count == 0)
+
+    head, margin, edge = content["head"], content["margin"], content["boundary"]
     seen, bound = head["worst_seen"], head["bound"]
     wanted = "a bound: this head has none" if bound is None else f"<= {bound:.2e}, its bound"
     within = None
     if bound is not None:  # what it is compared with is rounded as well
         within = seen <= bound + head["reference_bound"] and not head["overflows"]
     check("error of the head, worst seen", seen, wanted, within)
-    tight = None if head["ratio"] is None else head["ratio"] <= LARGEST_RATIO
-    check("bound of the head / worst seen", head["ratio"], f"<= {LARGEST_RATIO:g}", tight)
-    margin, edge = content["margin"], content["boundary"]
-    wanted = f"<= {MOST_MARGIN_SD:g}" + (f" ({REMEDY})" if margin["jump"] > 0 else "")
-    check("margin, sd", margin["sd"], wanted, margin["sd"] <= MOST_MARGIN_SD)
+    at_most("bound of the head / worst seen", head["ratio"], LARGEST_RATIO)
+    at_most("margin, sd", margin["sd"], MOST_MARGIN_SD, f" ({REMEDY})" * (margin["jump"] > 0))
     if edge is not None:
-        turned = edge["outside_margin"]
-        check("bins where float32 turns: flips outside the margin", turned, "0", turned == 0)
+        none("bins where float32 turns: flips outside the margin", edge["outside_margin"])
     for name, facts in content["sets"].items():
-        worst = facts["error"]["worst_sd"]
-        check(f"{name}: worst error, sd", worst, f"<= {WORST_SD:g}", worst <= WORST_SD)
-        flips = facts["flips"]["outside_margin"]
-        check(f"{name}: flips outside the margin", flips, "0", flips == 0)
+        at_most(f"{name}: worst error, sd", facts["error"]["worst_sd"], WORST_SD)
+        none(f"{name}: flips outside the margin", facts["flips"]["outside_margin"])
         if name != "calibration":
             share = facts["inside_margin"]["share"]
             wanted = f"< {INSIDE_SHARE:g}"
             check(f"{name}: share inside the margin", share, wanted, share < INSIDE_SHARE)
     kinds = content["extremes"].values()
     flips = sum(facts["flips"]["outside_margin_valid"] for facts in kinds)
-    check("valid extremes: flips outside the margin", flips, "0", flips == 0)
-    silent = sum(facts["not_finite"] for facts in kinds)
-    check("extremes: scores that are not finite", silent, "0", silent == 0)
+    none("valid extremes: flips outside the margin", flips)
+    none("extremes: scores that are not finite", sum(facts["not_finite"] for facts in kinds))
     return rows

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from hydra.utils import get_object, instantiate
@@ -20,10 +21,8 @@ from tactslip_torch.commands.entry import entry_point, fail, one_line
 from tactslip_torch.data.file_recordings import FileRecordings, Inspected
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest, write_template
 from tactslip_torch.data.manifest import Problem
-from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.report.recordings import (
-    DrawnRecording,
-    Trial,
     dataset_figure,
     ranges_table,
     trials_table,
@@ -60,7 +59,7 @@ def check(config: DictConfig) -> int:
     return len(problems)
 
 
-def summary(config: DictConfig) -> list[Trial]:
+def summary(config: DictConfig) -> list[dict[str, Any]]:
     """Print what a set holds, and draw it; what is told of each recording.
 
     Raises:
@@ -71,7 +70,7 @@ def summary(config: DictConfig) -> list[Trial]:
     hand = source.hand  # refuses a set of which nothing can be read
     trials = [_trial(source, recording) for recording in source.ids]
     print("\n" + trials_table(trials, simulated=source.is_simulated))
-    if any(trial.num_onsets for trial in trials):
+    if any(trial["num_onsets"] for trial in trials):
         print("labels= takes up to a second before each onset as non-slip; it is not counted here")
     ranges = np.full((len(hand), 2), np.nan)
     if config.samples:
@@ -203,36 +202,27 @@ def _number(of: Sequence[object], what: str) -> str:
     return f"{len(of)} {what}{'' if len(of) == 1 else 's'}"
 
 
-def _trial(source: FileRecordings, recording: RecordingId) -> Trial:
+def _trial(source: FileRecordings, recording: RecordingId) -> dict[str, Any]:
     times = source.timeline(recording)
-    return Trial(
-        recording.material,
-        recording.scene,
-        times.duration_s,
-        sum(end - start for start, end in (*times.sliding_s, *times.slip_s)),
-        sum(end - start for start, end in times.non_slip_s),
-        len(times.onsets_s),
-    )
+    return {
+        "material": recording.material,
+        "scene": recording.scene,
+        "duration_s": times.duration_s,
+        "slip_s": sum(end - start for start, end in (*times.sliding_s, *times.slip_s)),
+        "non_slip_s": sum(end - start for start, end in times.non_slip_s),
+        "num_onsets": len(times.onsets_s),
+    }
 
 
-def _example(source: FileRecordings) -> DrawnRecording:
-    """The first recording of which most is told."""
+def _example(source: FileRecordings) -> tuple[str, Recording]:
+    """The first recording of which most is told, and what it is called."""
 
     def told(recording: RecordingId) -> int:
         times = source.timeline(recording)
         return bool(times.onsets_s or times.slip_s) + bool(times.non_slip_s)
 
     recording = max(source.ids, key=told)
-    content = source.load(recording)
-    return DrawnRecording(
-        f"{recording} ({source.entry(recording).file})",
-        content.samples,
-        content.sample_rate_hz,
-        content.onsets_s,
-        (*content.sliding_s, *content.slip_s),
-        content.non_slip_s,
-        content.units,
-    )
+    return f"{recording} ({source.entry(recording).file})", source.load(recording)
 
 
 def _act(config: DictConfig, _: Path) -> None:

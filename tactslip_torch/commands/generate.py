@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written, write_manifest
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.features.cache import source_digest
-from tactslip_torch.report.recordings import DrawnRecording, signals_figure, written_table
+from tactslip_torch.report.recordings import signals_figure, view_around, written_table
 from tactslip_torch.runtime import bar, in_processes, num_processes
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.experiment import frame_lengths, save_config
@@ -103,13 +104,12 @@ def _draw(
     for recording in recordings:
         content, hand, _ = files.load(recording)
         volts = channel_filter(content.samples.double())
-        truth = content.onsets_s, content.sliding_s, content.non_slip_s
-        rows.append(DrawnRecording(recording.material, volts, content.sample_rate_hz, *truth))
+        rows.append((recording.material, replace(content, samples=volts)))
     origin = content.provenance
     known = [f"{name} {origin[name]}" for name in ("fidelity", "seed") if name in origin]
     what = "SIMULATED recordings" if origin.get("simulated") else "Recordings"
     title = ", ".join([f"{what}: scene {scene}", f"cycle {recordings[0].cycle}", *known])
-    views = [row.around(stroke, BEFORE_S, AFTER_S) for row in rows]
+    views = [view_around(row, stroke, BEFORE_S, AFTER_S) for _, row in rows]
     for name, seen in ((f"recordings_{scene}.png", None), (f"onset_{scene}.png", views)):
         signals_figure(rows, hand.to_rows(), files.folder / name, title=title, views=seen)
 

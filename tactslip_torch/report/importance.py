@@ -216,8 +216,7 @@ def _best_few(axes: Axes, content: Mapping[str, Any]) -> None:
     title = f"(d) the best few, in the order in which they serve held-out groups; features {how}"
     axes.set_title(title)
     axes.set_ylabel("balanced accuracy, %")
-    text = "bands: 95 % intervals of the difference to all sensors, over recordings"
-    axes.set_xlabel(text)
+    axes.set_xlabel("bands: 95 % intervals of the difference to all sensors, over recordings")
     axes.legend(loc="best", ncols=2)
 
 

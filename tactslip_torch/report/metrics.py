@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from tactslip_torch.report.published import PAPER_SCENE
 
+_Label = TypeVar("_Label", str, int)
 _FIRST, _LAST = -20, 19
 POSITIONS = (f"<{_FIRST}", *map(str, range(_FIRST, _LAST + 1)), f"{_LAST + 1}+")
 """Places beside an onset that ``bin_metrics`` counts, earliest first."""
@@ -41,8 +42,8 @@ def confusion_matrix(is_slip_true: Tensor, is_slip_predicted: Tensor) -> list[li
             f"got {len(is_slip_true)} and {len(is_slip_predicted)} bins"
         )
     cells = torch.bincount(2 * is_slip_true.long() + is_slip_predicted.long(), minlength=4)
-    (quiet_right, false_slip, missed_slip, slip_right) = cells.tolist()
-    return [[quiet_right, false_slip], [missed_slip, slip_right]]
+    counts: list[list[int]] = cells.view(2, 2).tolist()
+    return counts
 
 
 def split_metrics(confusion: Sequence[Sequence[int]]) -> dict[str, Any]:
@@ -134,11 +135,10 @@ def bin_metrics(
     }
     if positions is not None:
         is_right = is_slip_true == is_slip_predicted
-        places = _members([_position_label(place) for place in positions], counted)
+        places = [p if p is None else min(max(p, _FIRST - 1), _LAST + 1) for p in positions]
         groups["per_position"] = {
-            label: _recall(int(is_right[places[label]].sum()), len(places[label]))
-            for label in POSITIONS
-            if label in places
+            POSITIONS[place - _FIRST + 1]: _recall(int(is_right[rows].sum()), len(rows))
+            for place, rows in sorted(_members(places, counted).items())
         }
     return {**whole, **groups}
 
@@ -166,10 +166,8 @@ def merged_metrics(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         if not any(kind in own for own in scores):
             continue
         having = [own[kind] for own in (scores if kind == "per_scene" else counted) if kind in own]
-        by_label: dict[str, list[Mapping[str, Any]]] = {}
-        for group in having:
-            for label, of_label in group.items():
-                by_label.setdefault(label, []).append(of_label)
+        labels = dict.fromkeys(label for group in having for label in group)
+        by_label = {label: [group[label] for group in having if label in group] for label in labels}
         if kind == "per_position":
             groups[kind] = {
                 label: _recall(
@@ -308,22 +306,15 @@ def weights_at_share(is_slip: Tensor, slip_share: float) -> Tensor:
     return weights.masked_fill(is_slip.cpu(), slip_share / own)
 
 
-def _members(labels: Sequence[str], counted: Sequence[bool] | None = None) -> dict[str, list[int]]:
-    """Rows of the counted bins by label, labels in order of appearance."""
-    members: dict[str, list[int]] = {}
+def _members(
+    labels: Sequence[_Label | None], counted: Sequence[bool] | None = None
+) -> dict[_Label, list[int]]:
+    """Rows of the counted bins by label, labels in order of appearance; ``None`` is no label."""
+    members: dict[_Label, list[int]] = {}
     for row, label in enumerate(labels):
-        if counted is None or counted[row]:
+        if label is not None and (counted is None or counted[row]):
             members.setdefault(label, []).append(row)
     return members
-
-
-def _position_label(position: int | None) -> str:
-    """The entry of ``POSITIONS`` for a place; of none, a word that is not among them."""
-    if position is None:
-        return "none"
-    if position < _FIRST:
-        return POSITIONS[0]
-    return POSITIONS[-1] if position > _LAST else str(position)
 
 
 def _recall(num_right: int, num_bins: int) -> dict[str, Any]:

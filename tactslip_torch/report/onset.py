@@ -306,13 +306,11 @@ def onsets_table(content: Mapping[str, Any]) -> str:
     for row in rows[:_MOST_ROWS]:
         cells: dict[str, object] = {"file": row["file"], "alarm s": _seconds(row["alarm_s"])}
         cells |= {"onset s": _seconds(row["onset_s"]), "P(slip)": _seconds(row["probability"], 2)}
-        cells |= {"by": row["raised_by"]}
-        cells |= {"valid": "NO" if row["is_valid"] is False else row["is_valid"]}
-        cells |= {
-            "true onset s": _seconds(row["true_onset_s"]),
-            "delay s": _seconds(row["delay_s"]),
-        }
-        shown.append(cells | {"outcome": row["outcome"]})
+        is_valid = "NO" if row["is_valid"] is False else row["is_valid"]
+        cells |= {"by": row["raised_by"], "valid": is_valid}
+        cells |= {"true onset s": _seconds(row["true_onset_s"])}
+        cells |= {"delay s": _seconds(row["delay_s"]), "outcome": row["outcome"]}
+        shown.append(cells)
     lines = [style.table(shown, merged=1) if rows else "no alarm, and no slip missed"]
     if len(rows) > _MOST_ROWS:
         lines.append(f"and {len(rows) - _MOST_ROWS} more, see onsets.csv")

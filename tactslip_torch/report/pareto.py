@@ -162,8 +162,7 @@ def pareto_figure(content: Mapping[str, Any], path: str | Path) -> None:
         axes.axvline(limit, color="black", linestyle=":", linewidth=1)
     left.set_xlabel("worst-case latency, onset to decision, ms")
     left.set_ylabel("balanced accuracy, %, a material left out")
-    title = "front: shortest hop; chosen: longest that keeps the deadline (dotted)"
-    left.set_title(title)
+    left.set_title("front: shortest hop; chosen: longest that keeps the deadline (dotted)")
     right.plot([], [], "s", color="white", mec="black", label="pooled over channels")
     for letter, what in _NAMED.values():
         right.plot([], [], marker=f"${letter}$", color="black", linestyle="", label=what)
@@ -192,10 +191,9 @@ def _candidates(axes: Axes, content: Mapping[str, Any], key: str) -> None:
     axes.plot(x, y, ".", color="#CCCCCC", markersize=3, label="searched (compute modelled)")
     for align, colour in _ALIGN_COLOURS.items():
         rows = [row for row in content["front"] if row["align"] == align]
-        for marker, pooled in (("o", False), ("s", True)):
-            for row in rows:
-                if (row["columns"] != "channel") == pooled:
-                    axes.plot(*_point(row, key), marker, color=colour)
+        for row in rows:
+            marker = "o" if row["columns"] == "channel" else "s"
+            axes.plot(*_point(row, key), marker, color=colour)
         if rows:
             axes.plot([], [], "o", color=colour, label=f"front, {align}")
 

@@ -9,7 +9,6 @@ that every burst is seen. Colours are fingers, paler towards the palm.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from tactslip_torch.report import style
 from tactslip_torch.report.onset import Array, Envelope, Segments, lane_height, median, span
@@ -39,103 +37,67 @@ _MOST_LANES = 24
 _NAMES = 6.5  # font size of channels in points
 
 
-@dataclass(frozen=True)
-class Trial:
-    """What is known of one recording.
+Rows = Sequence[Mapping[str, Any]]
+"""One a recording."""
 
-    Args:
-        material: of it.
-        scene: of it.
-        duration_s: of it.
-        slip_s: seconds that are labelled slip.
-        non_slip_s: seconds that are labelled non-slip.
-        num_onsets: that are known.
+Recording = Any
+"""One of ``tactslip_torch.data``: its ``samples``, in ``units``, of which what is not finite is not
+drawn, its exact ``onsets_s``, and start and end of what is slip or known to be without."""
+
+
+def view_around(
+    recording: Recording, stroke: int, before_s: float, after_s: float
+) -> tuple[float, float]:
+    """Where to look for a stroke: around its onset or, where nothing slips, its start.
+
+    Strokes count from 1; the last stands for those that are not there, and the whole recording for
+    a stroke where there is none.
     """
-
-    material: str
-    scene: str
-    duration_s: float
-    slip_s: float
-    non_slip_s: float
-    num_onsets: int
-
-
-@dataclass(frozen=True, eq=False)
-class DrawnRecording:
-    """One recording, as it is drawn.
-
-    Args:
-        title: stands beside it.
-        samples: ``[C, T]``, in ``units``; what is not finite is left out.
-        sample_rate_hz: samples per second.
-        onsets_s: exact onsets.
-        slip_s: start and end of each segment of slip.
-        non_slip_s: those of segments that are known to be without.
-        units: of the samples.
-    """
-
-    title: str
-    samples: Tensor
-    sample_rate_hz: float
-    onsets_s: Sequence[float] = ()
-    slip_s: Segments = ()
-    non_slip_s: Segments = ()
-    units: str = "V"
-
-    @property
-    def duration_s(self) -> float:
-        """Of the whole recording."""
-        return self.samples.shape[-1] / self.sample_rate_hz
-
-    def around(self, stroke: int, before_s: float, after_s: float) -> tuple[float, float]:
-        """Where to look for a stroke: around its onset or, where nothing slips, its start.
-
-        Strokes count from 1; the last stands for those that are not there, and the whole
-        recording for a stroke where there is none.
-        """
-        begins = self.onsets_s or [start for start, _ in self.non_slip_s]
-        if not begins:
-            return 0.0, self.duration_s
-        centre_s = begins[min(stroke, len(begins)) - 1]
-        return max(0.0, centre_s - before_s), min(self.duration_s, centre_s + after_s)
+    begins = recording.onsets_s or [start for start, _ in recording.non_slip_s]
+    if not begins:
+        return 0.0, recording.duration_s
+    centre_s = begins[min(stroke, len(begins)) - 1]
+    return max(0.0, centre_s - before_s), min(recording.duration_s, centre_s + after_s)
 
 
 # What a set holds --------------------------------------------------------------------------------
-def trials_table(trials: Sequence[Trial], *, simulated: bool) -> str:
+def trials_table(trials: Rows, *, simulated: bool) -> str:
     """How many recordings of each material there are, how long, and what is known of them.
 
     Of several scenes the same follows for each scene.
+
+    Args:
+        trials: of each recording its ``material`` and ``scene``, ``duration_s``, how much of that
+            is labelled (``slip_s``, ``non_slip_s``), and ``num_onsets``.
+        simulated: whether any is.
     """
 
-    def cells(group: Sequence[Trial]) -> Mapping[str, object]:
-        durations = [trial.duration_s for trial in group]
+    def cells(group: Rows) -> Mapping[str, object]:
+        durations = [trial["duration_s"] for trial in group]
         return {
             "recordings": len(group),
             "shortest s": f"{min(durations):.2f}",
             "longest s": f"{max(durations):.2f}",
             "seconds": f"{sum(durations):.1f}",
-            "onsets": sum(trial.num_onsets for trial in group),
-            "slip s": f"{sum(trial.slip_s for trial in group):.1f}",
-            "non-slip s": f"{sum(trial.non_slip_s for trial in group):.1f}",
+            "onsets": sum(trial["num_onsets"] for trial in group),
+            "slip s": f"{sum(trial['slip_s'] for trial in group):.1f}",
+            "non-slip s": f"{sum(trial['non_slip_s'] for trial in group):.1f}",
         }
 
-    tables = [_grouped("material", [(trial.material, trial) for trial in trials], cells)]
-    if len({trial.scene for trial in trials}) > 1:
-        tables.append(_grouped("scene", [(trial.scene, trial) for trial in trials], cells))
+    tables = [_grouped("material", trials, cells)]
+    if len({trial["scene"] for trial in trials}) > 1:
+        tables.append(_grouped("scene", trials, cells))
     return style.marked(simulated, "\n\n".join(tables))
 
 
-def _grouped(
-    key: str,
-    named: Sequence[tuple[str, Any]],
-    cells: Callable[[Sequence[Any]], Mapping[str, object]],
-) -> str:
-    """A row a group, in the order in which they come, and of several one of all."""
-    groups: dict[str, list[Any]] = {}
-    for name, each in named:
-        groups.setdefault(name, []).append(each)
+def _grouped(key: str, rows: Rows, cells: Callable[[Rows], Mapping[str, object]]) -> str:
+    """A row for each value of ``key``, in the order in which they come, and of several all."""
+    groups = {
+        name: [row for row in rows if row[key] == name]
+        for name in dict.fromkeys(row[key] for row in rows)
+    }
     if len(groups) > 1:
-        groups["all"] = [each for _, each in named]
+        groups["all"] = list(rows)
     return style.table([{key: name, **cells(group)} for name, group in groups.items()])
 
 
@@ -148,7 +110,7 @@ def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
         seconds: that it took.
     """
 
-    def cells(group: Sequence[Mapping[str, Any]]) -> Mapping[str, object]:
+    def cells(group: Rows) -> Mapping[str, object]:
         return {
             "recordings": len(group),
             "made now": sum(one["made"] for one in group),
@@ -156,7 +118,7 @@ def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
             "MB": f"{sum(one['num_bytes'] for one in group) / 1e6:.1f}",
         }
 
-    rows = _grouped("scene", [(one["line"]["scene"], one) for one in written], cells)
+    rows = _grouped("scene", [{"scene": one["line"]["scene"], **one} for one in written], cells)
     simulated = any(one["line"]["simulated"] == "true" for one in written)
     return style.marked(simulated, rows, f"took {seconds:.1f} s")
 
@@ -180,8 +142,8 @@ def ranges_table(channels: Channels, ranges: Array, units: str) -> str:
 
 @style.styled
 def dataset_figure(
-    trials: Sequence[Trial],
-    example: DrawnRecording,
+    trials: Rows,
+    example: tuple[str, Recording],
     names: Sequence[str],
     path: str | Path,
     *,
@@ -192,23 +154,24 @@ def dataset_figure(
     Of more channels than fit, so many are drawn, evenly chosen.
 
     Args:
-        trials: at least one.
-        example: drawn in lanes, each on a scale of its own, slip and non-slip shaded.
+        trials: at least one, as ``trials_table`` takes them.
+        example: its title, and what is drawn in lanes, each on a scale of its own, slip and
+            non-slip shaded.
         names: of its channels.
         path: the PNG to write, replaced as a whole if it exists.
         title: of the figure; says what is simulated.
     """
-    materials = list(dict.fromkeys(trial.material for trial in trials))
+    materials = list(dict.fromkeys(trial["material"] for trial in trials))
     num_lanes = min(len(names), _MOST_LANES)
     heights = [0.28 * len(materials) + 0.8, 0.2 * num_lanes + 0.9]
     figure = style.new_figure(11.0, sum(heights) + 0.9, title)
     bars, traces = figure.subplots(2, 1, gridspec_kw={"height_ratios": heights})
     colours = {style.VERMILION: "slip", style.BLUE: "non-slip", _UNKNOWN: "not labelled"}
     for lane, material in enumerate(materials):
-        group = [trial for trial in trials if trial.material == material]
-        slip = sum(trial.slip_s for trial in group)
-        quiet = sum(trial.non_slip_s for trial in group)
-        whole = max(sum(trial.duration_s for trial in group), slip + quiet)
+        group = [trial for trial in trials if trial["material"] == material]
+        slip = sum(trial["slip_s"] for trial in group)
+        quiet = sum(trial["non_slip_s"] for trial in group)
+        whole = max(sum(trial["duration_s"] for trial in group), slip + quiet)
         style.stack(bars, lane, (slip, quiet, whole - slip - quiet), colours)
         text = f"  {len(group)} recording{'s' * (len(group) != 1)}"
         bars.text(whole, lane, text, va="center", fontsize=7, color=style.GREY)
@@ -217,23 +180,23 @@ def dataset_figure(
     bars.set_xlabel("seconds of signal")
 
     chosen = sorted({round(place) for place in np.linspace(0, len(names) - 1, num_lanes)})
-    view = (0.0, example.duration_s)
-    times, values = _points(example, chosen, view)
+    name, recording = example
+    view = (0.0, recording.duration_s)
+    times, values = _points(recording, chosen, view)
     spans = [span(line, 0.01) for line in values]
     labels = [
-        f"{names[place]}  {wide or 1.0:.3g} {example.units}"
+        f"{names[place]}  {wide or 1.0:.3g} {recording.units}"
         for place, wide in zip(chosen, spans, strict=True)
     ]
     scales = [1.25 * wide or 1.0 for wide in spans]
     _draw_lanes(traces, times, values, labels, [style.INK] * len(chosen), scales, most=1.2)
     traces.set_ylim(-len(chosen) + 0.2, 0.8)
-    _mark(traces, example, view)
+    _mark(traces, recording, view)
     traces.set_xlabel("time, s")
     some = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} channels"
-    what = f"{example.title}{some}; beside each name the span of all but 2 % of it"
-    traces.set_title(what)
+    traces.set_title(f"{name}{some}; beside each name the span of all but 2 % of it")
     handles: list[Any] = [Patch(color=colour, label=label) for colour, label in colours.items()]
-    handles += [Line2D([], [], label="onset", **_ONSET)] if example.onsets_s else []
+    handles += [Line2D([], [], label="onset", **_ONSET)] if recording.onsets_s else []
     style.legend_below(figure, handles, 4)
     style.save(figure, path, dpi=120)
 
@@ -241,7 +204,7 @@ def dataset_figure(
 # Signals -----------------------------------------------------------------------------------------
 @style.styled
 def signals_figure(
-    rows: Sequence[DrawnRecording],
+    rows: Sequence[tuple[str, Recording]],
     channels: Channels,
     path: str | Path,
     *,
@@ -251,40 +214,40 @@ def signals_figure(
     """Write one recording a row: slow channels as measured and in lanes, fast ones in lanes.
 
     Args:
-        rows: at least one, all of the same hand.
+        rows: title and recording, at least one, all of the same hand.
         channels: of the hand.
         path: the PNG to write, replaced as a whole if it exists.
         title: of the figure; says what is simulated.
         views: ``(start, end)`` in seconds of what is shown of each row, ``None`` for all.
     """
-    views = [(0.0, row.duration_s) for row in rows] if views is None else views
+    recordings = [recording for _, recording in rows]
+    views = views or [(0.0, recording.duration_s) for recording in recordings]
     columns = _columns(channels)
     colours = _channel_colours(channels)
     height = max(1.9, *(_LANE * len(places) for _, places, _ in columns))
     figure = style.new_figure(13.0, height * len(rows) + 1.3, title)
     widths = {"width_ratios": [1.0 if in_lanes else 0.75 for _, _, in_lanes in columns]}
     grid = figure.subplots(len(rows), len(columns), squeeze=False, gridspec_kw=widths)
-    for panels, row, view in zip(grid, rows, views, strict=True):
+    for panels, (row_title, row), view in zip(grid, rows, views, strict=True):
         for axes, (_, places, in_lanes) in zip(panels, columns, strict=True):
             names, own = [channels[i]["name"] for i in places], [colours[i] for i in places]
             times, values = _points(row, places, view)
             scale = lane_height(values) if in_lanes else 1.0
             if in_lanes:
                 _draw_lanes(axes, times, values, names, own, [scale] * len(names))
-                apart = f"lanes {scale:.2g} {row.units} apart"
-                axes.set_title(apart, loc="right", fontsize=_NAMES)
+                axes.set_title(f"lanes {scale:.2g} {row.units} apart", loc="right", fontsize=_NAMES)
             for line, name, colour in zip(values, names, own, strict=True):
                 if not in_lanes:
                     axes.plot(times, line, color=colour, linewidth=0.7, label=name)
             _mark(axes, row, view)
         unit = "volts" if row.units == "V" else row.units
-        panels[0].set_ylabel(f"{row.title}\n{unit}", color=style.INK)
+        panels[0].set_ylabel(f"{row_title}\n{unit}", color=style.INK)
     for axes, (kind, _, in_lanes) in zip(grid[0], columns, strict=True):
         how = "offsets removed" if in_lanes else "as measured"
         axes.set_title(f"{kind}, {how}")
     for axes in grid[-1]:
         axes.set_xlabel("time, s")
-    style.legend_below(figure, _legend(rows, channels), 9)
+    style.legend_below(figure, _legend(recordings, channels), 9)
     style.save(figure, path, dpi=120)
 
 
@@ -312,7 +275,7 @@ def _channel_colours(channels: Channels) -> list[tuple[float, float, float]]:
 
 
 def _points(
-    row: DrawnRecording, places: Sequence[int], view: tuple[float, float]
+    row: Recording, places: Sequence[int], view: tuple[float, float]
 ) -> tuple[NDArray[np.floating], Array]:
     """Times and samples of some channels in the view, as few as the figure can show."""
     first, last = (round(edge * row.sample_rate_hz) for edge in view)
@@ -341,9 +304,13 @@ def _draw_lanes(
         label.set_color(colour)
 
 
-def _mark(axes: Axes, row: DrawnRecording, view: tuple[float, float]) -> None:
+def _slips(row: Recording) -> Segments:
+    return (*row.sliding_s, *row.slip_s)
+
+
+def _mark(axes: Axes, row: Recording, view: tuple[float, float]) -> None:
     """Onsets, slip and non-slip, as far as they are in view."""
-    for segments, look in ((row.slip_s, _SLIP), (row.non_slip_s, _NON_SLIP)):
+    for segments, look in ((_slips(row), _SLIP), (row.non_slip_s, _NON_SLIP)):
         for start, end in segments:
             if start < view[1] and end > view[0]:
                 axes.axvspan(max(start, view[0]), min(end, view[1]), **look)
@@ -355,7 +322,7 @@ def _mark(axes: Axes, row: DrawnRecording, view: tuple[float, float]) -> None:
     axes.tick_params(labelsize=_NAMES)
 
 
-def _legend(rows: Sequence[DrawnRecording], channels: Channels) -> list[Any]:
+def _legend(rows: Sequence[Recording], channels: Channels) -> list[Any]:
     """A line per finger, and the marks that there are."""
     fingers = style.colours_of(channel["finger"] for channel in channels)
     handles: list[Any] = [
@@ -366,7 +333,7 @@ def _legend(rows: Sequence[DrawnRecording], channels: Channels) -> list[Any]:
         handles.append(Line2D([], [], color="#CCCCCC", linewidth=2, label="paler: nearer the palm"))
     if any(row.onsets_s for row in rows):
         handles.append(Line2D([], [], label="onset of slip", **_ONSET))
-    if any(row.slip_s for row in rows):
+    if any(map(_slips, rows)):
         handles.append(Patch(label="slip", **_SLIP))
     if any(row.non_slip_s for row in rows):
         handles.append(Patch(label="non-slip", **_NON_SLIP))

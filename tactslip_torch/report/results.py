@@ -227,8 +227,7 @@ def _confusion_panel(
         look["color"] = "white" if fractions[row, column] > 0.6 else style.INK
         value = style.percent(fractions[row, column] if counts[row].any() else None)
         axes.text(column, row - 0.06, f"{value} %", fontsize=13, **look)
-        number = f"{style.grouped(int(counts[row, column]))} bins"
-        axes.text(column, row + 0.16, number, **look)
+        axes.text(column, row + 0.16, f"{style.grouped(int(counts[row, column]))} bins", **look)
     names = ["non-slip", "slip"]
     axes.set_xticks([0, 1], names)
     axes.set_yticks([0, 1], names, rotation=90, va="center")
@@ -352,8 +351,7 @@ def selected_features_figure(
         said = f"paper: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
         component.set_xlabel(said)
         style.lanes(descriptor, [f"{style.words(name)}  [{ranks[name]}]" for name in names])
-        unit = "features; the paper never selects [-]"
-        descriptor.set_xlabel(unit)
+        descriptor.set_xlabel("features; the paper never selects [-]")
     style.save(figure, path, dpi=180)
 
 
@@ -1167,8 +1165,7 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
         _draw_rates(right, of_scenes, aside, colour)
     left.set_title(f"Without slip: {' and '.join(hours)}")
     left.axvline(target, color=style.INK, linewidth=1, linestyle="--", zorder=1)
-    what = f"Confounding scenes, by {style.words(alarm['rule'])} (bars: their budgets)"
-    right.set_title(what)
+    right.set_title(f"Confounding scenes, by {style.words(alarm['rule'])} (bars: their budgets)")
     limits = {row["scene"]: row["limit"] for row in alarm["budget"] if not row["is_share"]}
     for lane, scene in enumerate(scenes):
         if scene in limits:
