@@ -101,8 +101,7 @@ def _distribution(axes: Axes, content: Mapping[str, Any], colours: Mapping[str, 
         for place in (place for place, split in enumerate(known) if _is_papers(split)):
             axes.plot(scores[place], fraction[place], "o", color=colours[name], markersize=8)
     axes.set_xlabel("balanced accuracy on the unseen materials, %")
-    axes.set_ylabel("fraction of splits at or below")
-    axes.set_ylim(0, 1)
+    axes.set(ylabel="fraction of splits at or below", ylim=(0, 1))
     axes.set_title("over all splits; dot: the paper's four")
     axes.legend(loc="upper left")
 

@@ -184,8 +184,7 @@ def _absences(axes: Axes, content: Mapping[str, Any]) -> None:
     style.lanes(axes, [row["name"] for row in rows])
     if 0 < len(fingers) < len(rows):
         axes.axhline(len(rows) - len(fingers) - 0.5, color=style.GREY, linewidth=0.8, linestyle=":")
-    axes.set_title("(c) lost without it")
-    axes.set_xlabel("points of balanced accuracy, 95 % intervals")
+    axes.set(title="(c) lost without it", xlabel="points of balanced accuracy, 95 % intervals")
     place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.03, 0.995)}
     axes.legend(handletextpad=0.3, labelspacing=0.2, **place)
 
@@ -214,8 +213,7 @@ def _best_few(axes: Axes, content: Mapping[str, Any]) -> None:
     axes.set_xlim(0.5, len(steps) + 0.5)
     how = RESELECT_WORDS[content["settings"]["reselect"]]
     title = f"(d) the best few, in the order in which they serve held-out groups; features {how}"
-    axes.set_title(title)
-    axes.set_ylabel("balanced accuracy, %")
+    axes.set(title=title, ylabel="balanced accuracy, %")
     axes.set_xlabel("bands: 95 % intervals of the difference to all sensors, over recordings")
     axes.legend(loc="best", ncols=2)
 

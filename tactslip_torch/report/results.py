@@ -63,7 +63,7 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
         selected_features_figure(selected, path, simulated=simulated)
     alarm = metrics.get("alarm") or {}
     for is_there, draw, name in (
-        (_detectors(metrics), _confound_figure, "confound"),
+        (_scene_rows(metrics), _confound_figure, "confound"),
         (_drawn_events(metrics), events_figure, "events"),
         (metrics.get("answers"), answers_figure, "answers"),
         (alarm, alarm_figure, "alarm"),
@@ -83,7 +83,7 @@ def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> N
         ("alarm", (alarm_table, _scenes_table, reliability_table)),
     ):
         texts += [one(metrics) for one in tables if metrics.get(key)]
-    if _detectors(metrics):
+    if _scene_rows(metrics):
         texts.append(confound_table(metrics))
     if selected:
         texts.append(selected_table(selected))
@@ -267,9 +267,8 @@ def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
             ``descriptor``, ``kind`` and ``finger``.
     """
     is_papers = _is_of_papers_hand(selected)
-    by_finger: Counter[str] = Counter()
-    for counts in published.SELECTED_BY_FINGER.values():
-        by_finger.update(counts)
+    gauges, films = published.SELECTED_BY_FINGER.values()
+    by_finger = {finger: gauges[finger] + films[finger] for finger in films}
     ranks = {name: f"#{rank}" for rank, name in enumerate(published.DESCRIPTORS_RANKED, 1)}
     ranks |= dict.fromkeys(published.DESCRIPTORS_NEVER, "0")
     beside: dict[str, Mapping[str, object]] = {
@@ -283,9 +282,7 @@ def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
     for key, of_paper in beside.items():
         shown = of_paper if is_papers else {}
         counted = Counter(each[key] for each in selected)
-        for value in [name for name, _ in counted.most_common()] + [
-            name for name in shown if name not in counted
-        ]:
+        for value in dict.fromkeys([*dict(counted.most_common()), *shown]):
             row = {"selected by": key, "": value, "ours": counted[value]}
             rows.append(row | ({"paper": shown.get(value)} if is_papers else {}))
     rows.append({"selected by": "all", "": "", "ours": len(selected)})
@@ -463,9 +460,7 @@ def validation_figure(metrics: _Metrics, path: str | Path) -> None:
         means = [100 * row["mean"] for row in rows]
         axes.plot(penalties, means, marker="o", ls=dash, color=colours[kind], label=label, lw=2)
     axes.plot(chosen["penalty"], 100 * chosen["mean"], "*", color="black", ms=14, label="chosen")
-    axes.set_xscale("log")
-    axes.set_xlabel("C")
-    axes.set_ylabel("balanced accuracy on the group left out, %")
+    axes.set(xscale="log", xlabel="C", ylabel="balanced accuracy on the group left out, %")
     axes.legend(handlelength=6.0, **style.UPPER_LEFT_OUTSIDE)
     style.save(figure, path)
 
@@ -512,19 +507,17 @@ def tuning_tables(metrics: _Metrics) -> list[str]:
             continue
         rows: list[_Row] = []
         for way, label in _WAYS.items():
-            held = {
-                key: mean(float(group[way][key]) for group in tuning["held"])
+            loss, accuracy = (
+                mean(float(group[way][key]) for group in tuning["held"])
                 for key in ("loss", "balanced_accuracy")
-            }
+            )
+            cells: _Row = {f"tuning {name}".strip(): label, "held-out loss": f"{loss:.4f}"}
+            cells["held-out %"] = style.percent(accuracy)
             detectors = fold["splits"] if way == "tuned" else tuning["splits"][way]
-            scores = {
-                f"{role} %": style.percent(detectors[role]["balanced_accuracy"])
-                for role, of in fold["splits"].items()
-                if of["balanced_accuracy"] is not None
-            }
-            cells = {"held-out loss": f"{held['loss']:.4f}"}
-            cells |= {"held-out %": style.percent(held["balanced_accuracy"])}
-            rows.append({f"tuning {name}".strip(): label, **cells, **scores})
+            for role, of in fold["splits"].items():
+                if of["balanced_accuracy"] is not None:
+                    cells[f"{role} %"] = style.percent(detectors[role]["balanced_accuracy"])
+            rows.append(cells)
         start = tuning["start"]
         steps = (
             f"{tuning['steps']} steps from C={start['penalty']:g}, c={start['offset']:g} to "
@@ -561,8 +554,7 @@ def tuning_figure(tuning: Mapping[str, Any], path: str | Path, *, simulated: boo
     axes.plot(learning, "k--", lw=1.5, label="what is learned on")
     axes.axvline(tuning["steps"], color=style.GREY, lw=1, label="steps taken")
     axes.set_ylim(bottom=0)
-    axes.set_xlabel("steps")
-    axes.set_ylabel("held-out log loss, nats")
+    axes.set(xlabel="steps", ylabel="held-out log loss, nats")
     axes.set_title("groups held out; dots: steps chosen by the other groups")
     axes.legend(**style.UPPER_LEFT_OUTSIDE)
     if scales:
@@ -581,56 +573,30 @@ def _draw_scales(axes: Axes, scales: Mapping[str, float]) -> None:
     ):
         text = "\n".join([f"{heading}:", *(f"{value:.2f}  {name}" for name, value in named)])
         axes.text(x, 0.98, text, transform=axes.transAxes, va="top", ha=side, fontsize=7)
-    axes.set_ylim(0, 1.5 * ordered[0][1])
-    axes.set_xlabel("features, by scale")
-    axes.set_ylabel("scale in the kernel")
-    axes.set_title("learned scales: soft selection")
+    axes.set(ylim=(0, 1.5 * ordered[0][1]), xlabel="features, by scale")
+    axes.set(ylabel="scale in the kernel", title="learned scales: soft selection")
 
 
 # Confounders: scenes that have motion without slip, or slip without motion ------------------------
-def _detectors(metrics: _Metrics) -> dict[str, Mapping[str, Any]]:
-    """The splits of each fold, or of the one detector; empty if all is of one kind of scene."""
-    folds = {name: fold["splits"] for name, fold in metrics.get("folds", {}).items()}
-    detectors = folds or {"detector": metrics["splits"]}
-    several = any(
-        len(split.get("per_scene", {})) > 1
-        for splits in detectors.values()
-        for role, split in splits.items()
-        if role != "train"
-    )
-    return detectors if several else {}
-
-
 def _scene_rows(metrics: _Metrics) -> list[dict[str, Any]]:
     """Scores by role, then scene, then detector: the paper's scene first, then those trained on.
 
-    ``is_trained`` is ``None`` where the results do not tell.
+    Empty if all is of one kind of scene. ``is_trained`` is ``None`` where the results do not tell.
     """
-    detectors = _detectors(metrics)
     is_fit = "detector" not in metrics  # evaluate's training role is not what was trained on
-    trained = {
-        name: set(splits.get("train", {}).get("per_scene", {})) if is_fit else set()
-        for name, splits in detectors.items()
-    }
-    of_any = set().union(*trained.values())
-    rows = [
-        {
-            "role": role,
-            "scene": scene,
-            "detector": name,
-            "is_trained": scene in trained[name] if is_fit else None,
-            "scores": scores,
-        }
-        for name, splits in detectors.items()
-        for role, split in splits.items()
-        if role != "train"
-        for scene, scores in split["per_scene"].items()
-    ]
-    roles = list(dict.fromkeys(row["role"] for row in rows))
-    scenes = sorted(
-        dict.fromkeys(row["scene"] for row in rows), key=lambda s: (s != "paper", s not in of_any)
-    )
-    return sorted(rows, key=lambda row: (roles.index(row["role"]), scenes.index(row["scene"])))
+    rows = []
+    for name, fold in (metrics.get("folds") or {"detector": metrics}).items():
+        held_out = dict(fold["splits"])
+        trained = held_out.pop("train", {}).get("per_scene", {})
+        for role, split in held_out.items():
+            for scene, scores in split.get("per_scene", {}).items():
+                row = {"role": role, "scene": scene, "detector": name, "scores": scores}
+                rows.append(row | {"is_trained": scene in trained if is_fit else None})
+    roles, scenes = (list(dict.fromkeys(row[key] for row in rows)) for key in ("role", "scene"))
+    of_any = {row["scene"] for row in rows if row["is_trained"]}
+    scenes.sort(key=lambda scene: (scene != "paper", scene not in of_any))
+    rows.sort(key=lambda row: (roles.index(row["role"]), scenes.index(row["scene"])))
+    return rows if len(scenes) > 1 else []
 
 
 def confound_table(metrics: _Metrics) -> str:
@@ -672,18 +638,15 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
     figure = style.new_figure(10.5, height, title, simulated=metrics["simulated"])
     panels = figure.subplots(len(roles), 2, sharex="col", sharey=True, squeeze=False)
     dot: dict[str, Any] = {"marker": "o", "ls": "", "ms": 7.5, "mew": 1.8}
+    sides = {"non_slip_recall": "nothing but slip", "slip_recall": "no slip in this scene"}
+    named = {"test": "test cycles of seen materials", "unseen": "unseen materials"}
     for role, pair in zip(roles, panels, strict=True):
-        for axes, key in zip(pair, ("non_slip_recall", "slip_recall"), strict=True):
+        for axes, (key, nothing) in zip(pair, sides.items(), strict=True):
             for lane, scene in enumerate(scenes):
-                own = [
-                    row
-                    for row in rows
-                    if (row["role"], row["scene"]) == (role, scene)
-                    and row["scores"][key] is not None
-                ]
-                values = [100 * row["scores"][key] for row in own]
-                if axes is pair[0]:
-                    values = [100 - value for value in values]
+                here = [row for row in rows if (row["role"], row["scene"]) == (role, scene)]
+                own = [row for row in here if row["scores"][key] is not None]
+                values = np.array([100 * row["scores"][key] for row in own])
+                values = 100 - values if key == "non_slip_recall" else values
                 heights = lane + _spread(len(own), 0.13)
                 axes.plot(values, heights, color="#BBBBBB", lw=2, zorder=1)
                 for row, value, at in zip(own, values, heights, strict=True):
@@ -691,16 +654,11 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
                     fill = "white" if row["is_trained"] is False else colour
                     axes.plot(value, at, color=colour, mfc=fill, clip_on=False, zorder=2, **dot)
                 if not own:
-                    text = "nothing but slip" if axes is pair[0] else "no slip in this scene"
-                    look: dict[str, Any] = {"color": style.GREY, "ha": "center"}
-                    axes.text(
-                        0.5, lane, text, va="center", transform=axes.get_yaxis_transform(), **look
-                    )
+                    look: dict[str, Any] = {"color": style.GREY, "ha": "center", "va": "center"}
+                    axes.text(0.5, lane, nothing, transform=axes.get_yaxis_transform(), **look)
             style.lanes(
-                axes,
-                ["paper's protocol" if name == "paper" else style.words(name) for name in scenes],
+                axes, [{"paper": "paper's protocol"}.get(s, style.words(s)) for s in scenes]
             )
-        named = {"test": "test cycles of seen materials", "unseen": "unseen materials"}
         pair[0].set_title(named.get(role, role))
     left, right = panels[-1]
     left.set_xlim(left=0)
@@ -811,8 +769,7 @@ def answers_table(metrics: _Metrics) -> str:
     answers = metrics["answers"]
     rows: list[_Row] = []
     for role, scores in answers.items():
-        row: _Row = {"prediction sets": role}
-        row |= _percents(scores, _ANSWERS)
+        row = {"prediction sets": role} | _percents(scores, _ANSWERS)
         for name, said in (("slip", "slip"), ("non_slip", "non-slip")):
             titles = {key: f"{said}: {key} %" for key in ("coverage", "reached", "abstained")}
             row |= _percents(scores[name], titles)
@@ -850,8 +807,7 @@ def answers_figure(metrics: _Metrics, path: str | Path) -> None:
         axes.axvline(100 * coverage, **asked)
     style.lanes(axes, [f"{role}, {CLASSES[truth].replace('_', '-')}" for role, truth in rows])
     axes.grid(visible=False, axis="y")
-    axes.set_xlabel("bins of the class, %")
-    axes.set_xlim(0, 100)
+    axes.set(xlabel="bins of the class, %", xlim=(0, 100))
     handles: list[Any] = [Patch(color=colour, label=label) for label, colour in outcomes.items()]
     limit = "asked: wrong only right of this line"
     style.legend_below(figure, [*handles, Line2D([], [], label=limit, **asked)], 4)
@@ -913,12 +869,9 @@ def events_table(metrics: _Metrics) -> str:
     for role, by_rule in metrics["events"].items():
         for rule, numbers in by_rule.items():
             hours, latency = numbers["quiet_hours"], numbers["latency_ms"] or {}
-            slip_free = f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min"
+            quiet = f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min"
             row: _Row = {"events": role, "rule": style.words(rule), **_event_cells(numbers)}
-            row |= {
-                "false alarms": _false_alarms(numbers),
-                "slip-free": slip_free if hours else "-",
-            }
+            row |= {"false alarms": _false_alarms(numbers), "slip-free": quiet if hours else "-"}
             rows.append(row | {"alarms a slip": _value(numbers["alarms_per_slip"], 2)})
             delay: _Row = {"mean delay, ms": role, "rule": style.words(rule)}
             for name, title in _LATENCY_PARTS.items():
@@ -982,8 +935,7 @@ def events_figure(metrics: _Metrics, path: str | Path) -> None:
                 latest = max(latest, delay["p95"]["value"])
             _draw_outcomes(right, lane, numbers)
             right.get_yticklabels()[lane].set_color(styles[rule]["color"])
-        left.set_ylim(0, 102)
-        left.set_ylabel("slips found, %")
+        left.set(ylim=(0, 102), ylabel="slips found, %")
         left.set_title(role, fontweight="bold")
         right.set_xlim(0, 100)
     left.set_xlim(earliest, 1.5 * latest)
