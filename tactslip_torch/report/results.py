@@ -847,10 +847,7 @@ def _value(number: Mapping[str, float] | None, digits: int, scale: float = 1.0) 
 def _false_alarms(numbers: Mapping[str, Any]) -> str:
     """A rate with its interval, such as ``74.2 /min [70.1, 78.0]``."""
     unit, key = ("h", "per_hour") if numbers["quiet_hours"] >= 1 else ("min", "per_minute")
-    rate = numbers[f"false_alarms_{key}"]
-    if rate is None:
-        return "-"
-    return f"{rate['value']:.1f} /{unit} [{rate['low']:.1f}, {rate['high']:.1f}]"
+    return style.interval(numbers[f"false_alarms_{key}"], 1, f" /{unit}")
 
 
 def events_table(metrics: _Metrics) -> str:
@@ -983,8 +980,7 @@ def rate_rows(metrics: _Metrics) -> list[_Row]:
             reached, against = "-", "-"
             if method in quiet:
                 rate, hours = quiet[method]
-                ends = f"[{rate['low']:.2f}, {rate['high']:.2f}]"
-                reached = f"{rate['value']:.2f} {ends} in {hours:.1f} h"
+                reached = f"{style.interval(rate, 2)} in {hours:.1f} h"
                 against = "more" if rate["low"] > target else "as asked"
                 against = "fewer" if rate["high"] < target else against
             row: _Row = {"materials": materials, "method": style.words(method)}
@@ -1034,17 +1030,11 @@ def budget_rows(metrics: _Metrics) -> list[_Row]:
             continue
         unit, factor = ("% of knocks", 100) if row["is_share"] else ("/h", 1)
         amount = f"{row['amount']} knocks" if row["is_share"] else f"{row['amount']:.1f} h"
-        cells = found.setdefault(
-            (row["scene"], row["role"]),
-            {
-                "scene": style.words(row["scene"]),
-                "materials": {"test": "seen"}.get(row["role"], row["role"]),
-                "budget": f"{factor * row['limit']:g} {unit}",
-                "of": amount,
-            },
-        )
-        value, low, high = (factor * row[name] for name in ("rate", "low", "high"))
-        cells[style.words(row["method"])] = f"{value:.2f} [{low:.2f}, {high:.2f}]"
+        head: _Row = {"scene": style.words(row["scene"])}
+        head |= {"materials": {"test": "seen"}.get(row["role"], row["role"])}
+        head |= {"budget": f"{factor * row['limit']:g} {unit}", "of": amount}
+        reached = style.interval({"value": row["rate"], **row}, 2, scale=factor)
+        found.setdefault((row["scene"], row["role"]), head)[style.words(row["method"])] = reached
     return list(found.values())
 
 
@@ -1110,25 +1100,23 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
         _draw_rates(left, [quiet[role].get(each, (None,))[0] for each in methods], aside, colour)
         left.plot([], [], "o-", color=colour, label=name)
         hours += [f"{spent:.1f} h of {name}" for _, spent in list(quiet[role].values())[-1:]]
-        of_scenes = [
-            by_role[role][alarm["rule"]]["false_alarms_per_hour"] if role in by_role else None
-            for by_role in scenes.values()
+        own = [
+            by_role[role][alarm["rule"]] if role in by_role else {} for by_role in scenes.values()
         ]
-        _draw_rates(right, of_scenes, aside, colour)
+        _draw_rates(right, [of.get("false_alarms_per_hour") for of in own], aside, colour)
     left.set_title(f"Without slip: {' and '.join(hours)}")
     left.axvline(target, color=style.INK, linewidth=1, linestyle="--", zorder=1)
     right.set_title(f"Confounding scenes, by {style.words(alarm['rule'])} (bars: their budgets)")
     limits = {row["scene"]: row["limit"] for row in alarm["budget"] if not row["is_share"]}
     for lane, scene in enumerate(scenes):
         if scene in limits:
-            right.plot(
-                [limits[scene]] * 2, [lane - 0.35, lane + 0.35], color=style.INK, linewidth=1.6
-            )
+            right.vlines(limits[scene], lane - 0.35, lane + 0.35, color=style.INK, linewidth=1.6)
     for axes, names in ((left, methods), (right, scenes)):
         style.lanes(axes, list(map(style.words, names)))
-        axes.set_xscale("log")
+        axes.set(
+            xscale="log", xlabel="false alarms an hour, with interval (none: at the left edge)"
+        )
         axes.set_xlim(left=0.8 * _LEAST_RATE)
-        axes.set_xlabel("false alarms an hour, with interval (none: at the left edge)")
     left.legend(loc="best")
     style.save(figure, path)
 
@@ -1166,7 +1154,5 @@ def _is_of_papers_hand(selected: Sequence[Mapping[str, str]]) -> bool:
     Args:
         selected: one mapping per feature with ``kind`` and ``finger``.
     """
-    return all(
-        feature["finger"] in published.SELECTED_BY_FINGER.get(feature["kind"], {})
-        for feature in selected
-    )
+    fingers = published.SELECTED_BY_FINGER
+    return all(feature["finger"] in fingers.get(feature["kind"], {}) for feature in selected)

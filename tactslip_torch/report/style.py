@@ -106,6 +106,21 @@ def percent(fraction: float | None, digits: int = 2) -> str:
     return "-" if fraction is None else f"{100 * fraction:.{digits}f}"
 
 
+def interval(
+    number: Mapping[str, float] | None, digits: int, unit: str = "", scale: float = 1.0
+) -> str:
+    """A number with the ends of its interval, ``-`` where there is none.
+
+    Example:
+        >>> interval({"value": 74.21, "low": 70.1, "high": 78.0}, 1, " /min")
+        '74.2 /min [70.1, 78.0]'
+    """
+    if number is None:
+        return "-"
+    value, low, high = (f"{scale * number[end]:.{digits}f}" for end in ("value", "low", "high"))
+    return f"{value}{unit} [{low}, {high}]"
+
+
 def words(name: str) -> str:
     """A name of the code as people write it: spaces in place of underscores."""
     return name.replace("_", " ")
