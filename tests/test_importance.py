@@ -30,6 +30,7 @@ from tactslip_torch.features.selection import ClassMoments, t_scores
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import PAPER_KERNEL
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.training.recipe import FeatureSelection
 
 OF_FEATURE = ["a", "a", "b", "b", "c", "c"]  # of each feature
 PENALTIES = (0.01, 0.1, 1.0)
@@ -52,9 +53,10 @@ def sampled(seed, tells, groups="MNO", recordings=4, bins=12):
 def refit_of(tells):
     train = sampled(0, tells)
     scaler = FeatureScaler.fit(train.features.double())
+    selection = FeatureSelection(tuple(range(len(OF_FEATURE))), scaler)
     scored = {"test": sampled(1, tells), "unseen": sampled(2, tells, groups="PQ")}
     weights = torch.linspace(0.5, 2.0, len(train.is_slip), dtype=torch.float64)
-    return Refit(train, weights, scored, scaler, PAPER_KERNEL, PENALTIES)
+    return Refit(train, weights, scored, selection, PAPER_KERNEL, PENALTIES)
 
 
 def ranking_of(refit, num_features=6, allowed=None, most_correlation=1.0):

@@ -19,13 +19,14 @@ from torch import Tensor
 
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.features.selection import rank_distinct, rank_features
+from tactslip_torch.features.selection import rank_distinct
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import HeldOut, TrainingBins
 from tactslip_torch.model.kernels import Kernel
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import bar, in_parts
+from tactslip_torch.training.recipe import FeatureSelection
 
 _COVERAGE = 0.95
 
@@ -176,22 +177,18 @@ class Refit:
         train: sampled training bins with the whole pool.
         weights: ``[n]`` of those, positive.
         scored: bins of other roles; they choose nothing.
-        scaler: of the whole pool or, with ``pooling``, of its columns.
+        selection: scales the whole pool; or of a detector that pools over channels: machines are
+            of its columns, made of the channels whose features they are given.
         kernel: of the machines.
         penalties: values of C to choose from.
-        pooling: of a detector that pools over channels: machines are of its columns, made of the
-            channels whose features they are given.
-        inputs: pool indices of what it takes.
     """
 
     train: SampledBins
     weights: Tensor
     scored: Mapping[str, SampledBins]
-    scaler: FeatureScaler
+    selection: FeatureSelection
     kernel: Kernel
     penalties: Sequence[float]
-    pooling: ChannelPooling | None = None
-    inputs: Sequence[int] = ()
     _known: dict[Any, tuple[Result, Any]] = field(default_factory=dict, repr=False, compare=False)
 
     def __call__(self, features: Sequence[int]) -> Result:
@@ -245,21 +242,20 @@ class Refit:
         return max(results, key=lambda pair: pair[0].merit)  # of equal ones the smallest C
 
     def _scaled(self, bins: SampledBins, features: Sequence[int]) -> Tensor:
-        if self.pooling is not None:
-            return self._pooled(self.pooling, bins, set(features))
-        index, knee = list(features), self.scaler.knee
-        ranges = self.scaler.minimum[index], self.scaler.maximum[index]
+        if self.selection.pooling is not None:
+            return self._pooled(self.selection.pooling, bins, set(features))
+        index, whole = list(features), self.selection.scaler
+        ranges, knee = (whole.minimum[index], whole.maximum[index]), whole.knee
         scaler = FeatureScaler(*ranges, None if knee is None else knee[index])
         scaled: Tensor = scaler(bins.features[:, index].double())
         return scaled
 
     def _pooled(self, layer: ChannelPooling, bins: SampledBins, features: set[int]) -> Tensor:
         """Columns of the channels of these features; of other channels, the middle of the range."""
-        inputs = zip(layer.inputs, self.inputs, strict=True)
+        inputs = zip(layer.inputs, self.selection.selected, strict=True)
         used = {name.channel for name, index in inputs if index in features}
         is_missing = torch.tensor([name not in used for name in layer.hand.names])
-        values = bins.features[:, list(self.inputs)].double()
-        scaled: Tensor = self.scaler(layer(values, is_missing.expand(len(values), -1)))
+        scaled = self.selection(bins.features, is_missing.expand(len(bins.features), -1))
         single = [not name.is_pooled and name.channel not in used for name in layer.names]
         return scaled.masked_fill(torch.tensor(single), 0.0)
 
@@ -316,12 +312,8 @@ class Ranking:
         num = min(most, len(places))
         if not num:
             return []
-        scores = self.scores[places]
-        if self.most_correlation < 1:
-            features, is_slip = self.sample.features[:, places], self.sample.is_slip
-            order = rank_distinct(scores, features, is_slip, num, self.most_correlation)
-        else:
-            order = rank_features(scores, num)
+        scores, features = self.scores[places], self.sample.features[:, places]
+        order = rank_distinct(scores, features, self.sample.is_slip, num, self.most_correlation)
         return [int(place) for place in places[order]]
 
 

@@ -479,14 +479,12 @@ def _layers(pool: FeaturePool, statistics: Sequence[str]) -> Iterator[ChannelPoo
 
 def _designs(needed: Sequence[set[Part]], sizes: Sequence[int]) -> Iterator[list[int]]:
     """Selections that tell the groups apart: each group with one, some and all of its parts."""
+    first: dict[Part, int] = {}  # of each part, the feature that needs fewest others
+    for index in sorted(range(len(needed)), key=lambda index: len(needed[index])):
+        for part in needed[index]:
+            first.setdefault(part, index)
     for group in GROUPS:
-        first: dict[Part, int] = {}  # of each part of the group, the feature that needs fewest
-        for index, own in enumerate(needed):
-            for part in own:
-                if part[0] == group and part[1]:
-                    known = first.setdefault(part, index)
-                    first[part] = min(known, index, key=lambda i: len(needed[i]))
-        places = sorted(set(first.values()))
+        places = sorted({index for part, index in first.items() if part[0] == group and part[1]})
         for number in sorted({1, 4, 16, min(len(places), 80)}):
             if 0 < number <= len(places):
                 yield _spread(places, number)

@@ -530,17 +530,16 @@ class ParetoSearch:
         rows = choose_model(recipe, self.pool, sample, mask, is_nested=False).rows
         everything = Structure("pooled", len(self.pool.names) * len(STATISTICS), Polynomial(1))
         ranked = fitted_selection(recipe, self.pool, sample, everything, mask)
-        found = []
-        for (size, _), own in itertools.groupby(
+        by_head = itertools.groupby(
             rows, lambda row: (row["num_features"], row["kernel"]["degree"])
-        ):
-            alike = list(own)
-            least = max(row["mean"] for row in alike) - recipe.tolerance
-            best = min(
-                (row for row in alike if row["mean"] >= least), key=lambda row: row["penalty"]
-            )
+        )
+        columns, found = f"pooled {', '.join(statistics)}", []
+        for (size, _), own in by_head:
+            strongest_first = sorted(own, key=lambda row: float(row["penalty"]))
+            least = max(row["mean"] for row in strongest_first) - recipe.tolerance
+            best = next(row for row in strongest_first if row["mean"] >= least)
             first = ranked if size is None else ranked.first(min(size, ranked.size))
-            columns, ranking = f"pooled {', '.join(statistics)}", "none" if size is None else "gd"
+            ranking = "none" if size is None else "gd"
             found.append(self._candidate(group, columns, ranking, best, first))
         return found
 

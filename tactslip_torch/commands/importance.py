@@ -44,7 +44,13 @@ from tactslip_torch.training.experiment import (
     save_config,
     versions,
 )
-from tactslip_torch.training.recipe import Recipe, sample_groups, sample_weight, scaled_selection
+from tactslip_torch.training.recipe import (
+    FeatureSelection,
+    Recipe,
+    sample_groups,
+    sample_weight,
+    scaled_selection,
+)
 
 FORMAT = "tactslip_torch sensors 1"
 _WHOLE_NUMBERS = {
@@ -168,24 +174,21 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
     weights = sample_weight(recipe, sample)
     group, group_names = sample_groups(sample)
     sample = replace(sample, group=group, group_names=group_names)
-    selected, is_pooled = list(detector.selected), detector.pooling is not None
-    allowed = recipe.allowed(pool)
+    selected, is_pooled = detector.selected, detector.pooling is not None
     if is_pooled:  # which takes all features of a channel, or none
         allowed = torch.zeros(len(pool.names), dtype=torch.bool)
-        allowed[selected] = True
+        allowed[list(selected)] = True
+        selection = FeatureSelection(selected, detector.scaler, detector.pooling)
+    else:
+        allowed = recipe.allowed(pool)
+        selection = scaled_selection(recipe, statistics, range(len(pool.names)))
     refit = Refit(
         train=sample,
         weights=weights,
         scored={role: of.bins() for role, of in others.items() if of.num_seen},
-        scaler=(
-            detector.scaler
-            if is_pooled
-            else scaled_selection(recipe, statistics, range(len(pool.names))).scaler
-        ),
+        selection=selection,
         kernel=kernel_from_dict(detector.info["kernel"]),
         penalties=sorted({*recipe.penalties_ascending, float(detector.info["penalty"])}),
-        pooling=detector.pooling,
-        inputs=selected,
     )
     ranking = Ranking(
         scores=t_scores(statistics.moments, recipe.score_variance),
