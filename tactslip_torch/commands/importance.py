@@ -175,12 +175,12 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
     group, group_names = sample_groups(sample)
     sample = replace(sample, group=group, group_names=group_names)
     selected, is_pooled = detector.selected, detector.pooling is not None
+    allowed = recipe.allowed(pool)
     if is_pooled:  # which takes all features of a channel, or none
         allowed = torch.zeros(len(pool.names), dtype=torch.bool)
         allowed[list(selected)] = True
         selection = FeatureSelection(selected, detector.scaler, detector.pooling)
     else:
-        allowed = recipe.allowed(pool)
         selection = scaled_selection(recipe, statistics, range(len(pool.names)))
     refit = Refit(
         train=sample,
