@@ -20,8 +20,10 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.harness import COLORS, LIGHT, Benchmark, Job, Report, Table, by, percent, say
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import SEEN_ROLE, FittedMachine, composed, small_recipe, statistics_from
+from benchmarks.tables import COLORS, LIGHT, Report, Table, by, percent
+from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.model.calibration import ABSTAIN, NON_SLIP, SLIP, Abstention, fit_platt
 from tactslip_torch.model.fit import HeldOut
 from tactslip_torch.report.metrics import CLASSES, answer_counts, answer_metrics
@@ -36,8 +38,8 @@ MEASURES = {
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
+class Abstaining(Benchmark):
+    """Ways to abstain.
 
     Args:
         overrides: of the configuration of ``crossval``: materials and cycles.
@@ -50,6 +52,15 @@ class Sizes:
         coverages: that are asked for.
     """
 
+    title = "Abstaining"
+    about = (
+        "bins of recordings whose truth is in the answer, and bins without an answer, by how the "
+        "thresholds of abstention were set"
+    )
+    quick = (
+        'overrides=[data.cycles=4,"data.materials=[M1,M4,iron]"] num_held_out=1 splits=2 '
+        "train_bins=30 scored_bins=40 num_features=20 penalties=[0.001] coverages=[0.5,0.8]"
+    )
     overrides: tuple[str, ...] = ()
     num_held_out: int = 4
     splits: int = 8
@@ -59,50 +70,15 @@ class Sizes:
     penalties: tuple[float, ...] = (1e-4, 1e-3, 1e-2)
     coverages: tuple[float, ...] = (0.8, 0.9, 0.95, 0.97, 0.99)
 
-
-@dataclass(frozen=True, eq=False)
-class _Scored:
-    """Scores, truth and recordings of bins, each ``[n]``."""
-
-    score: Tensor
-    is_slip: Tensor
-    recording: Tensor
-
-
-class Abstaining(Benchmark[Sizes]):
-    """Ways to abstain."""
-
-    name = "abstaining"
-    title = "Abstaining"
-    about = (
-        "bins of recordings whose truth is in the answer, and bins without an answer, by how the "
-        "thresholds of abstention were set"
-    )
-    sizes = Sizes()
-    quick = Sizes(
-        ("data.cycles=4", "data.materials=[M1,M4,iron]"),
-        num_held_out=1,
-        splits=2,
-        train_bins=30,
-        scored_bins=40,
-        num_features=20,
-        penalties=(1e-3,),
-        coverages=(0.5, 0.8),
-    )
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """A row for each split, way, coverage and role."""
-        sizes = job.sizes
-        config = composed("crossval", [*sizes.overrides, *job.overrides])
+        config = composed("crossval", [*self.overrides, *job.overrides])
         source = instantiate(config.data, _convert_="all")
         names = sorted({recording.material for recording in source.ids})
-        share, seed = config.train_fraction, config.seed
-        materials = statistics_from(
-            source, config, names, sizes.train_bins, sizes.scored_bins, share, seed
-        )
-        recipe = small_recipe(config, sizes.train_bins, sizes.num_features, sizes.penalties)
+        materials = statistics_from(source, config, names, self.train_bins, self.scored_bins)
+        recipe = small_recipe(config, self.train_bins, self.num_features, self.penalties)
         rows = []
-        for held_out in _choices(names, sizes):
+        for held_out in _choices(names, self):
             say(f"abstaining: without {', '.join(held_out)}")
             seen = [name for name in names if name not in held_out]
             machine = FittedMachine.of(materials.statistics_of(seen), recipe)
@@ -110,14 +86,11 @@ class Abstaining(Benchmark[Sizes]):
                 "test": materials.bins_of(seen, ("test",)),
                 "unseen": materials.bins_of(held_out, ("train", "test")),
             }
-            bins = {
-                role: _Scored(machine.scores(of.features), of.is_slip, of.recording)
-                for role, of in evaluated.items()
-            }
-            for way, coverage, low, high in _thresholds(machine, sizes.coverages):
-                for role, of in bins.items():
+            scores = {role: machine.scores(of.features) for role, of in evaluated.items()}
+            for way, coverage, low, high in _thresholds(machine, self.coverages):
+                for role, of in evaluated.items():
                     row = {"way": way, "asked": coverage, "role": role, "held_out": held_out}
-                    rows.append(row | _evaluated(of, low, high, coverage))
+                    rows.append(row | _evaluated(of, scores[role], low, high, coverage))
         return {"rows": rows}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
@@ -145,14 +118,13 @@ class Abstaining(Benchmark[Sizes]):
                 kept = [mean(row["covered"] for row in of) for of in by(own, "asked").values()]
                 axes.plot(asked, kept, "o-", color=color, label=way)
             axes.plot(asked, asked, "--", color=LIGHT)
-            axes.set_title(words)
-            axes.set_xlabel("coverage asked for")
+            axes.set(title=words, xlabel="coverage asked for")
         panels[0].set_ylabel("coverage kept")
         handles = panels[0].get_legend_handles_labels()
         drawing.legend(*handles, loc="outside lower center", ncols=3)
 
 
-def _choices(names: Sequence[str], sizes: Sizes) -> list[tuple[str, ...]]:
+def _choices(names: Sequence[str], sizes: Abstaining) -> list[tuple[str, ...]]:
     """The paper's held-out materials where they are as many, then others by a seed."""
     every = list(itertools.combinations(sorted(names), sizes.num_held_out))
     papers = tuple(sorted(set(names) - set(SEEN_MATERIALS)))
@@ -182,10 +154,9 @@ def _thresholds(
         ):
             try:
                 found = Abstention.fit(held[left_out], sample.is_slip, unit, coverage)
+                yield way, coverage, found.low, found.high
             except ValueError:  # too few recordings for any answer
                 yield way, coverage, -math.inf, math.inf
-            else:
-                yield way, coverage, found.low, found.high
         reach = math.log(coverage / (1 - coverage))
         low, high = -math.inf, math.inf
         if platt.slope:
@@ -194,9 +165,11 @@ def _thresholds(
         yield "never abstaining", coverage, 0.0, 0.0
 
 
-def _evaluated(bins: _Scored, low: float, high: float, coverage: float) -> dict[str, Any]:
-    given = torch.full_like(bins.score, ABSTAIN, dtype=torch.int8)
-    given = given.masked_fill(bins.score < low, NON_SLIP).masked_fill(bins.score >= high, SLIP)
+def _evaluated(
+    bins: SampledBins, score: Tensor, low: float, high: float, coverage: float
+) -> dict[str, Any]:
+    given = torch.full_like(score, ABSTAIN, dtype=torch.int8)
+    given = given.masked_fill(score < low, NON_SLIP).masked_fill(score >= high, SLIP)
     counts = {
         str(name): answer_counts(bins.is_slip[mine], given[mine])
         for name in bins.recording.unique().tolist()

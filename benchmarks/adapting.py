@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from statistics import mean, median
 from typing import Any
 
@@ -18,20 +19,10 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.harness import (
-    COLORS,
-    Benchmark,
-    Job,
-    Report,
-    Table,
-    by,
-    limit,
-    limits,
-    percent,
-    say,
-    timed,
-)
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import FittedMachine, Trained
+from benchmarks.tables import COLORS, Report, Table, by, limits, percent
+from benchmarks.timing import timed
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.kernels import Head
@@ -51,28 +42,6 @@ AUTO, SLIP_FREE, ONE, SHIFT, CEILING = "auto", "slip-free", "weight 1", "thresho
 BinsByName = dict[str, RecordingBins]
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
-
-    Args:
-        training: overrides of ``tactslip_torch.train``; its held-out materials are the new ones.
-        counts: recordings that are added.
-        draws: of which recordings.
-        train_fraction: of a new material's recordings, from which they are drawn; everything is
-            evaluated on the others.
-        limited: the count that limits are on.
-        margin: that old materials may lose on average.
-    """
-
-    training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
-    counts: tuple[int, ...] = (1, 2, 5, 10)
-    draws: int = 3
-    train_fraction: float = 0.8
-    limited: int = 5
-    margin: float = 0.005
-
-
 @dataclass(frozen=True, eq=False)
 class _Subject:
     """The trained detector, its statistics, and the bins of every recording by name."""
@@ -86,32 +55,37 @@ class _Subject:
         return {str(one): self.bins[str(one)] for one in recordings}
 
 
-class Adapting(Benchmark[Sizes]):
-    """New materials by count, way and draw."""
+@dataclass(frozen=True)
+class Adapting(Benchmark):
+    """New materials by count, way and draw.
 
-    name = "adapting"
+    Args:
+        training: overrides of ``tactslip_torch.train``; its held-out materials are the new ones.
+        counts: recordings that are added.
+        draws: of which recordings.
+        train_fraction: of a new material's recordings, from which they are drawn; everything is
+            evaluated on the others.
+        limited: the count that limits are on.
+        margin: that old materials may lose on average.
+    """
+
     title = "A new material from a few recordings"
     about = "balanced accuracy on a new material and on the old ones, by recordings that are added"
-    sizes = Sizes()
-    quick = Sizes(
-        (
-            "+exp=quick",
-            "recipe=robust",
-            "data.cycles=4",
-            "recipe.num_features=10",
-            "recipe.penalties=[0.0003]",
-            "split.train_fraction=0.75",
-        ),
-        counts=(1, 2),
-        draws=1,
-        train_fraction=0.6,
-        limited=2,
+    quick = (
+        "training=[+exp=quick,recipe=robust,data.cycles=4,recipe.num_features=10,"
+        '"recipe.penalties=[0.0003]",split.train_fraction=0.75] counts=[1,2] draws=1 '
+        "train_fraction=0.6 limited=2"
     )
+    training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
+    counts: tuple[int, ...] = (1, 2, 5, 10)
+    draws: int = 3
+    train_fraction: float = 0.8
+    limited: int = 5
+    margin: float = 0.005
 
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Every new material, way, count and draw; weights on training materials; one step."""
-        sizes = job.sizes
-        overrides = [*sizes.training, *job.overrides, "statistics=true"]
+        overrides = [*self.training, *job.overrides, "statistics=true"]
         trained = Trained.by(overrides, job.folder, job.folder / "cache")
         statistics = statistics_of(job.folder / "detector.pt", trained.detector)
         bins = recording_bins(trained.detector, trained.maker, statistics, is_new=False)
@@ -121,58 +95,55 @@ class Adapting(Benchmark[Sizes]):
         for material in trained.materials("unseen"):
             say(f"adapting: {material} is new")
             order = _drawn(trained.recordings("unseen", material), 1000)
-            num = round(sizes.train_fraction * len(order))
+            num = round(self.train_fraction * len(order))
             pool, new = order[:num], subject.of(order[num:])
             row = {"material": material, "way": "before", "count": 0}
             rows.append(row | _scores(subject.before.head, new, old))
-            for way, count, draw in _jobs(sizes):
+            ways, draws = (AUTO, ONE, SHIFT, SLIP_FREE), range(self.draws)
+            for way, count, draw in product(ways, self.counts, draws):
                 chosen = subject.of(_drawn(pool, draw)[:count])
                 row = {"material": material, "way": way, "count": len(chosen)}
-                rows.append(row | _adapted(subject, way, chosen, new, old, sizes))
+                rows.append(row | _adapted(subject, way, chosen, new, old, self))
             row = {"material": material, "way": CEILING, "count": len(pool)}
             rows.append(row | _ceiling(trained, pool, order[num:]))
         material = trained.materials("unseen")[0]
-        some = subject.of(trained.recordings("unseen", material)[: sizes.limited])
-        seconds, _ = timed(lambda: add(statistics, subject.before, some, None, 1.0))
-        return {
-            "rows": rows,
-            "weights": list(_weights(subject, sizes)),
-            "add_s": seconds,
-            "limited": sizes.limited,
-            "margin": sizes.margin,
-        }
+        some = subject.of(trained.recordings("unseen", material)[: self.limited])
+        add_s, _ = timed(lambda: add(statistics, subject.before, some, None, 1.0))
+        weights = list(_weights(subject, self))
+        kept = {"add_s": add_s, "limited": self.limited, "margin": self.margin}
+        return {"rows": rows, "weights": weights, **kept}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Limits, new and old materials, and how the weight was chosen."""
-        rows = numbers["rows"]
-        found = {}
+        rows, found = numbers["rows"], {}
         for key, title in (("new", "New material"), ("old", "Old materials' test recordings")):
-            cells = []
-            for (way, count), of in by(rows, "way", "count").items():
-                row = {"way": way, "recordings": count}
-                for (material,) in by(rows, "material"):
-                    row[material] = _cell([one[key] for one in of if one["material"] == material])
-                cells.append(row)
-            note = "Balanced accuracy, %, median of draws (lowest to highest)."
-            found[title] = Table(cells, note)
-        weights = []
-        for (factor,), these in by(numbers["weights"], "factor").items():
-            means = {f"{key} %": percent(mean(row[key] for row in these)) for key in _KEYS}
-            weights.append({"weight of a new bin": f"{factor:g}"} | means)
+            cells = [
+                {"way": way, "recordings": count}
+                | {
+                    material: _cell([one[key] for one in of if one["material"] == material])
+                    for (material,) in by(rows, "material")
+                }
+                for (way, count), of in by(rows, "way", "count").items()
+            ]
+            found[title] = Table(
+                cells, "Balanced accuracy, %, median of draws (lowest to highest)."
+            )
+        weights = [
+            {"weight of a new bin": f"{factor:g}"}
+            | {f"{key} %": percent(mean(row[key] for row in these)) for key in _KEYS}
+            for (factor,), these in by(numbers["weights"], "factor").items()
+        ]
         note = "Where each training material in turn is new; means over them."
         before = mean(row["old"] for row in rows if row["way"] == "before")
         limited = mean(row["old"] for row in by(rows, "way", "count")[AUTO, numbers["limited"]])
+        adding = f"old materials lose, points, auto, {numbers['limited']} recordings"
+        solving = f"s to add {numbers['limited']} recordings whose features are there"
         goals = [
-            limit(f"old materials lose, points, auto, {numbers['limited']} recordings",
-                  100 * (before - limited), 100 * numbers["margin"]),
-            limit(f"s to add {numbers['limited']} recordings whose features are there",
-                  numbers["add_s"], 10.0),
-        ]  # fmt: skip
-        return {
-            "Limits": limits(goals),
-            **found,
-            "How the weight was chosen": Table(weights, note),
-        }
+            (adding, 100 * (before - limited), 100 * numbers["margin"], ""),
+            (solving, numbers["add_s"], 10.0, ""),
+        ]
+        about = {"How the weight was chosen": Table(weights, note)}
+        return {"Limits": limits(goals), **found, **about}
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """New and old against the number of recordings."""
@@ -184,8 +155,7 @@ class Adapting(Benchmark[Sizes]):
                 means = [mean(100 * row[key] for row in of) for of in these.values()]
                 counts = [count for (count,) in these]
                 axes.plot(counts, means, "o-", color=COLORS[place], label=way)
-            axes.set_title(title)
-            axes.set_xlabel("recordings added")
+            axes.set(title=title, xlabel="recordings added")
         panels[0].set_ylabel("balanced accuracy, %, mean of materials")
         panels[0].legend()
 
@@ -200,12 +170,6 @@ def _cell(values: Sequence[float]) -> str:
     return percent(median(values)) + spread
 
 
-def _jobs(sizes: Sizes) -> Iterator[tuple[str, int, int]]:
-    for way in (AUTO, ONE, SHIFT, SLIP_FREE):
-        for count in sizes.counts:
-            yield from ((way, count, draw) for draw in range(sizes.draws))
-
-
 def _drawn(recordings: Sequence[RecordingId], seed: int) -> list[RecordingId]:
     """The recordings in a random order."""
     generator = torch.Generator().manual_seed(seed)
@@ -218,7 +182,7 @@ def _adapted(
     chosen: BinsByName,
     new: BinsByName,
     old: Sequence[BinsByName],
-    sizes: Sizes,
+    sizes: Adapting,
 ) -> dict[str, float]:
     """Scores after these recordings are brought to the detector in one way."""
     head = subject.before.head
@@ -259,7 +223,7 @@ def _ceiling(
     return {"new": score(new), "old": mean(old)}
 
 
-def _weights(subject: _Subject, sizes: Sizes) -> Iterator[dict[str, Any]]:
+def _weights(subject: _Subject, sizes: Adapting) -> Iterator[dict[str, Any]]:
     """What weights do where each training material in turn is new: ``FACTORS`` rests on this.
 
     Features and scaling saw the material. No new material, and no test recording, is among it.
@@ -316,10 +280,8 @@ def _scores(
     head: Head, new: BinsByName, old: Sequence[BinsByName], shift: float = 0.0
 ) -> dict[str, float]:
     """Of the new material, and the mean over old ones."""
-    return {
-        "new": _score(head, new, shift),
-        "old": mean(_score(head, bins, shift) for bins in old),
-    }
+    olds = [_score(head, bins, shift) for bins in old]
+    return {"new": _score(head, new, shift), "old": mean(olds)}
 
 
 if __name__ == "__main__":

@@ -12,9 +12,10 @@ is kept, so a run that was stopped resumes. Puts its tables into docs/onset.md.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -25,20 +26,10 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
-from benchmarks.harness import (
-    COLORS,
-    Benchmark,
-    Job,
-    Report,
-    Table,
-    code_digest,
-    percent,
-    say,
-    trained,
-    write_text,
-)
+from benchmarks.harness import Benchmark, Job, resumed, say, trained
 from benchmarks.peers import rockets
 from benchmarks.subjects import Array, Trained, composed
+from benchmarks.tables import COLORS, Report, Table, by, percent
 from tactslip_torch import AlarmSettings, FeaturePool, Prediction, SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector
 from tactslip_torch.onset.decisions import Scorer
@@ -62,41 +53,38 @@ PULSES_V = (0.02, 0.05, 0.1, 0.5)
 KNOCKS_MV = (10.0, 30.0, 100.0)
 _SCENES = ("arm_motion", "taps", "grips", "machine", "mains_bursts")
 _OTHERS = ("pulled", "dead_channel", "release_50mv", "release_150mv", "grips_knocked")
-QUICK_TRAINING = (
-    "data.cycles=2",
-    "data.materials=[M1,M6,iron]",
-    "split.seen=[M1,M6]",
-    "split.unseen=[iron]",
-    "split.train_fraction=0.5",
-    *(f"extra_scenes.{scene}.cycles=2" for scene in ("knocked", "pulled", *_SCENES)),
-    *(f"~extra_scenes.{scene}" for scene in ("paper_loud", "motor_off")),
-    *(f"~recipe.scene_weights.{scene}" for scene in ("paper_loud", "motor_off")),
-    "recipe.penalties=[0.003]",
-    "recipe.sample_bins=20",
-)
-QUICK_STREAMS = (
-    "onset.streams.cycles=6",
-    "onset.learn_cycles=2",
-    "onset.check_hours=0.002",
-    "onset.check_slip_free_hours=0.002",
-    "onset.budget.held=3000",
-    "onset.hours.held=0.002",
-    "onset.budget.taps_share=0.9",
-    *(f"onset.budget.{scene}=9000" for scene in _SCENES if scene != "taps"),
-    *(f"onset.hours.{scene}=0.002" for scene in _SCENES),
-    *(f"onset.streams.extra_scenes.{scene}.cycles=5" for scene in (*_SCENES, "held", "knocked")),
-    *(
-        f"onset.streams.extra_scenes.{scene}.tail_s=4"
-        for scene in (*_SCENES, "held", "knocked", "grips_knocked")
-        if scene != "arm_motion"
-    ),
-    *(f"onset.streams.extra_scenes.{scene}.cycles=3" for scene in _OTHERS),
+_ALL = (*_SCENES, "held", "knocked")
+QUICK = '","'.join(
+    (
+        "data.cycles=2",
+        "data.materials=[M1,M6,iron]",
+        "split.seen=[M1,M6]",
+        "split.unseen=[iron]",
+        "split.train_fraction=0.5",
+        *(f"extra_scenes.{scene}.cycles=2" for scene in ("knocked", "pulled", *_SCENES)),
+        *(f"~extra_scenes.{scene}" for scene in ("paper_loud", "motor_off")),
+        *(f"~recipe.scene_weights.{scene}" for scene in ("paper_loud", "motor_off")),
+        "recipe.penalties=[0.003]",
+        "recipe.sample_bins=20",
+        "onset.streams.cycles=6",
+        "onset.learn_cycles=2",
+        "onset.check_hours=0.002",
+        "onset.check_slip_free_hours=0.002",
+        "onset.budget.held=3000",
+        "onset.hours.held=0.002",
+        "onset.budget.taps_share=0.9",
+        *(f"onset.budget.{scene}=9000" for scene in _SCENES if scene != "taps"),
+        *(f"onset.hours.{scene}=0.002" for scene in _SCENES),
+        *(f"onset.streams.extra_scenes.{scene}.cycles=5" for scene in _ALL),
+        *(f"onset.streams.extra_scenes.{scene}.tail_s=4" for scene in (*_ALL[1:], _OTHERS[-1])),
+        *(f"onset.streams.extra_scenes.{scene}.cycles=3" for scene in _OTHERS),
+    )
 )
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
+class Alarms(Benchmark):
+    """Every seed, then the first under other pulses and knocks.
 
     Args:
         seeds: of sets, splits and detectors; weak pulses have the first.
@@ -108,6 +96,14 @@ class Sizes:
         num_kernels: of MiniRocket; 0 leaves it out, which halves the time of its seed.
     """
 
+    title = "The alarm: slips found, and how late"
+    about = "alarms of +exp=onset within the default budget, on recordings that set nothing"
+    page, markers, has_headings = "docs/onset.md", "onset", False
+    quick = (
+        f'seeds=[0] overrides=["{QUICK}"] pulses_v=[0.1] knocks_mv=[30.0] cycles=1 '
+        "peer_recordings=3 num_kernels=168"
+    )
+    libraries = ("aeon",)
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     overrides: tuple[str, ...] = (
         "baselines=false",
@@ -121,48 +117,31 @@ class Sizes:
     peer_recordings: int = 60
     num_kernels: int = 0
 
-
-class Alarms(Benchmark[Sizes]):
-    """Every seed, then the first under other pulses and knocks."""
-
-    name = "alarms"
-    title = "The alarm: slips found, and how late"
-    about = "alarms of +exp=onset within the default budget, on recordings that set nothing"
-    page, markers, has_headings = "docs/onset.md", "onset", False
-    sizes = Sizes()
-    quick = Sizes((0,), (*QUICK_TRAINING, *QUICK_STREAMS), (0.1,), (30.0,), 1, 3, num_kernels=168)
-    libraries = ("aeon",)
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Of every seed what the stage tells; of the first also pulses."""
-        found: dict[str, Any] = {"seeds": {}}
-        for seed in job.sizes.seeds:
-            kept = job.folder / f"alarm-{seed}.json"
-            given = ["+exp=onset", f"seed={seed}", *job.sizes.overrides, *job.overrides]
-            made_by = [code_digest(), *given]
-            of = json.loads(kept.read_text()) if kept.exists() else {}
-            if of.get("made_by") != made_by:
-                of = {"made_by": made_by, "of": self._of_seed(seed, given, job)}
-                write_text(kept, json.dumps(of) + "\n")
-            found["seeds"][str(seed)] = of["of"]
-        return found
+        found = {}
+        for seed in self.seeds:
+            given = ["+exp=onset", f"seed={seed}", *self.overrides, *job.overrides]
+            run = partial(self._of_seed, seed, given, job)
+            found[str(seed)] = resumed(job.folder / f"alarm-{seed}.json", given, run)
+        return {"seeds": found}
 
-    def _of_seed(self, seed: int, overrides: list[str], job: Job[Sizes]) -> dict[str, Any]:
-        folder, is_first = job.folder / f"seed-{seed}", seed == job.sizes.seeds[0]
+    def _of_seed(self, seed: int, overrides: list[str], job: Job) -> dict[str, Any]:
+        folder, is_first = job.folder / f"seed-{seed}", seed == self.seeds[0]
         training = [x for x in overrides if not x.startswith("onset.")] + ["onset=none"]
-        trained(f"detector, seed {seed}", training, folder, job.folder / "cache")
+        trained(training, folder, job.folder / "cache")
         detector = SlipDetector.load(folder / "detector.pt")
         parts = (detector.pool, detector.channel_filter)
         peers: dict[str, Scorer] = {LARGEST_DETAIL: BaselineDetector("largest_detail", *parts)}
         config: Any = OmegaConf.to_container(composed("train", overrides).onset, resolve=True)
         stage: CalibratedAlarm = instantiate(config, _convert_="all")
-        if is_first and job.sizes.num_kernels:
-            peers[ROCKET] = _rocket(detector, training, folder, stage, job.sizes)
+        if is_first and self.num_kernels:
+            peers[ROCKET] = _rocket(detector, training, folder, stage, self)
         say(f"alarm, seed {seed}")
         found = stage(detector, peers)
         detector.save(folder / "detector.pt")
         if is_first:
-            found["pulses"] = _pulses(detector, stage, found, job.sizes)
+            found["pulses"] = _pulses(detector, stage, found, self)
         return _told(found)
 
     def tables(self, numbers: Report) -> dict[str, Table]:
@@ -182,7 +161,10 @@ class Alarms(Benchmark[Sizes]):
         found = {
             "False alarms": Table(_budget_rows(seeds), note),
             "Slips of the protocol": Table(
-                _slip_rows(seeds, lambda of, role: of["events"].get(f"{role} stream", {})),
+                _slip_rows(
+                    {role: of["events"].get(f"{role} stream", {}) for role in ROLES}
+                    for of in seeds.values()
+                ),
                 "Means over seeds, in brackets the worst. Delays are from the release of half of "
                 "the load, an alarm before the first release is early.",
             ),
@@ -216,17 +198,12 @@ class Alarms(Benchmark[Sizes]):
         left.set_title("slips found, %, a dot a seed", fontsize=10)
         left.legend(frameon=False, fontsize=7)
         pulses = next(iter(numbers["seeds"].values())).get("pulses", [])
-        for place, knock in enumerate(dict.fromkeys(row["knocks_mv"] for row in pulses)):
-            own = [row for row in pulses if row["knocks_mv"] == knock]
+        for color, ((knock,), own) in zip(COLORS, by(pulses, "knocks_mv").items(), strict=False):
             volts = [row["pulse_v"] for row in own]
-            for method, style, face in ((JOINT, "-", None), (LARGEST_DETAIL, "--", "white")):
+            for method, style, face in ((JOINT, "-", color), (LARGEST_DETAIL, "--", "white")):
                 values = [100 * row[method]["found"] for row in own]
                 label = f"{method}, knocks {knock:g} mV"
-                look = {
-                    "color": COLORS[place],
-                    "marker": "o",
-                    "markerfacecolor": face or COLORS[place],
-                }
+                look: dict[str, Any] = {"color": color, "marker": "o", "markerfacecolor": face}
                 right.plot(volts, values, style, label=label, **look)
         right.set_xscale("log")
         right.set_xticks(PULSES_V, [f"{volt:g}" for volt in PULSES_V])
@@ -279,72 +256,55 @@ def _budget_rows(seeds: Mapping[str, Any]) -> list[dict[str, Any]]:
         low, high = budget.interval(alarms, amount)
         ends = f"[{factor * low:.2f}, {factor * high:.2f}]"
         within = sum(row["rate"] <= row["limit"] for row in rows if row["amount"])
-        own = cells.setdefault(
-            (scene, role),
-            {
-                "scene": scene.replace("_", " "),
-                "materials": ROLES[role],
-                "budget": f"{factor * budget.limit:g} {unit}",
-                "of": f"{amount:.4g} {'knocks' if budget.is_share else 'h'}",
-            },
-        )
+        row = {"scene": scene.replace("_", " "), "materials": ROLES[role]}
+        row["budget"] = f"{factor * budget.limit:g} {unit}"
+        row["of"] = f"{amount:.4g} {'knocks' if budget.is_share else 'h'}"
+        own = cells.setdefault((scene, role), row)
         own[method] = f"{factor * alarms / amount:.2f} {ends}, within {within} of {len(rows)}"
     return list(cells.values())
 
 
-def _slip_rows(
-    seeds: Mapping[str, Any], events_of: Callable[[Any, str], Mapping[str, Any]]
-) -> list[dict[str, Any]]:
-    """A row for each kind of materials and method."""
+def _slip_rows(by_seed: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each kind of materials and method, of events by role and method of each seed."""
+    found: dict[tuple[str, str], list[Any]] = {}
+    for by_role in by_seed:
+        for role, words in ROLES.items():
+            for method, events in by_role.get(role, {}).items():
+                found.setdefault((words, method), []).extend(
+                    [events] if events["num_onsets"] else []
+                )
     rows = []
-    for role, words in ROLES.items():
-        methods = dict.fromkeys(name for of in seeds.values() for name in events_of(of, role))
-        for method in methods:
-            own = [
-                events_of(of, role)[method]
-                for of in seeds.values()
-                if method in events_of(of, role)
-            ]
-            own = [events for events in own if events["num_onsets"]]
-            if not own:
-                continue
-            row: dict[str, Any] = {"materials": words, "method": method, "seeds": len(own)}
-            row["slips"] = sum(events["num_onsets"] for events in own)
-            for name, worst in (("found", min), ("early", max), ("missed", max)):
-                shares = [events[name]["value"] for events in own]
-                row[f"{name} %"] = f"{percent(fmean(shares))} [{percent(worst(shares))}]"
-            for title, key, quantile in (
-                ("delay ms", "delay_ms", "median"),
-                ("p95 ms", "delay_ms", "p95"),
-                ("from first release ms", "delay_first_ms", "median"),
-            ):
-                times = [e[key][quantile]["value"] for e in own if e.get(key)]
-                row[title] = f"{fmean(times):.1f} [{max(times):.1f}]" if times else "-"
-            slid = [
-                speed["slid_mm"]["median"]["value"]
-                for events in own
-                if (speed := events.get("per_speed", {}).get("40")) and speed.get("slid_mm")
-            ]
-            row["mm slid at 40 mm/s"] = f"{fmean(slid):.2f} [{max(slid):.2f}]" if slid else "-"
-            rows.append(row)
+    for (words, method), own in sorted(found.items(), key=lambda of: of[0][0] != "seen"):
+        if not own:
+            continue
+        row: dict[str, Any] = {"materials": words, "method": method, "seeds": len(own)}
+        row["slips"] = sum(events["num_onsets"] for events in own)
+        for name, worst in (("found", min), ("early", max), ("missed", max)):
+            shares = [events[name]["value"] for events in own]
+            row[f"{name} %"] = f"{percent(fmean(shares))} [{percent(worst(shares))}]"
+        for title, key, quantile in (
+            ("delay ms", "delay_ms", "median"),
+            ("p95 ms", "delay_ms", "p95"),
+            ("from first release ms", "delay_first_ms", "median"),
+        ):
+            row[title] = _mean_and_worst([e[key][quantile]["value"] for e in own if e.get(key)], 1)
+        slid = [events["per_speed"]["40"]["slid_mm"] for events in own]
+        slid = [of["median"]["value"] for of in slid if of]
+        rows.append(row | {"mm slid at 40 mm/s": _mean_and_worst(slid, 2)})
     return rows
+
+
+def _mean_and_worst(values: Sequence[float], digits: int) -> str:
+    return f"{fmean(values):.{digits}f} [{max(values):.{digits}f}]" if values else "-"
 
 
 def _scene_slips(seeds: Mapping[str, Any]) -> list[dict[str, Any]]:
-    rows = []
-    for scene in next(iter(seeds.values()))["scenes"]:
-
-        def events_of(of: Any, role: str, scene: str = scene) -> Mapping[str, Any]:
-            found: Mapping[str, Any] = of["scenes"][scene].get(role, {})
-            return found
-
-        own = _slip_rows(seeds, events_of)
-        rows += [
-            {"scene": scene.replace("_", " "), **row}
-            for row in own
-            if row["materials"] == "held out" and row["method"] in (JOINT, LARGEST_DETAIL)
-        ]
-    return rows
+    return [
+        {"scene": scene.replace("_", " "), **row}
+        for scene in next(iter(seeds.values()))["scenes"]
+        for row in _slip_rows(of["scenes"][scene] for of in seeds.values())
+        if row["materials"] == "held out" and row["method"] in (JOINT, LARGEST_DETAIL)
+    ]
 
 
 def _pulse_rows(pulses: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -359,7 +319,7 @@ def _pulse_rows(pulses: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _pulses(
-    detector: SlipDetector, stage: CalibratedAlarm, found: Mapping[str, Any], sizes: Sizes
+    detector: SlipDetector, stage: CalibratedAlarm, found: Mapping[str, Any], sizes: Alarms
 ) -> list[dict[str, Any]]:
     """Slips found of other pulses and knocks, on held-out materials, at the thresholds as set."""
     settings = AlarmSettings.of(detector)
@@ -367,51 +327,36 @@ def _pulses(
     of_detail = found["methods"][LARGEST_DETAIL]
     rate, hop = detector.pool.sample_rate_hz, settings.onset.evidence.hop_samples
     plain = BaselineDetector("largest_detail", detector.pool, detector.channel_filter)
-    by_detail = replace(settings, onset=None, hop_samples=hop, threshold=of_detail["threshold"])
-    by_detail = AlarmSettings.from_dict(
-        {
-            **by_detail.to_dict(),
-            "rule": of_detail["rule"],
-            "calibration": of_detail["calibration"],
-            "threshold": of_detail["threshold"],
-        },
-        detector.pool.hand,
-        rate,
-    )
+    plainer = replace(settings, onset=None, hop_samples=hop).to_dict()
+    plainer |= {name: of_detail[name] for name in ("rule", "calibration", "threshold")}
+    by_detail = AlarmSettings.from_dict(plainer, detector.pool.hand, rate)
     seen = set(detector.info["train_materials"])
     source_of: Any = type(stage.streams)
+    scorers: dict[str, Scorer] = {OURS: detector, LARGEST_DETAIL: plain}
+    hops = {OURS: settings.hop_samples, LARGEST_DETAIL: hop}
+    materials = sorted({one.material for one in stage.streams.ids} - seen)
     rows = []
-    for knocks in sizes.knocks_mv:
-        for pulse in sizes.pulses_v:
-            materials = sorted({one.material for one in stage.streams.ids} - seen)
-            scene = {"onset_pulse_v": pulse, "burst_mv": knocks}
-            source = source_of(seed=1000, cycles=sizes.cycles, materials=materials, scene=scene)
-            scorers: dict[str, Scorer] = {OURS: detector, LARGEST_DETAIL: plain}
-            hops = {OURS: settings.hop_samples, LARGEST_DETAIL: hop}
-            streams = score_streams(source, source.ids, scorers, hops, settings.onset)
-            row: dict[str, Any] = {"pulse_v": pulse, "knocks_mv": knocks}
-            for method, name, own in (
-                (JOINT, OURS, settings),
-                (LARGEST_DETAIL, LARGEST_DETAIL, by_detail),
-            ):
-                parts = (detector.pool.bin_samples, scorers[name].look_ahead)
-                timing = Timing(rate, hops[name], *parts)
-                latency = LatencyParts(parts[1] / rate, parts[0] / rate)
-                events = pooled_metrics(
-                    [
-                        recording_events(watched(*made), EventRules(), latency)
-                        for made in decide(streams[name], own, timing)
-                    ],
-                    num_resamples=1,
-                )
-                per_hour = events["false_alarms_per_hour"]["value"]
-                row[method] = {
-                    "slips": events["num_onsets"],
-                    "found": events["found"]["value"],
-                    "early": events["early"]["value"],
-                    "false_per_hour": per_hour,
-                }
-            rows.append(row)
+    for knocks, pulse in product(sizes.knocks_mv, sizes.pulses_v):
+        scene = {"onset_pulse_v": pulse, "burst_mv": knocks}
+        source = source_of(seed=1000, cycles=sizes.cycles, materials=materials, scene=scene)
+        streams = score_streams(source, source.ids, scorers, hops, settings.onset)
+        row: dict[str, Any] = {"pulse_v": pulse, "knocks_mv": knocks}
+        for method, name, own in (
+            (JOINT, OURS, settings),
+            (LARGEST_DETAIL, LARGEST_DETAIL, by_detail),
+        ):
+            parts = (detector.pool.bin_samples, scorers[name].look_ahead)
+            latency = LatencyParts(parts[1] / rate, parts[0] / rate)
+            decided = decide(streams[name], own, Timing(rate, hops[name], *parts))
+            made = [recording_events(watched(*of), EventRules(), latency) for of in decided]
+            events = pooled_metrics(made, num_resamples=1)
+            row[method] = {
+                "slips": events["num_onsets"],
+                "found": events["found"]["value"],
+                "early": events["early"]["value"],
+                "false_per_hour": events["false_alarms_per_hour"]["value"],
+            }
+        rows.append(row)
     return rows
 
 
@@ -437,10 +382,8 @@ class _RocketDetector:
     def predict_raw(self, samples: torch.Tensor, *, given: torch.dtype) -> Prediction:
         """Score raw bins with their context; a channel that is missing counts as silent."""
         bins = self.channel_filter.valid(samples)
-        is_missing, raw_magnitude = (
-            self.pool.is_missing(bins),
-            self.channel_filter.raw_magnitude(samples),
-        )
+        is_missing = self.pool.is_missing(bins)
+        raw_magnitude = self.channel_filter.raw_magnitude(samples)
         is_valid = (self.pool.is_alive(bins, given, raw_magnitude) & ~is_missing).all(-1)
         windows = torch.where(is_missing[..., None], 0.0, bins).float().contiguous()
         score = torch.from_numpy(np.asarray(self.scores(windows.numpy()))).reshape(-1).to(given)
@@ -452,7 +395,7 @@ def _rocket(
     overrides: list[str],
     folder: Path,
     stage: CalibratedAlarm,
-    sizes: Sizes,
+    sizes: Alarms,
 ) -> Scorer:
     """MiniRocket with ridge on bins of some training recordings, at the hop of bins."""
     own = Trained.by(overrides, folder, folder / "cache")

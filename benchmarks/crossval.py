@@ -8,47 +8,36 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from benchmarks.harness import Benchmark, Job, Report, Table, code_digest, percent, result_of
+from benchmarks.harness import Benchmark, Job, code_digest, result_of
+from benchmarks.tables import Report, Table, percent
 from tactslip_torch.report.crossval import material_rows, split_rows
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Overrides of ``tactslip crossval``, before those of the command line, and its seeds."""
+class Crossval(Benchmark):
+    """Every choice of four held-out materials.
 
-    overrides: tuple[str, ...] = ()
-    seeds: tuple[int, ...] = (0,)
+    Overrides of ``tactslip crossval``, before those of the command line, and its seeds.
+    """
 
-
-class Crossval(Benchmark[Sizes]):
-    """Every choice of four held-out materials."""
-
-    name = "crossval"
     title = "Every choice of held-out materials"
     about = "balanced accuracy, %, on every choice of held-out materials"
     page, has_headings = "docs/recipes.md", False
-    sizes = Sizes()
-    quick = Sizes(
-        (
-            "data.cycles=4",
-            "materials=[M1,M2,iron]",
-            "num_unseen=1",
-            "train_bins=20",
-            "scored_bins=20",
-            "~recipes.paper",
-            "~recipes.general",
-            "recipes.robust.num_features=10",
-            "recipes.robust.penalties=[0.001]",
-        )
+    quick = (
+        'overrides=[data.cycles=4,"materials=[M1,M2,iron]",num_unseen=1,train_bins=20,'
+        'scored_bins=20,"~recipes.paper","~recipes.general",recipes.robust.num_features=10,'
+        '"recipes.robust.penalties=[0.001]"]'
     )
     drawn: ClassVar = {"crossval.png": ""}
+    overrides: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = (0,)
 
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """What the command leaves with each seed; with ``seed=...`` given, with that one alone."""
         given = [each for each in job.overrides if each.startswith("seed=")]
         runs = []
-        for seed in given[-1:] or [f"seed={seed}" for seed in job.sizes.seeds]:
-            overrides = [*job.sizes.overrides, *job.overrides, *([] if given else [seed])]
+        for seed in given[-1:] or [f"seed={seed}" for seed in self.seeds]:
+            overrides = [*self.overrides, *job.overrides, *([] if given else [seed])]
             folder = job.folder / seed.replace("=", "-")
             found = result_of("crossval", overrides, folder, "crossval.json")
             runs.append(found | {"code": code_digest(), "folder": str(folder)})

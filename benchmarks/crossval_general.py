@@ -5,14 +5,17 @@ It takes longest, so it has a run and a table of its own.
 
 from __future__ import annotations
 
-from benchmarks.crossval import Crossval, Sizes
+from dataclasses import dataclass
+
+from benchmarks.crossval import Crossval
 
 
+@dataclass(frozen=True)
 class CrossvalGeneral(Crossval):
     """The general recipe alone."""
 
-    name = "crossval_general"
-    sizes = Sizes(("~recipes.paper", "~recipes.robust"), seeds=(0, 4))
+    overrides: tuple[str, ...] = ("~recipes.paper", "~recipes.robust")
+    seeds: tuple[int, ...] = (0, 4)
 
 
 if __name__ == "__main__":

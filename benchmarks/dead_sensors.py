@@ -16,9 +16,10 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.harness import Benchmark, Job, Report, Table, bars, by, percent, say
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import SEEN_ROLE, Trained
-from tactslip_torch import HandLayout
+from benchmarks.tables import Report, Table, bars, by, percent
+from tactslip_torch import HandLayout, SlipDetector
 from tactslip_torch.model.calibration import (
     Calibration,
     calibration_from_dict,
@@ -29,22 +30,10 @@ from tactslip_torch.model.calibration import (
 )
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.missing_channels import ClassGaussians, channel_mask, missing_scores
+from tactslip_torch.training.recipe import balanced_accuracy
 
 OURS, REFIT = "closed form", "refit"
 _CALIBRATED_ON = 3000  # training bins at most that a refitted machine is calibrated on
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
-
-    Args:
-        training: overrides of ``tactslip_torch.train``.
-        halves: random halves of the channels.
-    """
-
-    training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
-    halves: int = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,37 +45,35 @@ class _Bins:
     material: Tensor
 
 
-class DeadSensors(Benchmark[Sizes]):
-    """Losses of sensors, and ways to go on."""
+@dataclass(frozen=True)
+class DeadSensors(Benchmark):
+    """Losses of sensors, and ways to go on.
 
-    name = "dead_sensors"
+    Args:
+        training: overrides of ``tactslip_torch.train``.
+        halves: random halves of the channels.
+    """
+
     title = "Dead sensors"
     about = "balanced accuracy and calibration without some sensors, by way to go on"
-    sizes = Sizes()
-    quick = Sizes(
-        (
-            "+exp=unseen4",
-            "recipe=robust",
-            "data.cycles=4",
-            "data.materials=[M1,M2,iron]",
-            "split.seen=[M1,M2]",
-            "split.unseen=[iron]",
-            "recipe.num_features=20",
-            "recipe.penalties=[0.001,0.01]",
-        ),
-        halves=1,
+    quick = (
+        'training=[+exp=unseen4,recipe=robust,data.cycles=4,"data.materials=[M1,M2,iron]",'
+        '"split.seen=[M1,M2]","split.unseen=[iron]",recipe.num_features=20,'
+        '"recipe.penalties=[0.001,0.01]"] halves=1'
     )
+    training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
+    halves: int = 20
 
     @torch.no_grad()
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """A row for each loss, role and way; of losses that take a feature and leave one."""
-        training = [*job.sizes.training, *job.overrides]
+        training = [*self.training, *job.overrides]
         trained = Trained.by(training, job.folder, job.folder / "cache")
         detector = trained.detector
         bins = {role: _bins_of(trained, role) for role in ("train", *SEEN_ROLE)}
         calibration = calibration_from_dict(detector.info["calibration"])
-        rows = []
-        for kind, name, channels in _losses(detector.pool.hand, job.sizes.halves):
+        rows, ways = [], _ways(detector)
+        for kind, name, channels in _losses(detector.pool.hand, self.halves):
             dead = channel_mask(channels, detector.pool.hand.names)
             is_lost = dead[detector.channel_index]
             if not is_lost.any() or is_lost.all():
@@ -94,18 +81,16 @@ class DeadSensors(Benchmark[Sizes]):
             say(f"dead sensors: without {name}, {int(is_lost.sum())} features less")
             head, of_refit = _refitted(bins["train"], is_lost, float(detector.info["penalty"]))
             for role in SEEN_ROLE:
-                own = bins[role]
-                loss = {"kind": kind, "lost": name, "role": role}
-                for way, (gaussians, fill) in _ways(trained).items():
-                    whole, lost = detector.head(own.z), is_lost.expand(len(own.z), -1)
-                    score, variance = missing_scores(
-                        detector.head, gaussians, fill, whole, own.z, lost
-                    )
-                    stated = probability(widened_llr(calibration, score, variance), 0.5)
-                    rows.append(loss | {"way": way} | _evaluated(own, score, stated))
-                score = head(own.z[:, ~is_lost])
-                stated = probability(widened_llr(of_refit, score, torch.zeros_like(score)), 0.5)
-                rows.append(loss | {"way": REFIT} | _evaluated(own, score, stated))
+                z, lost = bins[role].z, is_lost.expand(len(bins[role].z), -1)
+                whole, refit = detector.head(z), head(z[:, ~is_lost])
+                scored = {
+                    way: (calibration, *missing_scores(detector.head, *of, whole, z, lost))
+                    for way, of in ways.items()
+                } | {REFIT: (of_refit, refit, torch.zeros_like(refit))}
+                for way, (calibrated, score, variance) in scored.items():
+                    stated = probability(widened_llr(calibrated, score, variance), 0.5)
+                    row = {"kind": kind, "lost": name, "role": role, "way": way}
+                    rows.append(row | _evaluated(bins[role], score, stated))
         return {"rows": rows}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
@@ -127,7 +112,7 @@ class DeadSensors(Benchmark[Sizes]):
         kinds = [kind for (kind,) in by(rows, "kind")]
         series = {
             way: [
-                mean(100 * row["balanced_accuracy"] for row in of)
+                100 * mean(row["balanced_accuracy"] for row in of)
                 for of in by(own, "kind").values()
             ]
             for (way,), own in by(rows, "way").items()
@@ -173,19 +158,16 @@ def _losses(hand: HandLayout, halves: int) -> list[tuple[str, str, list[str]]]:
     return found
 
 
-def _ways(trained: Trained) -> dict[str, tuple[ClassGaussians | None, Tensor]]:
-    detector = trained.detector
+def _ways(detector: SlipDetector) -> dict[str, tuple[ClassGaussians | None, Tensor]]:
     imputation = detector.imputation
     assert imputation is not None  # as trained
     silent = torch.zeros(len(detector.pool.hand), detector.pool.bin_samples)
     features = detector.pool(detector.pool.widen(silent))[list(detector.selected)].double()
-    fills = {
-        "mean-fill": imputation,
-        "zero-fill": torch.zeros_like(imputation),
-        "0 V": detector.scaler(features),
-    }
-    return {OURS: (detector.gaussians, imputation)} | {
-        name: (None, fill) for name, fill in fills.items()
+    return {
+        OURS: (detector.gaussians, imputation),
+        "mean-fill": (None, imputation),
+        "zero-fill": (None, torch.zeros_like(imputation)),
+        "0 V": (None, detector.scaler(features)),
     }
 
 
@@ -201,10 +183,9 @@ def _refitted(training: _Bins, is_lost: Tensor, penalty: float) -> tuple[Any, Ca
 
 
 def _evaluated(bins: _Bins, score: Tensor, stated: Tensor) -> dict[str, float]:
-    is_right = (score >= 0) == bins.is_slip
-    recalls = [is_right[bins.is_slip].double().mean(), is_right[~bins.is_slip].double().mean()]
-    calibration = reliability(stated, bins.is_slip, weights=_class_weights(bins.is_slip))
-    return {"balanced_accuracy": float(sum(recalls)) / 2, "ece": calibration["ece"]}
+    weights = _class_weights(bins.is_slip)
+    ece = reliability(stated, bins.is_slip, weights=weights)["ece"]
+    return {"balanced_accuracy": balanced_accuracy(score >= 0, bins.is_slip) or 0.0, "ece": ece}
 
 
 def _class_weights(is_slip: Tensor) -> Tensor:

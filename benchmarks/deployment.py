@@ -19,23 +19,9 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 from benchmarks import ROOT
-from benchmarks.harness import (
-    Benchmark,
-    Job,
-    Report,
-    Spread,
-    Table,
-    bars,
-    in_fresh_process,
-    interleaved,
-    number,
-    on_threads,
-    say,
-    timed,
-)
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import (
     FLOAT32,
     FLOAT64,
@@ -47,37 +33,17 @@ from benchmarks.subjects import (
     raw_bins,
     stream_samples,
 )
+from benchmarks.tables import Report, Spread, Table
+from benchmarks.timing import in_fresh_process, interleaved, on_threads, timed
 from tactslip_torch import SlipDetector, StreamingDetector
 from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.signals.filtering import ChannelFilter
 
-Precision = Literal["float32", "float64"]
-PRECISIONS: tuple[Precision, ...] = ("float32", "float64")
-DTYPES = {"float32": FLOAT32, "float64": FLOAT64}
+DTYPES: dict[Literal["float32", "float64"], torch.dtype] = {
+    "float32": FLOAT32,
+    "float64": FLOAT64,
+}
 REFERENCE = "reference, float64"
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
-
-    Args:
-        recordings: simulated, to whose bins the machine is fitted.
-        evaluated: bins whose scores are held against the reference.
-        rounds: of every way.
-        bulk: bins at once.
-        push: samples of a push of a stream.
-        streamed_s: of stream, whose scores are held against the package.
-        starts: of every fresh process.
-    """
-
-    recordings: int = 33
-    evaluated: int = 2000
-    rounds: int = 20
-    bulk: tuple[int, ...] = (16, 256)
-    push: int = 200
-    streamed_s: float = 20.0
-    starts: int = 3
 
 
 def host(module: str) -> Any:
@@ -104,62 +70,71 @@ def bin_scores(path: Path) -> Callable[[torch.Tensor], Array]:
     return scores
 
 
-class Deployment(Benchmark[Sizes]):
-    """Files of the export beside the package."""
+@dataclass(frozen=True)
+class Deployment(Benchmark):
+    """Files of the export beside the package.
 
-    name = "deployment"
+    Args:
+        recordings: simulated, to whose bins the machine is fitted.
+        evaluated: bins whose scores are held against the reference.
+        rounds: of every way.
+        bulk: bins at once.
+        push: samples of a push of a stream.
+        streamed_s: of stream, whose scores are held against the package.
+        starts: of every fresh process.
+    """
+
     title = "Deployed: files in onnxruntime"
     about = (
         "the main job's detector exported to ONNX and run by onnxruntime, beside the package, on "
         "1 thread"
     )
-    sizes = Sizes()
-    quick = Sizes(
-        recordings=1, evaluated=16, rounds=2, bulk=(4,), push=100, streamed_s=2.0, starts=1
-    )
+    bars = (("Bins", "us a bin"), ("A stream", "us a push"))
+    quick = "recordings=1 evaluated=16 rounds=2 bulk=[4] push=100 streamed_s=2.0 starts=1"
     libraries = ("onnxruntime", "onnx")
+    recordings: int = 33
+    evaluated: int = 2000
+    rounds: int = 20
+    bulk: tuple[int, ...] = (16, 256)
+    push: int = 200
+    streamed_s: float = 20.0
+    starts: int = 3
 
     @torch.inference_mode()
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Files, bins, streams and fresh processes."""
-        sizes = job.sizes
-        main = MainJobDetector.fitted(sizes.recordings)
+        main = MainJobDetector.fitted(self.recordings)
         with TemporaryDirectory(prefix="tactslip-bench-") as folder, on_threads(1):
             files = []
             main.detector().save(Path(folder) / "detector.pt")
-            for precision in PRECISIONS:
+            for precision in DTYPES:
                 say(f"deployment: export, {precision}")
                 place = Path(folder) / precision
                 place.mkdir()
                 export = partial(export_detector, main.detector(), place, precision=precision)
                 seconds, _ = timed(export)
                 for name in ("model.onnx", "stream.onnx"):
-                    size = (place / name).stat().st_size
-                    files.append(
-                        {"file": f"{name}, {precision}", "bytes": size, "seconds": seconds}
-                    )
+                    row = {"file": f"{name}, {precision}", "seconds": seconds}
+                    files.append(row | {"bytes": (place / name).stat().st_size})
             return {
                 "files": files,
-                "bins": _bins(main, Path(folder), sizes),
-                "streams": _streams(main, Path(folder), sizes),
-                "starts": _starts(Path(folder), sizes),
-                "push": sizes.push,
+                "bins": _bins(main, Path(folder), self),
+                "streams": _streams(main, Path(folder), self),
+                "starts": _starts(Path(folder), self.starts),
+                "push": self.push,
             }
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Bins, streams, files, starts."""
         bins = [
             {"way": row["way"]}
-            | {f"us a bin, {of} at once": Spread(*us).text() for of, us in row["us"].items()}
-            | {"error": number(row["error"]), "flips": row["flips"]}
+            | {f"us a bin, {of} at once": Spread(*us) for of, us in row["us"].items()}
+            | {"error": row["error"], "flips": row["flips"]}
             for row in numbers["bins"]
         ]
+        push = f"us a push of {numbers['push']} samples"
         streams = [
-            {
-                "way": row["way"],
-                f"us a push of {numbers['push']} samples": Spread.of(row["seconds"], 1e6).text(),
-                "error": number(row["error"]),
-            }
+            {"way": row["way"], push: Spread.of(row["seconds"], 1e6), "error": row["error"]}
             for row in numbers["streams"]
         ]
         files = [
@@ -170,12 +145,9 @@ class Deployment(Benchmark[Sizes]):
             }
             for row in numbers["files"]
         ]
+        parts = ("import", "load", "first")
         starts = [
-            {"way": row["way"]}
-            | {
-                f"{part} s": f"{median(row[f'{part}_s']):.2f}"
-                for part in ("import", "load", "first")
-            }
+            {"way": row["way"]} | {f"{of} s": f"{median(row[f'{of}_s']):.2f}" for of in parts}
             for row in numbers["starts"]
         ]
         note = (
@@ -189,24 +161,12 @@ class Deployment(Benchmark[Sizes]):
             "A first score in a fresh process": Table(starts),
         }
 
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Latency of a bin and of a push."""
-        bins, streams = drawing.subplots(2, 1)
-        rows = numbers["bins"]
-        values = {f"{size} at once": [row["us"][size][0] for row in rows] for size in rows[0]["us"]}
-        bars(bins, [row["way"] for row in rows], values, "us a bin")
-        rows = numbers["streams"]
-        pushes = {"push": [Spread.of(row["seconds"], 1e6).median for row in rows]}
-        about = f"us a push of {numbers['push']} samples"
-        bars(streams, [row["way"] for row in rows], pushes, about)
 
-
-def _bins(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str, Any]]:
+def _bins(main: MainJobDetector, folder: Path, sizes: Deployment) -> list[dict[str, Any]]:
     ways: dict[str, Callable[[torch.Tensor], Any]] = {}
-    for precision in PRECISIONS:
+    for precision, dtype in DTYPES.items():
         ways[f"onnxruntime, {precision}"] = bin_scores(folder / precision / "model.onnx")
-        detector = main.detector(DTYPES[precision])
-        ways[f"tactslip_torch, {precision}"] = partial(_score, detector, DTYPES[precision])
+        ways[f"tactslip_torch, {precision}"] = partial(_score, main.detector(dtype), dtype)
     ways[REFERENCE] = partial(_score, main.detector(FLOAT64, "torch"), FLOAT64)
     us: dict[str, dict[str, Spread]] = {name: {} for name in ways}
     for size in (1, *sizes.bulk):
@@ -214,7 +174,7 @@ def _bins(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str, A
         bins = raw_bins(size)
         timings = interleaved({n: partial(way, bins) for n, way in ways.items()}, sizes.rounds)
         for name, timing in timings.items():
-            us[name][str(size)] = Spread.of(timing.per_round, 1e6 / size)
+            us[name][str(size)] = Spread.of(timing["seconds"], 1e6 / size)
     evaluated = raw_bins(sizes.evaluated, min(sizes.recordings, 12))
     scores = {n: np.asarray(way(evaluated), np.float64).ravel() for n, way in ways.items()}
     exact = scores[REFERENCE]
@@ -233,19 +193,16 @@ def _score(detector: SlipDetector, dtype: torch.dtype, samples: torch.Tensor) ->
     return detector.predict_raw(samples.to(dtype)).score
 
 
-def _streams(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str, Any]]:
+def _streams(main: MainJobDetector, folder: Path, sizes: Deployment) -> list[dict[str, Any]]:
     samples = stream_samples(1)
     part = samples[: round(sizes.streamed_s * RATE_HZ)]
     pushes: dict[str, Callable[[Array], Any]] = {}
     scores = {}
-    for precision in PRECISIONS:
-        dtype = DTYPES[precision]
-        file = folder / precision / "stream.onnx"
+    for precision, dtype in DTYPES.items():
+        file, detector = folder / precision / "stream.onnx", main.detector(dtype)
         ways: dict[str, Callable[[], Any]] = {
             f"onnxruntime, {precision}": partial(host("stream").Stream, file),
-            f"tactslip_torch, {precision}": partial(
-                StreamingDetector, main.detector(dtype), dtype=dtype
-            ),
+            f"tactslip_torch, {precision}": partial(StreamingDetector, detector, dtype=dtype),
         }
         for name, make in ways.items():
             watched = make()
@@ -253,20 +210,11 @@ def _streams(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str
             scores[name] = np.concatenate(each)
             pushes[name] = make().push
     say("deployment: streams")
-    calls = {
-        name: partial(_next_push, push, endless(samples, sizes.push))
-        for name, push in pushes.items()
-    }
+    calls = {n: partial(_next_push, of, endless(samples, sizes.push)) for n, of in pushes.items()}
     timings = interleaved(calls, sizes.rounds, block_s=0.02)
     exact = scores["tactslip_torch, float64"]
-    return [
-        {
-            "way": name,
-            "seconds": timings[name].per_round,
-            "error": float(np.abs(scores[name] - exact).max() / exact.std()),
-        }
-        for name in pushes
-    ]
+    errors = {name: float(np.abs(of - exact).max() / exact.std()) for name, of in scores.items()}
+    return [{"way": n, "seconds": timings[n]["seconds"], "error": errors[n]} for n in pushes]
 
 
 def _scores_of(pushed: Any) -> Array:
@@ -278,20 +226,16 @@ def _next_push(push: Callable[[Array], Any], samples: Any) -> None:
     push(next(samples))
 
 
-def _starts(folder: Path, sizes: Sizes) -> list[dict[str, Any]]:
+def _starts(folder: Path, num: int) -> list[dict[str, Any]]:
     np.save(folder / "bin.npy", raw_bins(1).numpy())
-    ways = {
-        "onnxruntime, float32": folder / "float32" / "model.onnx",
-        "tactslip_torch": folder / "detector.pt",
-    }
     rows = []
-    for way, path in ways.items():
+    for way, file in (
+        ("onnxruntime, float32", "float32/model.onnx"),
+        ("tactslip_torch", "detector.pt"),
+    ):
         say(f"deployment: fresh processes with {way}")
-        given = {"path": str(path), "bin_path": str(folder / "bin.npy")}
-        start = "by_package" if path.suffix == ".pt" else "by_onnxruntime"
-        found = [
-            in_fresh_process(f"benchmarks.starts:{start}", **given) for _ in range(sizes.starts)
-        ]
+        given = {"path": str(folder / file), "bin_path": str(folder / "bin.npy")}
+        found = [in_fresh_process("benchmarks.starts:first_score", **given) for _ in range(num)]
         rows.append({"way": way} | {part: [one[part] for one in found] for part in found[0]})
     return rows
 

@@ -13,30 +13,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.harness import (
-    Benchmark,
-    Job,
-    Report,
-    Spread,
-    Table,
-    bars,
-    interleaved,
-    number,
-    on_threads,
-)
+from benchmarks.harness import Benchmark, Job
 from benchmarks.peers import arrays, loop, others, rockets
 from benchmarks.subjects import FLOAT32, FLOAT64, labelled_bins
+from benchmarks.tables import Report, Spread, Table
+from benchmarks.timing import interleaved, on_threads
 from tactslip_torch import FeaturePool, HandLayout
 
 HAND = HandLayout.paper24()
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
+class Features(Benchmark):
+    """All features of simulated bins, by the package and by its peers.
 
     Args:
         bins: of a call of the package and of MiniRocket.
@@ -46,65 +37,46 @@ class Sizes:
         rounds: of every call.
     """
 
+    title = "Features: the whole pool"
+    about = "all features of filtered simulated bins of 24 channels and 50 ms"
+    bars = (("Time and error", "us a bin"),)
+    quick = "bins=32 slow_bins=4 num_kernels=168 rounds=2"
+    libraries = ("PyWavelets", "ptwt", "tsfel", "aeon")
     bins: int = 4096
     slow_bins: int = 256
     num_kernels: int = 10_000
     threads: int = 2
     rounds: int = 7
 
-
-class Features(Benchmark[Sizes]):
-    """All features of simulated bins, by the package and by its peers."""
-
-    name = "features"
-    title = "Features: the whole pool"
-    about = "all features of filtered simulated bins of 24 channels and 50 ms"
-    sizes = Sizes()
-    quick = Sizes(bins=32, slow_bins=4, num_kernels=168, rounds=2)
-    libraries = ("PyWavelets", "ptwt", "tsfel", "aeon")
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Every way once a round."""
-        sizes = job.sizes
         some, _ = labelled_bins(1)
-        bins = some[torch.arange(sizes.bins) % len(some)].clone()
-        few = bins[: sizes.slow_bins]
-        rocket = rockets.mini_rocket(bins[:64].numpy(), sizes.threads, sizes.num_kernels)
+        bins = some[torch.arange(self.bins) % len(some)].clone()
+        few = bins[: self.slow_bins]
+        rocket = rockets.mini_rocket(bins[:64].numpy(), self.threads, self.num_kernels)
         names = [(n.channel, n.component, n.domain, n.descriptor) for n in FeaturePool(HAND).names]
         windows = bins.float().numpy()
         ways: dict[str, tuple[int, Callable[[], Any]]] = {
             "tactslip_torch, float64": (len(bins), partial(_pool(FLOAT64), bins)),
             "tactslip_torch, float32": (len(bins), partial(_pool(FLOAT32), bins.float())),
             "reference, float64": (len(few), partial(FeaturePool(HAND, backend="torch"), few)),
-            "NumPy and PyWavelets, batched": (
-                len(few),
-                partial(arrays.features, few.numpy(), 14),
-            ),
-            "SciPy and PyWavelets, a loop": (
-                1,
-                partial(_looped, few[0].numpy(), names),
-            ),
+            "NumPy and PyWavelets, batched": (len(few), partial(arrays.features, few.numpy(), 14)),
+            "SciPy and PyWavelets, a loop": (1, partial(_looped, few[0].numpy(), names)),
             "aeon MiniRocket, transform": (len(windows), partial(rocket.transform, windows)),
             "TSFEL, all features": (1, partial(others.tsfel_features(), few[0].numpy())),
         }
-        with torch.inference_mode(), on_threads(sizes.threads):
+        with torch.inference_mode(), on_threads(self.threads):
             calls = {name: call for name, (_, call) in ways.items()}
-            timings = interleaved(calls, sizes.rounds, block_s=0)
+            timings = interleaved(calls, self.rounds, block_s=0)
             truth = torch.as_tensor(calls["reference, float64"]())
             rows = []
             for name, (num, call) in ways.items():
                 found = torch.as_tensor(np.atleast_2d(call()))
                 is_same = found.shape[1] == truth.shape[1] and "Rocket" not in name
-                rows.append(
-                    {
-                        "way": name,
-                        "features": found.shape[1],
-                        "bins": num,
-                        "seconds": timings[name].per_round,
-                        "error": feature_error(found, truth) if is_same else None,
-                    }
-                )
-        return {"threads": sizes.threads, "rows": rows}
+                error = feature_error(found, truth) if is_same else None
+                row = {"way": name, "features": found.shape[1], "bins": num, "error": error}
+                rows.append(row | {"seconds": timings[name]["seconds"]})
+        return {"threads": self.threads, "rows": rows}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Time of a bin and error of each way."""
@@ -118,19 +90,13 @@ class Features(Benchmark[Sizes]):
             {
                 "way": row["way"],
                 "features": row["features"],
-                "us a bin": Spread.of(row["seconds"], 1e6 / row["bins"]).text(),
+                "us a bin": Spread.of(row["seconds"], 1e6 / row["bins"]),
                 "bins a call": row["bins"],
-                "error": number(row["error"]),
+                "error": row["error"],
             }
             for row in numbers["rows"]
         ]
         return {"Time and error": Table(rows, note)}
-
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Time of a bin."""
-        rows = numbers["rows"]
-        values = [Spread.of(row["seconds"], 1e6 / row["bins"]).median for row in rows]
-        bars(drawing.subplots(), [row["way"] for row in rows], {"time": values}, "us a bin")
 
 
 def feature_error(found: Tensor, reference: Tensor) -> float:

@@ -16,34 +16,22 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
-from benchmarks.harness import (
-    Benchmark,
-    Job,
-    Report,
-    Spread,
-    Table,
-    bars,
-    interleaved,
-    limit,
-    limits,
-    number,
-    on_threads,
-    paired_ratio,
-    say,
-)
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import Array
+from benchmarks.tables import Report, Spread, Table, limits, number
+from benchmarks.timing import interleaved, on_threads, paired_ratio
 from tactslip_torch.data.formats import FORMATS, Archived, pieces
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 
 LOAD, STRETCHES, SAVE, LIBRARY = "loaded whole", "read by stretches", "written", "by its library"
+WAYS = (LOAD, STRETCHES, SAVE, LIBRARY)
 LIMITED = ("npz", "hdf5", "mcap")
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
+class Formats(Benchmark):
+    """Every format, read and written in turns.
 
     Args:
         duration_s: of the recording.
@@ -51,56 +39,47 @@ class Sizes:
         rounds: of every call.
     """
 
+    title = "Files"
+    about = "a simulated recording of 24 channels at 2 kHz in float32, in every format on 1 thread"
+    bars = (("Reading", ("whole, ms", "by stretches, ms", "by its library, ms")),)
+    quick = "duration_s=1.0 rounds=2"
+    libraries = ("h5py", "mcap", "rosbags", "pyarrow")
     duration_s: float = 14.0
     stretch_ms: float = 100.0
     rounds: int = 15
 
-
-class Formats(Benchmark[Sizes]):
-    """Every format, read and written in turns."""
-
-    name = "formats"
-    title = "Files"
-    about = "a simulated recording of 24 channels at 2 kHz in float32, in every format on 1 thread"
-    sizes = Sizes()
-    quick = Sizes(duration_s=1.0, rounds=2)
-    libraries = ("h5py", "mcap", "rosbags", "pyarrow")
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Seconds of every way, each of which is checked first."""
-        sizes = job.sizes
-        written = _recording(sizes.duration_s)
+        written = _recording(self.duration_s)
         samples = written.recording.samples
-        stretch = round(sizes.stretch_ms * 1e-3 * written.recording.sample_rate_hz)
+        stretch = round(self.stretch_ms * 1e-3 * written.recording.sample_rate_hz)
         with TemporaryDirectory() as folder, on_threads(1):
             calls: dict[str, Callable[[], Any]] = {}
             files = {name: Path(folder, f"a.{of.endings[0]}") for name, of in FORMATS.items()}
             for name, path in files.items():
                 of = FORMATS[name]
-                calls[f"{name} {SAVE}"] = partial(of.save, path, *written)
                 of.save(path, *written)
-                calls[f"{name} {LOAD}"] = partial(of.load, path)
-                calls[f"{name} {STRETCHES}"] = partial(_by_stretches, name, path, stretch)
-                calls[f"{name} {LIBRARY}"] = partial(_LIBRARIES[name][1], path)
-                for found in (
-                    of.load(path).recording.samples,
-                    _by_stretches(name, path, stretch),
-                    _LIBRARIES[name][1](path),
-                ):
-                    if not np.array_equal(np.asarray(found), samples.numpy()):
+                ways: dict[str, Callable[[], Any]] = {
+                    LOAD: partial(of.load, path),
+                    STRETCHES: partial(_by_stretches, name, path, stretch),
+                    LIBRARY: partial(_LIBRARIES[name][1], path),
+                }
+                for read in ways.values():
+                    found = read()
+                    read_samples = found.recording.samples if isinstance(found, Archived) else found
+                    if not np.array_equal(np.asarray(read_samples), samples.numpy()):
                         raise ValueError(f"{name}: what was read is not what was written")
-            say(f"formats: {sizes.rounds} rounds of {len(calls)} calls")
-            timings = interleaved(calls, sizes.rounds)
+                ways[SAVE] = partial(of.save, path, *written)
+                calls |= {f"{name} {way}": call for way, call in ways.items()}
+            say(f"formats: {self.rounds} rounds of {len(calls)} calls")
+            timings = interleaved(calls, self.rounds)
             rows = [
                 {
                     "format": name,
                     "ending": FORMATS[name].endings[0],
                     "bytes": _bytes(path),
                     "library": _LIBRARIES[name][0],
-                    "seconds": {
-                        way: timings[f"{name} {way}"].per_round
-                        for way in (LOAD, STRETCHES, SAVE, LIBRARY)
-                    },
+                    "seconds": {way: timings[f"{name} {way}"]["seconds"] for way in WAYS},
                 }
                 for name, path in files.items()
             ]
@@ -108,49 +87,31 @@ class Formats(Benchmark[Sizes]):
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Limits, reading and writing."""
-        rows, reading, writing = numbers["rows"], [], []
+        rows, reading, writing, goals = numbers["rows"], [], [], []
         for row in rows:
-            ms = {way: Spread.of(of, 1e3).text() for way, of in row["seconds"].items()}
-            ratio = paired_ratio(row["seconds"][LIBRARY], row["seconds"][LOAD]).median
+            ms, file = (
+                {way: Spread.of(of, 1e3) for way, of in row["seconds"].items()},
+                row["ending"],
+            )
             reading.append(
                 {
-                    "file": f".{row['ending']}",
+                    "file": f".{file}",
                     "whole, ms": ms[LOAD],
                     "by stretches, ms": ms[STRETCHES],
                     "library": row["library"],
-                    "its ms": ms[LIBRARY],
-                    "library / whole": number(ratio),
+                    "by its library, ms": ms[LIBRARY],
+                    "library / whole": paired_ratio(
+                        row["seconds"][LIBRARY], row["seconds"][LOAD]
+                    ).median,
                 }
             )
-            writing.append(
-                {
-                    "file": f".{row['ending']}",
-                    "ms": ms[SAVE],
-                    "kB": f"{row['bytes'] / 1e3:,.0f}",
-                    "bytes / samples": number(row["bytes"] / numbers["sample_bytes"]),
-                }
-            )
-        goals = [
-            limit(
-                f".{row['ending']} {way}, median",
-                Spread.of(row["seconds"][way], 1e3).median,
-                100,
-                "ms",
-            )
-            for row in rows
-            if row["format"] in LIMITED
-            for way in (LOAD, STRETCHES)
-        ]
+            size = {"kB": f"{row['bytes'] / 1e3:,.0f}"}
+            size["bytes / samples"] = number(row["bytes"] / numbers["sample_bytes"])
+            writing.append({"file": f".{file}", "ms": ms[SAVE]} | size)
+            if row["format"] in LIMITED:
+                for way in (LOAD, STRETCHES):
+                    goals.append((f".{file} {way}, median", ms[way].median, 100, "ms"))
         return {"Limits": limits(goals), "Reading": Table(reading), "Writing": Table(writing)}
-
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Three bars a format."""
-        rows = numbers["rows"]
-        series = {
-            way: [Spread.of(row["seconds"][way], 1e3).median for row in rows]
-            for way in (LOAD, STRETCHES, LIBRARY)
-        }
-        bars(drawing.subplots(), [f".{r['ending']}" for r in rows], series, "ms to read all")
 
 
 def _recording(duration_s: float) -> Archived:

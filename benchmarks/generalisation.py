@@ -13,6 +13,8 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -24,19 +26,16 @@ from torch import Tensor
 
 from benchmarks import ROOT
 from benchmarks.harness import (
-    OURS,
-    PEER,
     Benchmark,
     Job,
-    Report,
-    Table,
     between_markers,
     code_digest,
-    mean_sd,
+    resumed,
     trained,
     write_text,
 )
 from benchmarks.subjects import composed
+from benchmarks.tables import OURS, PEER, Report, Table, mean_sd
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split, unseen4
 from tactslip_torch.features.bin_sample import bin_keys
@@ -76,41 +75,39 @@ called slip, and of errors, at most; of the others at least."""
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Seeds of each experiment, and overrides of every training and set of recordings."""
+class Generalisation(Benchmark):
+    """Every experiment with every seed.
 
+    Seeds of each experiment, and overrides of every training and set of recordings.
+    """
+
+    title = "Generalisation: materials, sessions, arms and sensors that were not trained on"
+    about = (
+        "detectors on what they were not trained on, several seeds. Balanced accuracy in %, unless "
+        "a row says otherwise; all data are **simulated**. Everything was chosen by validation on "
+        "training materials. *Worst* is the worst seed; *wanted* was set before. Baselines were "
+        "fitted on the same training bins. `+exp=hard` is the protocol on a simulated hand whose "
+        "channels differ without slip, as real ones do ([how it was held against a real one]"
+        "(../benchmarks/results/realism.json): `python -m benchmarks.realism`)"
+    )
+    page, is_page = "docs/generalisation.md", True
+    quick = "unseen4=[0] deploy=[] hard=[0] overrides=[data.cycles=5]"
     unseen4: tuple[int, ...] = (0, 1, 2, 3, 4)
     deploy: tuple[int, ...] = (0, 1, 2, 3, 4)
     hard: tuple[int, ...] = (0, 1, 2, 3, 4)
     overrides: tuple[str, ...] = ()
 
-
-class Generalisation(Benchmark[Sizes]):
-    """Every experiment with every seed."""
-
-    name = "generalisation"
-    title = "Generalisation: materials, sessions, arms and sensors that were not trained on"
-    about = "detectors on what they were not trained on, several seeds"
-    page = "docs/generalisation.md"
-    sizes = Sizes()
-    quick = Sizes((0,), (), (0,), ("data.cycles=5",))
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """All measures of each seed, and what the main job prints."""
-        found: dict[str, Any] = {"code": {}, "experiments": {}, "hard": {}}
-        cache = job.folder / "cache"
-        for name in ("unseen4", "deploy", "hard"):
-            for seed in getattr(job.sizes, name):
-                kept = job.folder / f"measures-{name}-{seed}.json"
-                of = json.loads(kept.read_text()) if kept.exists() else {}
-                if of.get("code") != code_digest():
-                    given = [f"seed={seed}", *job.sizes.overrides, *job.overrides]
-                    run = hard_run if name == "hard" else seed_run
-                    of = {"code": code_digest(), "of": run(name, given, job.folder, cache)}
-                    write_text(kept, json.dumps(of) + "\n")
-                place = found if name == "hard" else found["experiments"]
-                place.setdefault(name, {})[str(seed)] = of["of"]
-                found["code"][name] = of["code"]
+        by_name: dict[str, dict[str, Any]] = {"unseen4": {}, "deploy": {}, "hard": {}}
+        for name, own in by_name.items():
+            for seed in getattr(self, name):
+                given = [f"seed={seed}", *self.overrides, *job.overrides]
+                run = partial(hard_run if name == "hard" else seed_run, name, given, job.folder)
+                own[str(seed)] = resumed(job.folder / f"measures-{name}-{seed}.json", given, run)
+        hard = by_name.pop("hard")
+        found = {"code": dict.fromkeys([*by_name, "hard"], code_digest()), "hard": hard}
+        found["experiments"] = {name: own for name, own in by_name.items() if own}
         metrics = json.loads((job.folder / "unseen4-seed-0" / "metrics.json").read_text())
         return found | {"main job": splits_table(metrics)}
 
@@ -128,22 +125,6 @@ class Generalisation(Benchmark[Sizes]):
             rows = _rows(list(hard.values()), ("nested validation", "test", "unseen"))
             found["`+exp=hard`"] = Table(rows, f"{_about(numbers, 'hard')} {_ahead(hard)}")
         return found
-
-    def section(self, report: Report) -> str:
-        """The whole page."""
-        parts = [
-            "Written by `python -m benchmarks.generalisation`; no number is typed by hand. All "
-            "data are **simulated**. Balanced accuracy in %, unless a row says otherwise. "
-            "Everything was chosen by validation on training materials. *Worst* is the worst seed; "
-            "*wanted* was set before. Baselines were fitted on the same training bins. `+exp=hard` "
-            "is the protocol on a simulated hand whose channels differ without slip, as real ones "
-            "do ([how it was held against a real one](../benchmarks/results/realism.json): "
-            "`python -m benchmarks.realism`).",
-            "![Measures by seed](../benchmarks/results/generalisation.png)",
-        ]
-        for title, table in self.tables(report["numbers"]).items():
-            parts += [f"## {title}", table.markdown()]
-        return "\n\n".join(parts)
 
     def publish(self, report: Report, folder: Path) -> None:
         """The page, and README's first result: what the main job prints, and all seeds."""
@@ -174,27 +155,23 @@ class Generalisation(Benchmark[Sizes]):
         drawing.set_size_inches(12, 3.8)
         found, called, by_seed = drawing.subplots(1, 3)
         labels = ["test", "held-out materials", "another session"]
+        measures = {found: "slips at {:g} mV found", called: "moving arm at {:g} mV called slip"}
         for (name, own), color in zip(numbers["experiments"].items(), (OURS, PEER), strict=False):
-            for axes, measure in (
-                (found, "slips at {:g} mV found"),
-                (called, "moving arm at {:g} mV called slip"),
-            ):
-                for side, style in (("seen", "--"), ("held out", "-")):
-                    keys = [f"{measure.format(mv)}, {side}" for mv in LEVELS_MV]
-                    means = [fmean(of[key] for of in own.values()) for key in keys]
-                    text = f"{name}, {side}"
-                    axes.plot(LEVELS_MV, means, style, marker="o", color=color, label=text)
+            for (axes, measure), side in product(measures.items(), ("seen", "held out")):
+                keys = [f"{measure.format(mv)}, {side}" for mv in LEVELS_MV]
+                means = [fmean(of[key] for of in own.values()) for key in keys]
+                style = {"seen": "o--", "held out": "o-"}[side]
+                axes.plot(LEVELS_MV, means, style, color=color, label=f"{name}, {side}")
             for place, label in enumerate(labels):
-                values = [of[label] for of in own.values()]
                 at = place + (0.12 if color == PEER else -0.12)
+                values = [of[label] for of in own.values()]
                 by_seed.plot([at] * len(values), values, "o", color=color, alpha=0.7)
         by_seed.set_xticks(range(3), [label.replace(" ", "\n") for label in labels])
         by_seed.set_title("balanced accuracy, %, a dot a seed")
         for axes, title in ((found, "slips found, %"), (called, "moving arm called slip, %")):
             axes.set_xscale("log")
             axes.set_xticks(LEVELS_MV, [f"{mv:g}" for mv in LEVELS_MV])
-            axes.set_xlabel("motor vibration, mV")
-            axes.set_title(f"{title} of bins")
+            axes.set(xlabel="motor vibration, mV", title=f"{title} of bins")
             axes.set_ylim(bottom=0)
         found.set_ylim(0, 101)
         found.legend(handlelength=3.5)
@@ -216,8 +193,7 @@ def recordings(
 ) -> Iterator[RecordingFeatures]:
     """The features of some recordings of a set."""
     source = instantiate(config.data, _convert_="all")
-    rule = instantiate(config.labels)
-    maker = feature_maker(source, rule, **config.features)
+    maker = feature_maker(source, instantiate(config.labels), **config.features)
     chosen = keep(source)
     torch.set_num_threads(1)  # the processors belong to those who make features
     with feature_cache(str(cache)) as maker.cache:
@@ -231,10 +207,8 @@ def scored(detector: SlipDetector, made: RecordingFeatures, *, half: bool = Fals
     is_missing = None
     if half:
         num = len(detector.pool.hand)
-        order = bin_keys(f"{made.recording} missing", num).argsort()
-        is_missing = torch.zeros(num, dtype=torch.bool)
-        is_missing[order[: num // 2]] = True
-        is_missing = is_missing.expand(len(features), num)
+        rank = bin_keys(f"{made.recording} missing", num).argsort().argsort()
+        is_missing = (rank < num // 2).expand(len(features), num)
     with torch.no_grad():
         score = detector.head(detector.scaler(detector.columns(features, is_missing)))
     calibrated = calibration_of(detector)
@@ -246,10 +220,8 @@ def scored(detector: SlipDetector, made: RecordingFeatures, *, half: bool = Fals
 
 def balanced(parts: Sequence[Scored]) -> float:
     """Balanced accuracy of some recordings together, %."""
-    truth = torch.cat([part.truth for part in parts])
-    says = torch.cat([part.score for part in parts]) >= 0
-    recalls = [(says == truth)[truth == kind].double().mean() for kind in (False, True)]
-    return 100 * float(sum(recalls)) / 2
+    wrong = [called_slip(parts, truth=False), 100 - called_slip(parts, truth=True)]
+    return 100 - fmean(wrong)
 
 
 def called_slip(parts: Sequence[Scored], *, truth: bool) -> float:
@@ -283,10 +255,10 @@ def first_of(
     return keep
 
 
-def seed_run(name: str, given: Sequence[str], folder: Path, cache: Path) -> dict[str, Any]:
+def seed_run(name: str, given: Sequence[str], folder: Path) -> dict[str, Any]:
     """All measures of an experiment with the overrides that give its seed and size."""
-    what = f"{name}-{given[0]}".replace("=", "-")
-    metrics = trained(what, [f"+exp={name}", *given], folder / what, cache)
+    what, cache = f"{name}-{given[0]}".replace("=", "-"), folder / "cache"
+    metrics = trained([f"+exp={name}", *given], folder / what, cache)
     detector = SlipDetector.load(folder / what / "detector.pt")
     chosen = next(row for row in metrics["validation"] if row.get("chosen"))
     found: dict[str, Any] = {
@@ -308,14 +280,16 @@ def seed_run(name: str, given: Sequence[str], folder: Path, cache: Path) -> dict
         made = recordings(config, cache, keep, f"{given[0]}, {what}")
         return [scored(detector, each, half=half) for each in made]
 
-    for role, label in (("test", "test"), ("unseen", "held out")):
+    for role, label, name in (
+        ("test", "test", "test"),
+        ("unseen", "held out", "held-out materials"),
+    ):
         keep = first_of(role, given, 99)
-        whole = on(label, keep)
-        found["test" if role == "test" else "held-out materials"] = balanced(whole)
+        whole, half = on(label, keep), on(f"{label}, half missing", keep, half=True)
+        found[name] = balanced(whole)
         found[f"calibration error, {label}"] = calibration_error(whole)
-        missing = on(f"{label}, half missing", keep, half=True)
-        found[f"half of the channels missing, {label}"] = balanced(missing)
-        found[f"calibration error, half missing, {label}"] = calibration_error(missing)
+        found[f"half of the channels missing, {label}"] = balanced(half)
+        found[f"calibration error, half missing, {label}"] = calibration_error(half)
     over = [f"data.materials=[{','.join(SEEN)}]", "data.sessions=3", "data.cycles=5"]
     sessions = on("sessions", lambda source: [r for r in source.ids if r.session], *over)
     found["another session"] = balanced(sessions)
@@ -349,13 +323,13 @@ def seed_run(name: str, given: Sequence[str], folder: Path, cache: Path) -> dict
     return found
 
 
-def hard_run(name: str, given: Sequence[str], folder: Path, cache: Path) -> dict[str, Any]:
+def hard_run(name: str, given: Sequence[str], folder: Path) -> dict[str, Any]:
     """Balanced accuracies of recipes and baselines on ``+exp=hard``, %."""
     found, baselines = {}, {}
     for recipe in HARD_RECIPES:
         over = [f"+exp={name}", f"recipe={recipe}", *given]
         what = f"{name}-{recipe}-{given[0]}".replace("=", "-")
-        metrics = trained(what, over, folder / what, cache)
+        metrics = trained(over, folder / what, folder / "cache")
         found[f"recipe={recipe}"] = _by_role(metrics["splits"])
         if recipe == HARD_RECIPES[0]:
             found[f"recipe={recipe}"]["nested validation"] = _nested(metrics)
@@ -388,23 +362,18 @@ def _measures(own: Mapping[str, Any], name: str) -> list[dict[str, object]]:
         values = [of[measure] for of in every]
         at_most = "called slip" in measure or "error" in measure  # is better when it is smaller
         worst, sign = (max(values), -1) if at_most else (min(values), 1)
-        limits = LIMITS[name].get(measure, (None, None))
         asked = [
             (value, wanted)
-            for value, wanted in zip((fmean(values), worst), limits, strict=True)
+            for value, wanted in zip(
+                (fmean(values), worst), LIMITS[name].get(measure, ()), strict=False
+            )
             if wanted is not None
         ]
         met = all(sign * value >= sign * wanted for value, wanted in asked)
         texts = [f"({of:g})" if place else f"{of:g}" for place, (_, of) in enumerate(asked)]
-        rows.append(
-            {
-                "measure": measure,
-                "mean ± sd": mean_sd(values),
-                "worst": f"{worst:.2f}",
-                "wanted (worst)": " ".join(texts),
-                "": ("met" if met else "**missed**") if asked else "",
-            }
-        )
+        row = {"measure": measure, "mean ± sd": mean_sd(values), "worst": f"{worst:.2f}"}
+        row |= {"wanted (worst)": " ".join(texts)}
+        rows.append(row | {"": ("met" if met else "**missed**") if asked else ""})
     return rows
 
 

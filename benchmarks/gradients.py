@@ -6,29 +6,19 @@ features, C, c and weights; each in a process of its own, with the memory that i
 
 from __future__ import annotations
 
-import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from statistics import median
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from benchmarks.harness import (
-    Benchmark,
-    Job,
-    Report,
-    Spread,
-    Table,
-    bars,
-    in_fresh_process,
-    number,
-    peak_bytes,
-    say,
-)
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.model import synthetic_bins
+from benchmarks.tables import Report, Spread, Table
+from benchmarks.timing import in_fresh_process, peak_bytes, timed
 from tactslip_torch.model.fit import (
     HeldOut,
     TrainingBins,
@@ -38,113 +28,89 @@ from tactslip_torch.model.fit import (
 )
 from tactslip_torch.model.kernels import Polynomial
 
-Kind = Literal["fit", "left out"]
 FORWARD, OURS, PEER = "forward alone", "differentiable", "autograd"
 NUM_GROUPS, NUM_SCORED, PENALTY, OFFSET = 6, 1000, 1.0, 0.5
 
 
-@dataclass(frozen=True)
-class Problem:
+class Problem(NamedTuple):
     """A fit to go back through.
 
-    Args:
+    Attributes:
         kind: the machine of all bins, or the scores of groups left out.
         num_bins: to fit.
         num_features: of them.
         has_peer: whether autograd goes through the same.
     """
 
-    kind: Kind
+    kind: Literal["fit", "left_out"]
     num_bins: int
     num_features: int
     has_peer: bool
 
-    def __str__(self) -> str:
-        return f"{self.kind}, {self.num_bins:,} x {self.num_features}"
-
 
 @dataclass(frozen=True)
-class Sizes:
-    """Problems, rounds of every way, and threads of every process."""
+class Gradients(Benchmark):
+    """Every way of every problem, in turns.
 
+    Args:
+        problems: to go back through.
+        rounds: of every way.
+        threads: of every process.
+    """
+
+    title = "Gradients through the fit"
+    about = "a loss and its gradient in features, C, c and weights, on synthetic bins"
+    bars = (("Forward and back", ("forward, s", "backward, s")),)
+    quick = "problems=[[fit,200,12,true],[left_out,200,12,true]] rounds=1"
+    is_simulated = False
     problems: tuple[Problem, ...] = (
         Problem("fit", 8000, 120, has_peer=True),
         Problem("fit", 2000, 120, has_peer=True),
-        Problem("left out", 4800, 120, has_peer=False),
-        Problem("left out", 2000, 60, has_peer=True),
+        Problem("left_out", 4800, 120, has_peer=False),
+        Problem("left_out", 2000, 60, has_peer=True),
     )
     rounds: int = 3
     threads: int = 2
 
-
-class Gradients(Benchmark[Sizes]):
-    """Every way of every problem, in turns."""
-
-    name = "gradients"
-    title = "Gradients through the fit"
-    about = "a loss and its gradient in features, C, c and weights, on synthetic bins"
-    sizes = Sizes()
-    quick = Sizes(
-        (Problem("fit", 200, 12, has_peer=True), Problem("left out", 200, 12, has_peer=True)),
-        rounds=1,
-    )
-    is_simulated = False
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Seconds and bytes of every round, each in a process of its own."""
-        rows: dict[tuple[Problem, str], list[Any]] = {}
-        for _ in range(job.sizes.rounds):
-            for problem in job.sizes.problems:
+        rounds: dict[tuple[str, str], list[Any]] = {}
+        for _ in range(self.rounds):
+            for problem in (Problem(*of) for of in self.problems):
+                about = f"{problem.kind.replace('_', ' ')}, {problem.num_bins:,} x "
+                about += str(problem.num_features)
                 for way in (FORWARD, OURS, *([PEER] if problem.has_peer else [])):
-                    say(f"gradients: {problem}, {way}")
-                    given = {"problem": asdict(problem), "way": way, "threads": job.sizes.threads}
+                    say(f"gradients: {about}, {way}")
+                    given = {"problem": problem, "way": way, "threads": self.threads}
                     answer = in_fresh_process("benchmarks.gradients:one_way", **given)
-                    rows.setdefault((problem, way), []).append(answer)
-        return {
-            "threads": job.sizes.threads,
-            "rows": [
-                {"problem": str(problem), "way": way, "rounds": found}
-                for (problem, way), found in rows.items()
-            ],
-        }
+                    rounds.setdefault((about, way), []).append(answer)
+        rows = [{"problem": of, "way": way, "rounds": own} for (of, way), own in rounds.items()]
+        return {"threads": self.threads, "rows": rows}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Seconds, memory and difference of every way."""
         cells = []
+        peers = {r["problem"]: r["rounds"][0] for r in numbers["rows"] if r["way"] == PEER}
         for row in numbers["rows"]:
-            rounds, first = row["rounds"], row["rounds"][0]
-            peer = _row(numbers, row["problem"], PEER)
-            differs = None
+            rounds, peer, differs = row["rounds"], peers.get(row["problem"]), None
             if peer is not None and row["way"] == OURS:
-                theirs = peer["rounds"][0]["gradient"]
-                pairs = zip(first["gradient"], theirs, strict=True)
-                differs = number(max(abs((ours - other) / other) for ours, other in pairs))
+                ours, theirs = np.array([rounds[0]["gradient"], peer["gradient"]])
+                differs = float(np.abs((ours - theirs) / theirs).max())
             seconds = [of["backward_s"] for of in rounds if of["backward_s"] is not None]
             cells.append(
                 {
                     "bins x features": f"{row['problem']}: {row['way']}",
-                    "forward, s": Spread.of([of["forward_s"] for of in rounds]).text(),
-                    "backward, s": Spread.of(seconds).text() if seconds else None,
-                    "memory, MB": number(median(of["bytes"] for of in rounds) / 1e6),
+                    "forward, s": Spread.of([of["forward_s"] for of in rounds]),
+                    "backward, s": Spread.of(seconds) if seconds else None,
+                    "memory, MB": median(of["bytes"] for of in rounds) / 1e6,
                     "off autograd": differs,
                 }
             )
         note = f"{numbers['threads']} threads; memory: the most beyond what was held before."
         return {"Forward and back": Table(cells, note)}
 
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Seconds of forward and back."""
-        rows = numbers["rows"]
-        seconds = [
-            median(of["forward_s"] + (of["backward_s"] or 0.0) for of in row["rounds"])
-            for row in rows
-        ]
-        names = [f"{row['problem']}: {row['way']}" for row in rows]
-        about = "s, with a way back: forward and back"
-        bars(drawing.subplots(), names, {"seconds": seconds}, about)
 
-
-def one_way(problem: Report, way: str, threads: int) -> dict[str, Any]:
+def one_way(problem: tuple[Any, ...], way: str, threads: int) -> dict[str, Any]:
     """One loss and its gradient, after a small one that loads and starts what there is.
 
     Returns:
@@ -152,17 +118,13 @@ def one_way(problem: Report, way: str, threads: int) -> dict[str, Any]:
         beyond what was held before, ``loss``, and ``gradient``, its size along drawn directions.
     """
     torch.set_num_threads(threads)
-    given = Problem(**problem)
+    given = Problem(*problem)
     _loss(given, way, *_learned(min(300, given.num_bins), given.num_features))
     tensors = _learned(given.num_bins, given.num_features)
-    before, started = peak_bytes(), time.perf_counter()
-    loss = _loss(given, way, *tensors)
-    forward_s = time.perf_counter() - started
-    backward_s, gradient = None, None
+    before, backward_s, gradient = peak_bytes(), None, None
+    forward_s, loss = timed(lambda: _loss(given, way, *tensors))
     if way != FORWARD:
-        started = time.perf_counter()
-        slopes = torch.autograd.grad(loss, tensors)
-        backward_s = time.perf_counter() - started
+        backward_s, slopes = timed(lambda: torch.autograd.grad(loss, tensors))
         generator = torch.Generator().manual_seed(0)
         draws = [torch.randn(s.shape, generator=generator, dtype=s.dtype) for s in slopes]
         gradient = [float((s * draw).sum()) for s, draw in zip(slopes, draws, strict=True)]
@@ -223,11 +185,6 @@ def _loss(
                 own = groups == group
                 scores = scores.index_put((own,), by_autograd(z[own], ~own))
     return softplus(torch.where(truth, -scores, scores)).mean()
-
-
-def _row(numbers: Report, problem: str, way: str) -> Report | None:
-    rows = (row for row in numbers["rows"] if (row["problem"], row["way"]) == (problem, way))
-    return next(rows, None)
 
 
 if __name__ == "__main__":

@@ -16,24 +16,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.svm import SVC
 
 from benchmarks.deployment import bin_scores
-from benchmarks.harness import (
-    Benchmark,
-    Job,
-    Report,
-    Table,
-    bars,
-    interleaved,
-    limit,
-    limits,
-    number,
-    on_threads,
-    say,
-)
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.peers import loop, others, rockets
 from benchmarks.subjects import (
     FLOAT32,
@@ -43,6 +30,8 @@ from benchmarks.subjects import (
     labelled_bins,
     raw_bins,
 )
+from benchmarks.tables import Report, Table, limits, number
+from benchmarks.timing import interleaved, on_threads
 from tactslip_torch import FeaturePool, HandLayout
 from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -54,8 +43,8 @@ Score = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
+class Latency(Benchmark):
+    """One bin at a time on one thread.
 
     Args:
         recordings: simulated, to whose bins heads are fitted.
@@ -66,6 +55,14 @@ class Sizes:
         num_kernels: of MiniRocket.
     """
 
+    title = "Latency"
+    about = (
+        "one raw bin of 24 channels with its context to a score, the features that the main job "
+        "selects, one bin at a time on 1 thread"
+    )
+    bars = (("One bin to its score", ("median, us", "99th percentile, us")),)
+    quick = "recordings=1 bins=4 looped=1 rounds=2 block_s=0.002 num_kernels=168"
+    libraries = ("PyWavelets", "onnxruntime", "aeon")
     recordings: int = 8
     bins: int = 64
     looped: int = 4
@@ -73,45 +70,30 @@ class Sizes:
     block_s: float = 0.02
     num_kernels: int = 10_000
 
-
-class Latency(Benchmark[Sizes]):
-    """One bin at a time on one thread."""
-
-    name = "latency"
-    title = "Latency"
-    about = (
-        "one raw bin of 24 channels with its context to a score, the features that the main job "
-        "selects, one bin at a time on 1 thread"
-    )
-    sizes = Sizes()
-    quick = Sizes(recordings=1, bins=4, looped=1, rounds=2, block_s=2e-3, num_kernels=168)
-    libraries = ("PyWavelets", "onnxruntime", "aeon")
-
     @torch.inference_mode()
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Seconds of single calls of every way, and errors of its scores."""
-        sizes = job.sizes
-        samples = raw_bins(sizes.bins)
+        samples = raw_bins(self.bins)
         with on_threads(1):
-            ways = self._ways(sizes)
+            ways = self._ways()
         with on_threads(1):  # of the libraries loaded by now as well
-            say(f"latency: {sizes.rounds} rounds of {len(ways)} ways")
+            say(f"latency: {self.rounds} rounds of {len(ways)} ways")
             calls = {name: _in_turn(score, samples) for name, score in ways.items()}
-            timings = interleaved(calls, sizes.rounds, block_s=sizes.block_s, most_calls=60)
+            timings = interleaved(calls, self.rounds, block_s=self.block_s, most_calls=60)
             exact = _scores(ways[REFERENCE], samples)
             rows = []
             for name, score in ways.items():
-                some = samples[: sizes.looped] if "loop" in name else samples
+                some = samples[: self.looped] if "loop" in name else samples
                 found = _scores(score, some)
                 error = np.abs(found - exact[: len(found)]).max() / max(exact.std(), 1e-12)
                 is_other = name in OTHER_MACHINES
                 row = {"way": name, "error": None if is_other else float(error)}
-                rows.append(row | timings[name].summary())
+                rows.append(row | timings[name])
         return {"rows": rows}
 
-    def _ways(self, sizes: Sizes) -> dict[str, Score]:
+    def _ways(self) -> dict[str, Score]:
         """From one raw bin ``[1, C, n + 2 * context]``, float32, to its score."""
-        main = MainJobDetector.fitted(sizes.recordings)
+        main = MainJobDetector.fitted(self.recordings)
         fast, exact = main.detector(FLOAT32), main.detector(FLOAT64)
         slow = main.detector(FLOAT64, "torch")
         support, targets = main.z.numpy(), main.training.targets.numpy()
@@ -136,10 +118,17 @@ class Latency(Benchmark[Sizes]):
             REFERENCE: lambda x: slow.score_raw(x.double()),
             ORT: exported,
             "SciPy and PyWavelets, a loop, kernel sum": _loop(main),
-            "MiniRocket and ridge": _rocket(sizes),
+            "MiniRocket and ridge": self._rocket(),
             "tactslip_torch, float64, SVC head": lambda x: svc.decision_function(scaled(x)),
             "tactslip_torch, float64, KernelRidge head": lambda x: ridge.predict(scaled(x)),
         }
+
+    def _rocket(self) -> Score:
+        bins, is_slip = labelled_bins(self.recordings)
+        say("latency: MiniRocket")
+        scores = rockets.fit(bins.numpy(), is_slip.numpy(), num_kernels=self.num_kernels).score
+        filters = ChannelFilter(WINDOW_LENGTHS)
+        return lambda samples: scores(filters.valid(samples.double()).float().numpy())
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Seconds and errors of every way."""
@@ -148,25 +137,16 @@ class Latency(Benchmark[Sizes]):
         cells = [
             {
                 "way": row["way"],
-                "median, us": number(1e6 * row["p50_s"]),
-                "99th percentile, us": number(1e6 * row["p99_s"]),
+                "median, us": 1e6 * row["p50_s"],
+                "99th percentile, us": 1e6 * row["p99_s"],
                 "of ours": f"{number(row['p50_s'] / ours['p50_s'])} x",
-                "error": number(row["error"]),
+                "error": row["error"],
             }
             for row in rows
         ]
         note = "Error of scores in standard deviations of the reference's; - another machine."
-        goal = limit("a bin to its score, float32", 1e3 * ours["p50_s"], 1e3 * MOST_S, "ms")
+        goal = ("a bin to its score, float32", 1e3 * ours["p50_s"], 1e3 * MOST_S, "ms")
         return {"Limits": limits([goal]), "One bin to its score": Table(cells, note)}
-
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Median and tail of every way."""
-        rows = numbers["rows"]
-        series = {
-            "median": [1e6 * row["p50_s"] for row in rows],
-            "99th percentile": [1e6 * row["p99_s"] for row in rows],
-        }
-        bars(drawing.subplots(), [row["way"] for row in rows], series, "us from a bin to its score")
 
 
 def _in_turn(score: Score, samples: torch.Tensor) -> Callable[[], Any]:
@@ -198,14 +178,6 @@ def _loop(main: MainJobDetector) -> Score:
         return loop.kernel_score(z, support, beta, main.kernel.offset, main.kernel.degree)
 
     return score
-
-
-def _rocket(sizes: Sizes) -> Score:
-    bins, is_slip = labelled_bins(sizes.recordings)
-    say("latency: MiniRocket")
-    scores = rockets.fit(bins.numpy(), is_slip.numpy(), num_kernels=sizes.num_kernels).score
-    filters = ChannelFilter(WINDOW_LENGTHS)
-    return lambda samples: scores(filters.valid(samples.double()).float().numpy())
 
 
 if __name__ == "__main__":

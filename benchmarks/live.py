@@ -26,11 +26,15 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import psutil
 import torch
 from matplotlib.figure import Figure
 
-from benchmarks.harness import Benchmark, Job, Report, Table, limit, limits, number, say
+from benchmarks import ROOT
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import RATE_HZ, Array
+from benchmarks.tables import Report, Table, limits
+from benchmarks.timing import growth_mb
 from tactslip_torch import SlipDetector, StreamingDetector, sample_recording
 
 HEADER, FRAME_SAMPLES = "AA55", 2
@@ -42,8 +46,8 @@ _FRAME = (
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
+class Live(Benchmark):
+    """From a sample to its line, over minutes.
 
     Args:
         seconds: of stream, of each source.
@@ -51,57 +55,50 @@ class Sizes:
         checked_s: of them, whose decisions are held against ``StreamingDetector``.
     """
 
-    seconds: float = 600.0
-    settled_s: float = 60.0
-    checked_s: float = 60.0
-
-
-class Live(Benchmark[Sizes]):
-    """From a sample to its line, over minutes."""
-
-    name = "live"
     title = "Live"
     about = (
         "`tactslip stream` in a process of its own, fed the sample recording again and again: 24 "
         f"channels at 2 kHz, {FRAME_SAMPLES} samples a frame, a line for each decision; from when "
         "a sample was sent to when the line of the first decision on it could be read"
     )
-    sizes = Sizes()
-    quick = Sizes(4.0, 1.0, 4.0)
+    quick = "seconds=4.0 settled_s=1.0 checked_s=4.0"
+    seconds: float = 600.0
+    settled_s: float = 60.0
+    checked_s: float = 60.0
 
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Latencies, memory and what was lost, by source."""
         with TemporaryDirectory(prefix="tactslip-live-") as name:
             folder = Path(name)
             SlipDetector.pretrained("paper24-sim").save(folder / "detector.pt")
-            rows = [_fed(kind, folder, job.sizes) for kind in ("pseudo-terminal", "socket")]
-        return {"rows": rows, "settled_s": job.sizes.settled_s}
+            rows = [_fed(kind, folder, self) for kind in ("pseudo-terminal", "socket")]
+        return {"rows": rows, "settled_s": self.settled_s}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Limits, and what was measured."""
         goals, shown = [], []
         for row in numbers["rows"]:
             kind, bound_ms = row["source"], row["look_ahead_ms"] + row["hop_ms"] + MARGIN_MS
-            growth = _growth_mb(row, numbers["settled_s"])
+            growth = growth_mb(row, numbers["settled_s"])
             p50, p99, most = (row["latency_ms"][key] for key in ("50", "99", "100"))
+            memory = f"{kind}: resident memory, growth after it has settled"
             goals += [
-                limit(f"{kind}: sample to line, 99th percentile", p99, bound_ms, "ms"),
-                limit(f"{kind}: samples lost", row["sent"] - row["received"], 0),
-                limit(f"{kind}: resident memory, growth after it has settled", growth,
-                      MOST_GROWTH_MB, "MB"),
-                limit(f"{kind}: decisions unlike those of StreamingDetector", row["unlike"], 0),
-            ]  # fmt: skip
+                (f"{kind}: sample to line, 99th percentile", p99, bound_ms, "ms"),
+                (f"{kind}: samples lost", row["sent"] - row["received"], 0, ""),
+                (memory, growth, MOST_GROWTH_MB, "MB"),
+                (f"{kind}: decisions unlike those of StreamingDetector", row["unlike"], 0, ""),
+            ]
             shown.append(
                 {
                     "source": kind,
                     "samples": f"{row['sent']:,}",
-                    "median, ms": number(p50),
-                    "99 %, ms": number(p99),
-                    "longest, ms": number(most),
-                    "of it computing and waiting, median, ms": number(row["late_ms"]["50"]),
-                    "99 %, us": number(1e3 * row["late_ms"]["99"]),
-                    "of a core": number(row["cpu_s"] / row["seconds"]),
-                    "resident, MB": number(row["resident_bytes"][-1] / 1e6),
+                    "median, ms": p50,
+                    "99 %, ms": p99,
+                    "longest, ms": most,
+                    "of it computing and waiting, median, ms": row["late_ms"]["50"],
+                    "99 %, us": 1e3 * row["late_ms"]["99"],
+                    "of a core": row["cpu_s"] / row["seconds"],
+                    "resident, MB": row["resident_bytes"][-1] / 1e6,
                     "machine's load": f"{row['load']:.1f}",
                 }
             )
@@ -117,34 +114,22 @@ class Live(Benchmark[Sizes]):
             shares = [float(share) for share in row["latency_ms"]]
             latency.plot(list(row["latency_ms"].values()), shares, label=row["source"])
             memory.plot(row["at_s"], np.asarray(row["resident_bytes"]) / 1e6, label=row["source"])
-        latency.set_xlabel("ms from a sample to its line")
-        latency.set_ylabel("% of samples")
+        latency.set(xlabel="ms from a sample to its line", ylabel="% of samples")
         latency.legend()
-        memory.set_xlabel("s of stream")
-        memory.set_ylabel("resident, MB")
+        memory.set(xlabel="s of stream", ylabel="resident, MB")
 
 
-def _growth_mb(row: Report, settled_s: float) -> float:
-    looks = zip(row["at_s"], row["resident_bytes"], strict=True)
-    settled: list[float] = [resident for at_s, resident in looks if at_s >= settled_s]
-    return (max(settled) - settled[0]) / 1e6
-
-
-def _fed(kind: str, folder: Path, sizes: Sizes) -> dict[str, Any]:
+def _fed(kind: str, folder: Path, sizes: Live) -> dict[str, Any]:
     """Feed one source, and what came of it."""
-    import psutil
-
     say(f"live: {sizes.seconds:g} s of stream into a {kind}")
     frames, samples = _frames()
     with ExitStack() as stack:
         source, send = _terminal(stack) if kind == "pseudo-terminal" else _socket(stack)
         command = [sys.executable, "-m", "tactslip_torch", "stream", "model=detector.pt"]
         command += [f"source={source}", "decisions=true", *_FRAME.split()]
-        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-        environment |= {"OMP_NUM_THREADS": "1"}
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
         pipe: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        run = subprocess.Popen(command, cwd=folder, env=environment, **pipe)
-        stack.enter_context(run)
+        run = stack.enter_context(subprocess.Popen(command, cwd=folder, env=environment, **pipe))
         stack.callback(run.kill)
         lines: list[tuple[float, bytes]] = []
         is_ready = threading.Event()
@@ -202,26 +187,26 @@ def _fed(kind: str, folder: Path, sizes: Sizes) -> dict[str, Any]:
     checked = round(min(sizes.checked_s, sizes.seconds) * RATE_HZ)
     expected = stream.push(np.resize(samples, (checked, samples.shape[1])).astype(np.float64))
     pairs = zip(expected.score.tolist(), expected.is_alarm.tolist(), decided, strict=False)
+    unlike = sum(
+        alarm != row["alarm"] or not abs(score - row["score"]) < 1e-9
+        for score, alarm, (_, row) in pairs
+    )
+
+    def percentiles_ms(seconds: Array, shares: list[float]) -> dict[str, float]:
+        return {f"{share:g}": 1e3 * float(np.percentile(seconds, share)) for share in shares}
+
     return {
         "source": kind,
         "seconds": sizes.seconds,
         "sent": num * FRAME_SAMPLES,
         "received": round(last["seconds"] * RATE_HZ) if "decisions" in last else 0,
         "decisions": len(decided),
-        "unlike": sum(
-            alarm != row["alarm"] or not abs(score - row["score"]) < 1e-9
-            for score, alarm, (_, row) in pairs
-        )
-        + max(0, len(expected.score) - len(decided)),
+        "unlike": unlike + max(0, len(expected.score) - len(decided)),
         "events": [row["text"] for _, row in found if "event" in row],
         "look_ahead_ms": 1e3 * stream.look_ahead_s,
         "hop_ms": 1e3 * stream.hop_s,
-        "latency_ms": {
-            f"{share:g}": 1e3 * float(np.percentile(latency_s, share)) for share in sorted(shares)
-        },
-        "late_ms": {
-            f"{share:g}": 1e3 * float(np.percentile(late_s, share)) for share in (50, 99, 100)
-        },
+        "latency_ms": percentiles_ms(latency_s, sorted(shares)),
+        "late_ms": percentiles_ms(late_s, [50, 99, 100]),
         "cpu_s": cpu_s,
         "at_s": at_s,
         "resident_bytes": resident,

@@ -6,7 +6,6 @@ refitting every fold; and a fit by statistics of any number of bins, in a proces
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -14,27 +13,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.svm import SVC
 from torch import Tensor
 
-from benchmarks.harness import (
-    Benchmark,
-    Job,
-    Report,
-    Spread,
-    Table,
-    bars,
-    in_fresh_process,
-    interleaved,
-    listed,
-    number,
-    on_threads,
-    peak_bytes,
-    percent,
-    say,
-)
+from benchmarks.harness import Benchmark, Job, say
+from benchmarks.tables import Report, Spread, Table, listed, number, percent
+from benchmarks.timing import in_fresh_process, interleaved, on_threads, peak_bytes, timed
 from tactslip_torch import SufficientStats
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import KernelSum, Polynomial
@@ -44,8 +29,8 @@ KERNEL = Polynomial(2, OFFSET)
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
+class Model(Benchmark):
+    """Fits, scores, folds and statistics.
 
     Args:
         num_features: K.
@@ -58,6 +43,11 @@ class Sizes:
         threads: of fits; scoring has one.
     """
 
+    title = "Kernel machine at any size"
+    about = "the kernel machine of degree 2 on synthetic features, beside scikit-learn"
+    bars = (("Fits", "fit, s"), ("Fits", "a score, us"))
+    quick = "num_features=12 fitted=[200] test_bins=100 folded=240 any_bins=10000 rounds=1"
+    is_simulated = False
     num_features: int = 120
     fitted: tuple[int, ...] = (2_000, 8_000)
     test_bins: int = 4_000
@@ -67,26 +57,14 @@ class Sizes:
     rounds: int = 3
     threads: int = 2
 
-
-class Model(Benchmark[Sizes]):
-    """Fits, scores, folds and statistics."""
-
-    name = "model"
-    title = "Kernel machine at any size"
-    about = "the kernel machine of degree 2 on synthetic features, beside scikit-learn"
-    sizes = Sizes()
-    quick = Sizes(12, (200,), 100, folded=240, any_bins=10_000, rounds=1)
-    is_simulated = False
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Fits and scores by size, folds, and any number of bins."""
-        sizes = job.sizes
-        with on_threads(sizes.threads):
-            fits = [row for num_bins in sizes.fitted for row in _fits(num_bins, sizes)]
-            folds = _folds(sizes)
-        say(f"model: statistics of {sizes.any_bins:,} bins in a fresh process")
-        given = {"num_bins": sizes.any_bins, "num_features": sizes.num_features}
-        any_size = in_fresh_process("benchmarks.model:accumulate", threads=sizes.threads, **given)
+        with on_threads(self.threads):
+            fits = [row for num_bins in self.fitted for row in _fits(num_bins, self)]
+            folds = _folds(self)
+        say(f"model: statistics of {self.any_bins:,} bins in a fresh process")
+        given = {"num_bins": self.any_bins, "num_features": self.num_features}
+        any_size = in_fresh_process("benchmarks.model:accumulate", threads=self.threads, **given)
         return {"fits": fits, "folds": folds, "any_size": any_size | given}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
@@ -94,38 +72,28 @@ class Model(Benchmark[Sizes]):
         fits = [
             {
                 "machine": f"{row['way']}, {row['num_bins']:,} bins",
-                "fit, s": Spread.of(row["fit_s"]).text(),
-                "a score, us": number(1e6 * row["score_s"]),
+                "fit, s": Spread.of(row["fit_s"]),
+                "a score, us": 1e6 * row["score_s"],
                 "accuracy %": percent(row["accuracy"]),
-                "off KernelRidge": number(row["off"]),
+                "off KernelRidge": row["off"],
             }
             for row in numbers["fits"]
         ]
-        seconds = numbers["folds"]["seconds"].items()
-        of = numbers["any_size"]
+        seconds, of = numbers["folds"]["seconds"].items(), numbers["any_size"]
+        folds = [{"folds": way, "s": Spread.of(one)} for way, one in seconds]
         whole = {
             "bins": f"{of['num_bins']:,}",
             "bins a second": f"{of['num_bins'] / of['add_s']:,.0f}",
-            "s to solve": number(of["solve_s"]),
+            "s to solve": of["solve_s"],
             "peak memory, MB": f"{of['peak_bytes'] / 1e6:,.0f}",
         }
         note = "A score: one bin on 1 thread. Off: the largest difference of scores."
         folded = f"Largest difference of held-out scores: {number(numbers['folds']['off'])}."
         return {
             "Fits": Table(fits, note),
-            "Folds": Table(
-                [{"folds": way, "s": Spread.of(one).text()} for way, one in seconds], folded
-            ),
+            "Folds": Table(folds, folded),
             "Any number of bins": listed("statistics in a process of its own", whole),
         }
-
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Seconds of fits and of a score."""
-        fits, scores = drawing.subplots(1, 2, sharey=True)
-        rows = numbers["fits"]
-        names = [f"{row['way']}, {row['num_bins']:,}" for row in rows]
-        bars(fits, names, {"fit": [Spread.of(row["fit_s"]).median for row in rows]}, "s a fit")
-        bars(scores, names, {"score": [1e6 * row["score_s"] for row in rows]}, "us a score")
 
 
 def synthetic_bins(num_bins: int, num_features: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -149,20 +117,17 @@ def accumulate(num_bins: int, num_features: int, threads: int) -> dict[str, floa
     torch.set_num_threads(threads)
     stats = SufficientStats(num_features)
     z, is_slip = synthetic_bins(BATCH, num_features)
-    started = time.perf_counter()
-    for number_of_batch in range(-(-num_bins // BATCH)):
-        stats.update(f"batch {number_of_batch}", z, is_slip)
-    added = time.perf_counter()
-    stats.solve(PENALTY, OFFSET, balance="none")
-    solved = time.perf_counter()
-    return {
-        "add_s": added - started,
-        "solve_s": solved - added,
-        "peak_bytes": float(peak_bytes()),
-    }
+
+    def add() -> None:
+        for batch in range(-(-num_bins // BATCH)):
+            stats.update(f"batch {batch}", z, is_slip)
+
+    add_s, _ = timed(add)
+    solve_s, _ = timed(lambda: stats.solve(PENALTY, OFFSET, balance="none"))
+    return {"add_s": add_s, "solve_s": solve_s, "peak_bytes": float(peak_bytes())}
 
 
-def _fits(num_bins: int, sizes: Sizes) -> list[dict[str, Any]]:
+def _fits(num_bins: int, sizes: Model) -> list[dict[str, Any]]:
     say(f"model: fits to {num_bins:,} bins")
     z, is_slip = synthetic_bins(num_bins, sizes.num_features)
     new, truth = synthetic_bins(sizes.test_bins, sizes.num_features, seed=1)
@@ -204,8 +169,8 @@ def _fits(num_bins: int, sizes: Sizes) -> list[dict[str, Any]]:
             {
                 "way": way,
                 "num_bins": num_bins,
-                "fit_s": fits[way if way in fits else "fit_machine"].per_round,
-                "score_s": times[way].summary()["p50_s"],
+                "fit_s": fits[way if way in fits else "fit_machine"]["seconds"],
+                "score_s": times[way]["p50_s"],
                 "accuracy": float(((scores >= 0) == truth.numpy()).mean()),
                 "off": None if way == "SVC" else float(np.abs(scores - exact).max()),
             }
@@ -213,7 +178,7 @@ def _fits(num_bins: int, sizes: Sizes) -> list[dict[str, Any]]:
     return rows
 
 
-def _folds(sizes: Sizes) -> dict[str, Any]:
+def _folds(sizes: Model) -> dict[str, Any]:
     say(f"model: {sizes.num_folds} folds of {sizes.folded:,} bins")
     z, is_slip = synthetic_bins(sizes.folded, sizes.num_features)
     groups = torch.arange(len(z)) % sizes.num_folds
@@ -234,7 +199,7 @@ def _folds(sizes: Sizes) -> dict[str, Any]:
     }
     timings = interleaved(calls, sizes.rounds, block_s=0)
     off = (calls["fit and folds in closed form"]() - refits()).abs().max()
-    return {"seconds": {n: of.per_round for n, of in timings.items()}, "off": float(off)}
+    return {"seconds": {n: of["seconds"] for n, of in timings.items()}, "off": float(off)}
 
 
 if __name__ == "__main__":

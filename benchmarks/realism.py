@@ -16,8 +16,9 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from sklearn.metrics import roc_auc_score
 
-from benchmarks.harness import Benchmark, Job, Report, Table, bars
+from benchmarks.harness import Benchmark, Job
 from benchmarks.subjects import Array, composed
+from benchmarks.tables import Report, Table, bars
 from tactslip_torch.data.recording import RecordingSource, Timeline
 
 WINDOW_S, WINDOWS = 0.25, 4
@@ -41,25 +42,21 @@ AREAS = {
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Cycles of every material of the simulated sets."""
+class Realism(Benchmark):
+    """Statistics of three sets, without a detector.
 
-    cycles: int = 6
+    Cycles of every material of the simulated sets.
+    """
 
-
-class Realism(Benchmark[Sizes]):
-    """Statistics of three sets, without a detector."""
-
-    name = "realism"
     title = "Channels, real and simulated"
     about = "how channels differ and move together, without slip and with it"
-    sizes = Sizes()
-    quick = Sizes(1)
+    quick = "cycles=1"
     is_simulated = False
+    cycles: int = 6
 
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Statistics of each set; the real one needs ``data.root=FOLDER``."""
-        cycles = f"data.cycles={job.sizes.cycles}"
+        cycles = f"data.cycles={self.cycles}"
         overrides = {
             "real": ["+exp=biotacsp_dos", *job.overrides],
             "simulated, paper": ["scene=paper", cycles],

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -20,21 +20,8 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
 from benchmarks import ROOT
-from benchmarks.harness import (
-    GREY,
-    OURS,
-    PEER,
-    Benchmark,
-    Job,
-    Report,
-    Table,
-    between_markers,
-    finish,
-    mean_sd,
-    percent,
-    trained,
-    write_text,
-)
+from benchmarks.harness import Benchmark, Job, between_markers, finish, trained, write_text
+from benchmarks.tables import GREY, OURS, PEER, Report, Table, mean_sd, percent
 from tactslip_torch.analysis.signal_checks import check_signals, filtered
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.hand import HandLayout
@@ -71,56 +58,46 @@ EXPERIMENTS: Mapping[str, tuple[tuple[str, ...], int]] = {
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Seeds at most, experiments, and overrides of every run."""
+class Reproduction(Benchmark):
+    """Every experiment on every seed.
 
+    Seeds at most, experiments, and overrides of every run.
+    """
+
+    title = "Published numbers beside ours"
+    about = "every number of ours is SIMULATED, the paper's are of a real hand"
+    page, markers = "docs/reproduction.md", "results"
+    quick = (
+        "seeds=1 experiments=[random_bins,unseen4,confound] overrides=[data.cycles=2,"
+        "split.train_fraction=0.5,recipe.sample_bins=60] cycles=1"
+    )
     seeds: int = 5
     experiments: tuple[str, ...] = tuple(EXPERIMENTS)
     overrides: tuple[str, ...] = ()
     cycles: int = 3
 
-
-class Reproduction(Benchmark[Sizes]):
-    """Every experiment on every seed."""
-
-    name = "reproduction"
-    title = "Published numbers beside ours"
-    about = "every number of ours is SIMULATED, the paper's are of a real hand"
-    page, markers = "docs/reproduction.md", "results"
-    sizes = Sizes()
-    quick = Sizes(
-        1,
-        ("random_bins", "unseen4", "confound"),
-        ("data.cycles=2", "split.train_fraction=0.5", "recipe.sample_bins=60"),
-        1,
-    )
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Trainings, one after the other, and checks of the signals."""
-        runs: dict[str, list[dict[str, Any]]] = {name: [] for name in job.sizes.experiments}
+        runs: dict[str, list[dict[str, Any]]] = {name: [] for name in self.experiments}
         commands = {}
-        for seed in range(job.sizes.seeds):
+        for seed in range(self.seeds):
             for name in runs:
                 overrides, seeds = EXPERIMENTS[name]
-                given = [*overrides, *job.sizes.overrides, *job.overrides]
+                given = [*overrides, *self.overrides, *job.overrides]
                 if job.is_quick and name == "confound":
                     extra = OmegaConf.load(ROOT / "conf" / "extra_scenes" / "confound.yaml")
-                    given += [
-                        f"extra_scenes.{o}.cycles=2" for o in map(str, extra) if o != "defaults"
-                    ]
+                    scenes = [str(scene) for scene in extra if scene != "defaults"]
+                    given += [f"extra_scenes.{scene}.cycles=2" for scene in scenes]
                 commands[name] = " ".join(given)
                 if seed < seeds:
                     folder = job.folder / f"{name.replace(' ', '-')}-{seed}"
-                    cache = job.folder / "cache"
-                    metrics = trained(
-                        f"{name}, seed {seed}", [*given, f"seed={seed}"], folder, cache
-                    )
+                    metrics = trained([*given, f"seed={seed}"], folder, job.folder / "cache")
                     runs[name].append(kept(metrics, folder))
         return {
             "runs": runs,
             "commands": commands,
             "calibrated": json.loads(CALIBRATED_PATH.read_text(encoding="utf-8")),
-            "signals": [_signal_checks(seed, job.sizes.cycles) for seed in range(job.sizes.seeds)],
+            "signals": [_signal_checks(seed, self.cycles) for seed in range(self.seeds)],
         }
 
     def tables(self, numbers: Report) -> dict[str, Table]:
@@ -175,11 +152,8 @@ class Reproduction(Benchmark[Sizes]):
             if (name, role) in COMPARED:
                 x = 100 * (published.SPLITS[role].balanced_accuracy or 0)
                 axes.plot([x, x], [place - 0.4, place + 0.4], color="black", lw=2)
-        for marker, color, label in (
-            ("o", OURS, "ours, a dot a seed"),
-            ("|", PEER, "best pooled number"),
-        ):
-            axes.plot([], [], marker, color=color, label=label)
+        axes.plot([], [], "o", color=OURS, label="ours, a dot a seed")
+        axes.plot([], [], "|", color=PEER, label="best pooled number")
         axes.plot([], [], color="black", lw=2, label="paper, real hand")
         axes.set_yticks(range(len(names)), [", ".join(of) for of in names], fontsize=6)
         axes.set_ylim(len(names) - 0.4, -0.6)
@@ -195,11 +169,9 @@ class Reproduction(Benchmark[Sizes]):
         axes = drawing.subplots()
         for name, color in zip(BY_CYCLE, (OURS, PEER), strict=True):
             for role, style in (("test", "o-"), ("unseen", "s--")):
-                means = {}
-                for place in range(-20, 21):
-                    label = str(place) if place < 20 else "20+"
-                    if found := scores.beside_onset(name, role, [label]):
-                        means[place] = mean(found)
+                places = {at: ["20+" if at == 20 else str(at)] for at in range(-20, 21)}
+                recalls = {at: scores.beside_onset(name, role, of) for at, of in places.items()}
+                means = {at: mean(of) for at, of in recalls.items() if of}
                 label = f"{name}, {role}"
                 axes.plot(list(means), list(means.values()), style, color=color, ms=3, label=label)
         axes.axvline(-0.5, color=GREY, ls="--", lw=1)
@@ -211,10 +183,10 @@ class Reproduction(Benchmark[Sizes]):
             drawing = Figure(figsize=(9.2, 4.4), layout="constrained")
             panels = drawing.subplots(1, 2, sharey=True)
             for axes, role in zip(panels, ("test", "unseen"), strict=True):
-                for fold, color in zip(FOLDS, (PEER, OURS), strict=True):
+                for (fold, about), color in zip(FOLDS.items(), (PEER, OURS), strict=True):
                     for place, scene in enumerate(scenes):
                         values = list(scene_recalls(scores, fold, role, scene).values())
-                        words = f"trained on {FOLDS[fold]}" if place == 0 else None
+                        words = None if place else f"trained on {about}"
                         axes.plot(values, [place] * len(values), "o", color=color, label=words)
                 axes.set_xlabel(f"mean recall of the classes there are, %, {role}")
             panels[0].set_yticks(range(len(scenes)), scenes)
@@ -253,13 +225,13 @@ def kept(metrics: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _of_fold(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    def counted(of: Mapping[str, Any]) -> dict[str, Any]:
+        return {role: _counts(scores) for role, scores in of["splits"].items()}
+
     return {
-        "splits": {role: _counts(scores) for role, scores in metrics["splits"].items()},
+        "splits": counted(metrics),
         "baselines": {
-            name: {
-                "feature": found.get("feature"),
-                "splits": {role: _counts(scores) for role, scores in found["splits"].items()},
-            }
+            name: {"feature": found.get("feature"), "splits": counted(found)}
             for name, found in metrics["baselines"].items()
         },
         "penalty": metrics["penalty"],
@@ -271,16 +243,16 @@ def _of_fold(metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 def _counts(scores: Mapping[str, Any]) -> dict[str, Any]:
     """Confusions of all bins and of groups; right and all bins of every place beside onsets."""
-    groups = {
-        kind: {label: of["confusion"] for label, of in scores[kind].items()}
-        for kind in GROUPS
-        if scores.get(kind)
+    places = scores.get("per_position", {}).items()
+    return {
+        "confusion": scores["confusion"],
+        **{
+            kind: {label: of["confusion"] for label, of in scores[kind].items()}
+            for kind in GROUPS
+            if scores.get(kind)
+        },
+        "per_position": {label: [of["num_right"], of["num_bins"]] for label, of in places},
     }
-    places = {
-        label: [of["num_right"], of["num_bins"]]
-        for label, of in scores.get("per_position", {}).items()
-    }
-    return {"confusion": scores["confusion"], **groups, "per_position": places}
 
 
 Runs = Mapping[str, Sequence[Mapping[str, Any]]]
@@ -303,29 +275,14 @@ class Scores:
     """
 
     def __init__(self, runs: Runs) -> None:
-        self._scores: dict[tuple[str, str, str, str, str], dict[str, BySeed]] = {}
-        self._places: dict[tuple[str, str, str], list[Mapping[str, Sequence[int]]]] = {}
+        self._splits: dict[tuple[str, str, str], dict[int, Mapping[str, Any]]] = {}
         for name, of in runs.items():
-            for run in of:
-                for fold, one in run.get("folds", {"": run}).items():
-                    experiment = f"{name}: {fold}" if fold else name
-                    self._take(experiment, run["seed"], "", one["splits"])
-                    for baseline, found in one.get("baselines", {}).items():
-                        self._take(experiment, run["seed"], baseline, found["splits"])
-
-    def _take(self, experiment: str, seed: int, way: str, splits: Mapping[str, Any]) -> None:
-        for role, split in splits.items():
-            found = {("", ""): split_metrics(split["confusion"])}
-            for kind in GROUPS:
-                for label, confusion in split.get(kind, {}).items():
-                    found[kind, label] = split_metrics(confusion)
-            places = self._places.setdefault((experiment, way, role), [])
-            places.append(split.get("per_position", {}))
-            for group, scores in found.items():
-                by_score = self._scores.setdefault((experiment, way, role, *group), {})
-                for score, value in scores.items():
-                    if score in SCORES and value is not None:
-                        by_score.setdefault(score, {})[seed] = 100 * value
+            folds = [(run["seed"], *fold) for run in of for fold in _folds_of(run)]
+            for seed, fold, one in folds:
+                experiment = f"{name}: {fold}" if fold else name
+                for way, found in {"": one, **one.get("baselines", {})}.items():
+                    for role, split in found["splits"].items():
+                        self._splits.setdefault((experiment, way, role), {})[seed] = split
 
     def of(
         self,
@@ -333,7 +290,7 @@ class Scores:
         role: str,
         score: str = "balanced_accuracy",
         *,
-        group: tuple[str, str] = ("", ""),
+        group: tuple[str, str] | None = None,
         baseline: str = "",
     ) -> BySeed:
         """A score by seed; seeds without any are left out.
@@ -345,24 +302,37 @@ class Scores:
             group: such as ``("per_speed", "20")``: of these bins alone.
             baseline: of this in the place of the detector.
         """
-        return self._scores.get((experiment, baseline, role, *group), {}).get(score, {})
+        found = {}
+        for seed, split in self._splits.get((experiment, baseline, role), {}).items():
+            confusion = split.get(group[0], {}).get(group[1]) if group else split["confusion"]
+            if confusion and (value := split_metrics(confusion)[score]) is not None:
+                found[seed] = 100 * value
+        return found
 
     def beside_onset(self, experiment: str, role: str, places: Sequence[str]) -> list[float]:
         """Recall of bins at these places beside their onsets; a number a seed."""
         found = []
-        for counts in self._places.get((experiment, "", role), []):
+        for split in self._splits.get((experiment, "", role), {}).values():
+            counts = split.get("per_position", {})
             if own := [counts[place] for place in places if place in counts]:
-                found.append(100 * sum(right for right, _ in own) / sum(num for _, num in own))
+                right, num = map(sum, zip(*own, strict=True))
+                found.append(100 * right / num)
         return found
 
     def roles(self, experiment: str) -> list[str]:
         """Roles that an experiment evaluates."""
-        return [role for name, way, role in self._places if (name, way) == (experiment, "")]
+        return [role for name, way, role in self._splits if (name, way) == (experiment, "")]
 
     def labels(self, experiment: str, role: str, kind: str) -> list[str]:
         """Labels of the groups of a kind, such as speeds."""
-        wanted = (experiment, "", role, kind)
-        return [label for *of, label in self._scores if tuple(of) == wanted]
+        splits = self._splits.get((experiment, "", role), {}).values()
+        return list(dict.fromkeys(label for split in splits for label in split.get(kind, {})))
+
+
+def _folds_of(run: Mapping[str, Any]) -> Iterable[tuple[str, Mapping[str, Any]]]:
+    """The folds of a run by name; a run without any is one without a name."""
+    folds: Mapping[str, Mapping[str, Any]] = run.get("folds", {"": run})
+    return folds.items()
 
 
 def gains(after: BySeed, before: BySeed) -> list[float]:
@@ -435,16 +405,10 @@ def _beside(numbers: Report, scores: Scores, experiment: str) -> Table:
         what: str, paper: float, values: Collection[float], digits: int, role: str, of: str
     ) -> None:
         mark, why = _mark(experiment, role, of, numbers["calibrated"])
-        rows.append(
-            {
-                "published": what,
-                "paper": f"{paper:.{digits}f}",
-                "ours, simulated": mean_sd(values, digits),
-                "ours - paper": f"{mean(values) - paper:+.{digits}f}",
-                "": mark,
-                "why": why,
-            }
-        )
+        cells: dict[str, object] = {"published": what, "paper": f"{paper:.{digits}f}"}
+        cells["ours, simulated"] = mean_sd(values, digits)
+        cells["ours - paper"] = f"{mean(values) - paper:+.{digits}f}"
+        rows.append(cells | {"": mark, "why": why})
 
     for role, paper in published.SPLITS.items():
         for score, words in SCORES.items():
@@ -525,14 +489,11 @@ def _signals(signals: Sequence[Sequence[Mapping[str, Any]]]) -> Table:
     for checks in zip(*signals, strict=True):
         values = [value for check in checks for value in check["values"].values()]
         low, high = checks[0]["low"], checks[0]["high"]
-        rows.append(
-            {
-                "the paper's signals": checks[0]["says"],
-                "ours, simulated": f"{min(values):.3g} to {max(values):.3g}",
-                "asked": f"above {low:g}" if high is None else f"{low:g} to {high:g}",
-                "holds, seeds": f"{sum(map(bool, (c['holds'] for c in checks)))} of {len(checks)}",
-            }
-        )
+        row = {"the paper's signals": checks[0]["says"]}
+        row["ours, simulated"] = f"{min(values):.3g} to {max(values):.3g}"
+        row["asked"] = f"above {low:g}" if high is None else f"{low:g} to {high:g}"
+        holds = sum(bool(check["holds"]) for check in checks)
+        rows.append(row | {"holds, seeds": f"{holds} of {len(checks)}"})
     return Table(rows, "Least to largest over materials and seeds.")
 
 
@@ -594,9 +555,8 @@ def _baselines(runs: Runs, scores: Scores) -> Table:
 def _validation(runs: Runs) -> Table:
     rows = []
     for name in BY_CYCLE:
-        values = [run.get("validation") for run in runs.get(name, [])]
-        if values and None not in values:
-            percents = [100 * value for value in values if value is not None]
+        percents = [100 * run["validation"] for run in runs.get(name, []) if run["validation"]]
+        if percents:
             row = {"recipe": name, "left-out training materials, %": mean_sd(percents)}
             rows.append(row | {"by seed": ", ".join(f"{of:.2f}" for of in percents)})
     note = "Balanced accuracy of the best choice of K and C; no test and no held-out bin is in it."
@@ -625,7 +585,7 @@ def scene_recalls(scores: Scores, fold: str, role: str, scene: str) -> BySeed:
     """Mean recall of the classes that a scene has, in percent by seed."""
     both = [
         scores.of(f"confound: {fold}", role, score, group=("per_scene", scene))
-        for score in ("non_slip_recall", "slip_recall")
+        for score in CLASS_RECALLS.values()
     ]
     there = [of for of in both if of]
     return {seed: mean(of[seed] for of in there) for seed in (there[0] if there else {})}
@@ -679,12 +639,10 @@ def _confound(runs: Runs, scores: Scores) -> dict[str, Table]:
 
 
 def _parameters(calibrated: Mapping[str, Any]) -> Table:
+    values = {name: np.atleast_1d(value) for name, value in calibrated["values"].items()}
     rows = [
-        {
-            "parameter": name,
-            "frozen value": " to ".join(f"{of:g}" for of in np.atleast_1d(value)),
-        }
-        for name, value in calibrated["values"].items()
+        {"parameter": name, "frozen value": " to ".join(f"{of:g}" for of in value)}
+        for name, value in values.items()
     ]
     note = f"Provenance: {calibrated['provenance'].rstrip('.')}."
     if "target" in calibrated:
@@ -699,22 +657,20 @@ def _parameters(calibrated: Mapping[str, Any]) -> Table:
 def short_table(runs: Runs) -> Table:
     """The summary."""
     rows, scores = [], Scores(runs)
-    for name, roles in SHORT.items():
-        for role in roles if name in runs else ():
-            cells = {of: mean_sd(scores.of(name, role, of).values()) for of in SCORES}
-            pooled = mean_sd(scores.of(name, role, baseline=POOLED).values())
-            rows.append((f"`{name}` {role}, simulated, {len(runs[name])} seeds", cells, pooled))
-            if (name, role) in COMPARED:
-                paper = {of: percent(getattr(published.SPLITS[role], of)) for of in SCORES}
-                rows.append((f"paper, real hand, {role}", paper, ""))
-    return Table(
-        [
-            {"experiment": what}
-            | {f"{words} %": cells[of] for of, words in SCORES.items()}
-            | {"best pooled number, balanced %": pooled}
-            for what, cells, pooled in rows
-        ]
-    )
+
+    def row(what: str, cells: Mapping[str, str], pooled: str) -> None:
+        titled = {f"{words} %": cells[of] for of, words in SCORES.items()}
+        rows.append({"experiment": what} | titled | {"best pooled number, balanced %": pooled})
+
+    shown = [(name, role) for name, roles in SHORT.items() if name in runs for role in roles]
+    for name, role in shown:
+        cells = {of: mean_sd(scores.of(name, role, of).values()) for of in SCORES}
+        pooled = mean_sd(scores.of(name, role, baseline=POOLED).values())
+        row(f"`{name}` {role}, simulated, {len(runs[name])} seeds", cells, pooled)
+        if (name, role) in COMPARED:
+            paper = {of: percent(getattr(published.SPLITS[role], of)) for of in SCORES}
+            row(f"paper, real hand, {role}", paper, "")
+    return Table(rows)
 
 
 if __name__ == "__main__":

@@ -23,8 +23,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.generalisation import recordings
-from benchmarks.harness import Benchmark, Job, Report, Table
+from benchmarks.harness import Benchmark, Job
 from benchmarks.subjects import composed
+from benchmarks.tables import Report, Table
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import PAPER_SCENE, Split
 from tactslip_torch.features.bin_sample import BinSample, SampledBins
@@ -43,36 +44,27 @@ PENALTY = 1e-3  # what validation takes for every seed of +exp=unseen4
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Seeds, and overrides of the set of recordings."""
+class SceneWeights(Benchmark):
+    """Every set of weights.
 
+    Seeds, and overrides of the set of recordings.
+    """
+
+    title = "Weights of scenes in `+exp=deploy`"
+    about = "errors on training materials left out, of training bins alone, by weights of scenes"
+    page = "docs/generalisation.md"
+    quick = (
+        'seeds=[0] overrides=[data.cycles=5,"data.materials=[M1,M6,iron]","split.seen=[M1,M6]",'
+        '"split.unseen=[iron]"]'
+    )
     seeds: tuple[int, ...] = (0, 1, 2)
     overrides: tuple[str, ...] = ()
 
-
-class SceneWeights(Benchmark[Sizes]):
-    """Every set of weights."""
-
-    name = "scene_weights"
-    title = "Weights of scenes in `+exp=deploy`"
-    about = "errors on training materials left out, by weights of scenes"
-    page = "docs/generalisation.md"
-    sizes = Sizes()
-    quick = Sizes(
-        (0,),
-        (
-            "data.cycles=5",
-            "data.materials=[M1,M6,iron]",
-            "split.seen=[M1,M6]",
-            "split.unseen=[iron]",
-        ),
-    )
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Errors of each set of weights, the least mean error first."""
         found: dict[tuple[float, ...], list[dict[str, float]]] = {}
-        small = [*job.sizes.overrides, *job.overrides]
-        for seed in job.sizes.seeds:
+        small = [*self.overrides, *job.overrides]
+        for seed in self.seeds:
             bins = training_bins(seed, job.folder / "cache", small)
             for weights, errors in error_rows(*bins):
                 found.setdefault(weights, []).append(errors)
@@ -82,23 +74,13 @@ class SceneWeights(Benchmark[Sizes]):
             row = dict(zip(WEIGHTS, weights, strict=True)) | errors
             rows.append(row | {"mean error": statistics.fmean(errors.values())})
         rows.sort(key=lambda row: (round(row["mean error"], 6), row["protocol"]))
-        return {"seeds": list(job.sizes.seeds), "rows": rows}
+        return {"seeds": list(self.seeds), "rows": rows}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
-        """All of them."""
+        """All of them, the least mean error first."""
         rows = [{name: f"{of:.3g}" for name, of in row.items()} for row in numbers["rows"]]
-        return {self.title: Table(rows)}
-
-    def section(self, report: Report) -> str:
-        """How they were chosen, and the table."""
-        seeds = ", ".join(map(str, report["numbers"]["seeds"]))
-        about = (
-            "Chosen by leaving out each training material, of training bins alone (`python -m "
-            f"benchmarks.scene_weights`, seeds {seeds}, code {report['code']}). Errors in %, the "
-            "least mean error first:"
-        )
-        (table,) = self.tables(report["numbers"]).values()
-        return f"## {self.title}\n\n{about}\n\n{table.markdown()}"
+        seeds = ", ".join(map(str, numbers["seeds"]))
+        return {"Errors, %": Table(rows, f"Seeds {seeds}; the least mean error first.")}
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Each error by the place of the weights in the table."""

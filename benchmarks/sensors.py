@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from benchmarks.harness import Benchmark, Job, Report, Table, result_of, trained
+from benchmarks.harness import Benchmark, Job, result_of, trained
+from benchmarks.tables import Report, Table
 from tactslip_torch.report.importance import (
     RESELECT_WORDS,
     best_rows,
@@ -20,37 +21,33 @@ from tactslip_torch.report.importance import (
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Overrides of the training and of ``tactslip importance``."""
+class Sensors(Benchmark):
+    """Both ways of selection.
 
-    training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
-    overrides: tuple[str, ...] = ()
+    Overrides of the training and of ``tactslip importance``.
+    """
 
-
-class Sensors(Benchmark[Sizes]):
-    """Both ways of selection."""
-
-    name = "sensors"
     title = "Which sensors matter"
     about = (
         "what a detector loses without a sensor, one by one, and the best few, with features "
         "selected anew in two ways"
     )
-    sizes = Sizes()
-    quick = Sizes(
-        ("+exp=quick", "recipe=robust", "recipe.num_features=12", "recipe.penalties=[0.001]"),
-        ("bins=20", "cache=off", "num_workers=0"),
+    quick = (
+        'training=[+exp=quick,recipe=robust,recipe.num_features=12,"recipe.penalties=[0.001]"] '
+        "overrides=[bins=20,cache=off,num_workers=0]"
     )
     drawn: ClassVar = {"sensors.png": ""}
+    training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
+    overrides: tuple[str, ...] = ()
 
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """What the command leaves, by way of selection."""
         detector = job.folder / "detector"
-        trained("detector for sensors", job.sizes.training, detector, job.folder / "cache")
+        trained(self.training, detector, job.folder / "cache")
         found = {}
         for way in RESELECT_WORDS:
             overrides = [f"model={detector / 'detector.pt'}", f"reselect={way}"]
-            overrides += [*job.sizes.overrides, *job.overrides]
+            overrides += [*self.overrides, *job.overrides]
             found[way] = result_of("importance", overrides, job.folder / way, "sensors.json")
         return {"ways": found, "folder": str(job.folder / next(iter(RESELECT_WORDS)))}
 

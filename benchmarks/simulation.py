@@ -7,35 +7,18 @@ the equations are in the tests.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import torch
-from matplotlib.figure import Figure
 
-from benchmarks.harness import (
-    Benchmark,
-    Job,
-    Report,
-    Spread,
-    Table,
-    bars,
-    interleaved,
-    number,
-    on_threads,
-    percent,
-    say,
-)
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import FittedMachine, composed, small_recipe, statistics_from
-from tactslip_torch.simulation import (
-    SEEN_MATERIALS,
-    Dynamics,
-    Scene,
-    simulate,
-    timeline,
-)
+from benchmarks.tables import Report, Spread, Table, percent
+from benchmarks.timing import interleaved, on_threads
+from tactslip_torch.simulation import SEEN_MATERIALS, Dynamics, Scene, simulate, timeline
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.recipe import balanced_accuracy
 
@@ -48,8 +31,8 @@ LEVELS: dict[str, tuple[str, dict[str, int]]] = {
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
+class Simulation(Benchmark):
+    """Fidelity levels and steps.
 
     Args:
         steps_us: of the integration, the smallest first: the others are held against it.
@@ -61,6 +44,13 @@ class Sizes:
         num_features: K.
     """
 
+    title = "The simulated hand"
+    about = "fidelity levels and time steps: cost, difference to the smallest step, and accuracy"
+    bars = (("Levels and steps", "s a minute"),)
+    quick = (
+        "steps_us=[250.0,500.0] recordings=1 rounds=1 materials=[M1,M2] cycles=4 train_bins=20 "
+        "num_features=10"
+    )
     steps_us: tuple[float, ...] = (31.25, 62.5, 125.0, 250.0, 500.0)
     recordings: int = 3
     rounds: int = 5
@@ -69,33 +59,19 @@ class Sizes:
     train_bins: int = 200
     num_features: int = 60
 
-
-class Simulation(Benchmark[Sizes]):
-    """Fidelity levels and steps."""
-
-    name = "simulation"
-    title = "The simulated hand"
-    about = "fidelity levels and time steps: cost, difference to the smallest step, and accuracy"
-    sizes = Sizes()
-    quick = Sizes(
-        (250.0, 500.0), 1, 1, materials=("M1", "M2"), cycles=4, train_bins=20, num_features=10
-    )
-    libraries = ()
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Costs and differences by level and step; accuracies by level."""
         with on_threads(1):
-            return {"costs": _costs(job.sizes), "accuracies": _accuracies(job)}
+            return {"costs": _costs(self), "accuracies": _accuracies(self, job.overrides)}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Costs and accuracies."""
         costs = [
             {
-                "level": row["level"],
-                "step, us": row["step_us"] and f"{row['step_us']:g}",
-                "s a minute of 24 channels": Spread.of(row["seconds"]).text(),
-                "samples off": number(row["off"]),
-                "onset off, ms": number(row["onset_ms"]),
+                "level": row["level"] + (f", {row['step_us']:g} us" if row["step_us"] else ""),
+                "s a minute of 24 channels": Spread.of(row["seconds"]),
+                "samples off": row["off"],
+                "onset off, ms": row["onset_ms"],
             }
             for row in numbers["costs"]
         ]
@@ -115,18 +91,8 @@ class Simulation(Benchmark[Sizes]):
             "Trained on one level, evaluated on another": Table(accuracies, about),
         }
 
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Cost of levels and steps."""
-        rows = numbers["costs"]
-        names = [
-            row["level"] if row["step_us"] is None else f"{row['level']}, {row['step_us']:g} us"
-            for row in rows
-        ]
-        values = {"cost": [Spread.of(row["seconds"]).median for row in rows]}
-        bars(drawing.subplots(), names, values, "s per simulated minute")
 
-
-def _costs(sizes: Sizes) -> list[dict[str, Any]]:
+def _costs(sizes: Simulation) -> list[dict[str, Any]]:
     scenes: dict[tuple[str, float | None], list[Scene]] = {}
     for level, (fidelity, given) in LEVELS.items():
         made = [Scene(m, fidelity=fidelity) for m in SEEN_MATERIALS[: sizes.recordings]]
@@ -147,7 +113,7 @@ def _costs(sizes: Sizes) -> list[dict[str, Any]]:
         off, onset_ms = None, None
         if step_us not in (None, sizes.steps_us[0]):
             off, onset_ms = _difference(of, scenes[level, sizes.steps_us[0]])
-        seconds = [taken / minutes for taken in timings[str((level, step_us))].per_round]
+        seconds = [taken / minutes for taken in timings[str((level, step_us))]["seconds"]]
         row = {"level": level, "step_us": step_us, "seconds": seconds}
         rows.append(row | {"off": off, "onset_ms": onset_ms})
     return rows
@@ -173,10 +139,9 @@ def _difference(scenes: list[Scene], finest: list[Scene]) -> tuple[float, float]
 
 
 @torch.no_grad()
-def _accuracies(job: Job[Sizes]) -> dict[str, dict[str, float]]:
+def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> dict[str, dict[str, float]]:
     """Balanced accuracy on held-out cycles by the level trained on and the one evaluated on."""
-    sizes = job.sizes
-    config = composed("crossval", job.overrides)
+    config = composed("crossval", overrides)
     recipe = small_recipe(config, sizes.train_bins, sizes.num_features)
     kept = {}
     for level, (fidelity, given) in LEVELS.items():
@@ -184,19 +149,18 @@ def _accuracies(job: Job[Sizes]) -> dict[str, dict[str, float]]:
         source = SimulatedRecordings(
             cycles=sizes.cycles, materials=list(sizes.materials), fidelity=fidelity, scene=given
         )
-        kept[level] = statistics_from(
-            source, config, sizes.materials, sizes.train_bins, 2000, config.train_fraction, 0
-        )
+        kept[level] = statistics_from(source, config, sizes.materials, sizes.train_bins, 2000)
+    bins = {
+        level: materials.bins_of(sizes.materials, ("test",)) for level, materials in kept.items()
+    }
     found: dict[str, dict[str, float]] = {}
     for level, materials in kept.items():
         machine = FittedMachine.of(materials.statistics_of(sizes.materials), recipe)
-        found[level] = {}
-        for other, of in kept.items():
-            bins = of.bins_of(sizes.materials, ("test",))
-            is_right = machine.scores(bins.features) >= 0
-            found[level][other] = (
-                balanced_accuracy(is_right, bins.is_slip, bins.sample_weight) or 0.0
-            )
+        found[level] = {
+            other: balanced_accuracy(machine.scores(of.features) >= 0, of.is_slip, of.sample_weight)
+            or 0.0
+            for other, of in bins.items()
+        }
     return found
 
 

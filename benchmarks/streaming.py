@@ -23,25 +23,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import psutil
 import torch
 from matplotlib.figure import Figure
 
-from benchmarks.harness import (
-    Benchmark,
-    Job,
-    Report,
-    Spread,
-    Table,
-    bars,
-    in_fresh_process,
-    interleaved,
-    limit,
-    limits,
-    listed,
-    number,
-    on_threads,
-    say,
-)
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import (
     RATE_HZ,
     Array,
@@ -51,6 +37,8 @@ from benchmarks.subjects import (
     onset_settings,
     stream_samples,
 )
+from benchmarks.tables import Report, Spread, Table, bars, limits, listed
+from benchmarks.timing import growth_mb, in_fresh_process, interleaved, on_threads
 from tactslip_torch import AlarmSettings, SlipDetector, StreamingDetector
 from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.onset.decisions import KEY
@@ -61,8 +49,8 @@ LEAST_TIMES, MOST_GROWTH_MB = 20.0, 2.0
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
+class Streaming(Benchmark):
+    """Pushes, and memory along a stream.
 
     Args:
         recordings: simulated, to whose bins the head is fitted, and which are the stream.
@@ -74,6 +62,15 @@ class Sizes:
         onset_hops: pushes of a hop of the onset classifier.
     """
 
+    title = "Streams"
+    about = (
+        "a simulated stream of 24 channels at 2 kHz in float32, watched with the features that "
+        "the main job selects on 1 thread; times faster than the stream runs"
+    )
+    quick = (
+        "recordings=1 pushes=[20,200] hops=[20,100] rounds=2 watched_s=6.0 settled_s=2.0 "
+        "onset_hops=400"
+    )
     recordings: int = 8
     pushes: tuple[int, ...] = (1, 20, 200, 2000)
     hops: tuple[int, ...] = (10, 20, 50, 100)
@@ -82,29 +79,14 @@ class Sizes:
     settled_s: float = 300.0
     onset_hops: int = 6000
 
-
-class Streaming(Benchmark[Sizes]):
-    """Pushes, and memory along a stream."""
-
-    name = "streaming"
-    title = "Streams"
-    about = (
-        "a simulated stream of 24 channels at 2 kHz in float32, watched with the features that "
-        "the main job selects on 1 thread; times faster than the stream runs"
-    )
-    sizes = Sizes()
-    quick = Sizes(1, pushes=(20, 200), hops=(20, 100), rounds=2, watched_s=6.0, settled_s=2.0,
-                  onset_hops=400)  # fmt: skip
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Seconds of pushes by way, and resident memory."""
-        sizes = job.sizes
-        detector = MainJobDetector.fitted(sizes.recordings).detector()
-        samples = stream_samples(sizes.recordings)
-        pairs = [(HOP, push) for push in sizes.pushes]
-        pairs += [(hop, PUSH) for hop in sizes.hops if (hop, PUSH) not in pairs]
+        detector = MainJobDetector.fitted(self.recordings).detector()
+        samples = stream_samples(self.recordings)
+        pairs = [(HOP, push) for push in self.pushes]
+        pairs += [(hop, PUSH) for hop in self.hops if (hop, PUSH) not in pairs]
         ways = [("stream", hop, push) for hop, push in pairs]
-        ways += [("naive", hop, hop) for hop in sizes.hops]
+        ways += [("naive", hop, hop) for hop in self.hops]
         with on_threads(1), torch.no_grad():
             calls: dict[str, Callable[[], Any]] = {}
             for kind, hop, push in ways:
@@ -116,65 +98,59 @@ class Streaming(Benchmark[Sizes]):
                     for _ in range(round(RATE_HZ / push)):
                         call()  # until every push makes its decisions
                 calls[f"{kind} {hop} {push}"] = call
-            say(f"streaming: {sizes.rounds} rounds of {len(calls)} ways")
-            timings = interleaved(calls, sizes.rounds, block_s=0.1, most_calls=2000)
+            say(f"streaming: {self.rounds} rounds of {len(calls)} ways")
+            timings = interleaved(calls, self.rounds, block_s=0.1, most_calls=2000)
         rows = [
-            {"way": kind, "hop": hop, "push": push, **timings[f"{kind} {hop} {push}"].summary()}
+            {"way": kind, "hop": hop, "push": push, **timings[f"{kind} {hop} {push}"]}
             for kind, hop, push in ways
         ]
-        say(f"streaming: {sizes.onset_hops} hops of an onset classifier")
+        say(f"streaming: {self.onset_hops} hops of an onset classifier")
         with on_threads(1), torch.no_grad():
-            hops = _hops(detector, samples, sizes.onset_hops)
-        say(f"streaming: {sizes.watched_s:g} s of stream in a fresh process")
-        memory = in_fresh_process(f"benchmarks.{self.name}:watch", seconds=sizes.watched_s)
-        return {"rows": rows, "hops": hops, "memory": memory, "settled_s": sizes.settled_s}
+            hops = _hops(detector, samples, self.onset_hops)
+        say(f"streaming: {self.watched_s:g} s of stream in a fresh process")
+        memory = in_fresh_process(f"benchmarks.{self.name}:watch", seconds=self.watched_s)
+        return {"rows": rows, "hops": hops, "memory": memory, "settled_s": self.settled_s}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Limits, speed and memory."""
         main = next(r for r in numbers["rows"] if (r["way"], r["hop"], r["push"]) == _MAIN)
-        growth, hops = _growth_mb(numbers), numbers["hops"]
+        growth, hops = growth_mb(numbers["memory"], numbers["settled_s"]), numbers["hops"]
+        load = 1 / _times(main).median
+        about = f"load at hop {_ms(HOP)} ms, pushes of {_ms(PUSH)} ms"
         goals = [
-            limit(f"load at hop {_ms(HOP)} ms, pushes of {_ms(PUSH)} ms", 1 / _times(main).median,
-                  1 / LEAST_TIMES, "of a core"),
-            limit("resident memory, growth after it has settled", growth, MOST_GROWTH_MB, "MB"),
-            *(
-                limit(f"a hop of the onset classifier, {name}", 1e6 * hops[host]["hop"][quantile],
-                      most_us, "us")
-                for host, name, quantile, most_us in _HOP_LIMITS
-                if host in hops
-            ),
-        ]  # fmt: skip
+            (about, load, 1 / LEAST_TIMES, "of a core"),
+            ("resident memory, growth after it has settled", growth, MOST_GROWTH_MB, "MB"),
+        ]
+        for host, name, quantile, most_us in _HOP_LIMITS:
+            if host in hops:
+                us = 1e6 * hops[host]["hop"][quantile]
+                goals.append((f"a hop of the onset classifier, {name}", us, most_us, "us"))
         speed = [
             {
                 "way": f"{row['way']}, hop {_ms(row['hop'])} ms, pushes of {_ms(row['push'])} ms",
-                "times faster": _times(row).text(),
-                "median push, us": number(1e6 * row["p50_s"]),
-                "99th percentile, us": number(1e6 * row["p99_s"]),
+                "times faster": _times(row),
+                "median push, us": 1e6 * row["p50_s"],
+                "99th percentile, us": 1e6 * row["p99_s"],
             }
             for row in numbers["rows"]
         ]
+        of_hops = [
+            {"host": host, "push": kind, "p50 us": 1e6 * of["p50"], "p99 us": 1e6 * of["p99"]}
+            for host, kinds in hops.items()
+            for kind, of in kinds.items()
+        ]
         memory = numbers["memory"]
         held = {
-            "stream watched, s": number(memory["at_s"][-1]),
-            "resident at its end, MB": number(memory["resident_bytes"][-1] / 1e6),
-            "growth since it settled, MB": number(growth),
-            "held by the stream itself, kB": number(memory["state_bytes"] / 1e3),
+            "stream watched, s": memory["at_s"][-1],
+            "resident at its end, MB": memory["resident_bytes"][-1] / 1e6,
+            "growth since it settled, MB": growth,
+            "held by the stream itself, kB": memory["state_bytes"] / 1e3,
         }
         return {
             "Limits": limits(goals),
             "Speed": Table(speed, "naive: a bin with all its context for every decision."),
             "Hops of an onset classifier": Table(
-                [
-                    {
-                        "host": host,
-                        "push": kind,
-                        "p50 us": number(1e6 * of["p50"]),
-                        "p99 us": number(1e6 * of["p99"]),
-                    }
-                    for host, kinds in hops.items()
-                    for kind, of in kinds.items()
-                ],
-                "CPU time of one thread, pushes of 5 ms; every fifth completes a bin too.",
+                of_hops, "CPU time of one thread, pushes of 5 ms; every fifth completes a bin too."
             ),
             "Memory": listed("memory", held),
         }
@@ -182,13 +158,10 @@ class Streaming(Benchmark[Sizes]):
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Speed by way, and memory over time."""
         speed, memory = drawing.subplots(2, 1, height_ratios=[2, 1])
-        rows = numbers["rows"]
-        names = [f"{r['way']}, hop {_ms(r['hop'])}, push {_ms(r['push'])} ms" for r in rows]
-        bars(speed, names, {"speed": [_times(row).median for row in rows]}, "times faster")
+        bars(speed, *self.tables(numbers)["Speed"].columns("times"), "times faster")
         found = numbers["memory"]
         memory.plot(found["at_s"], np.asarray(found["resident_bytes"]) / 1e6)
-        memory.set_xlabel("s of stream")
-        memory.set_ylabel("resident, MB")
+        memory.set(xlabel="s of stream", ylabel="resident, MB")
 
 
 _MAIN = ("stream", HOP, PUSH)
@@ -214,16 +187,15 @@ def _hops(
         }
         for host, push in hosts.items():  # one after the other: they would share the caches
             for place, piece in enumerate(islice(endless(samples, hop), num)):
-                seen = (place + 1) * hop
-                had, has = ((x - first) // settings.hop_samples for x in (seen - hop, seen))
+                bins = [(x * hop - first) // settings.hop_samples for x in (place, place + 1)]
                 started = time.thread_time()
                 push(piece)
                 spent = time.thread_time() - started
                 if place >= _FIRST_TIMED:
-                    seconds[host]["hop and bin" if has > had else "hop"].append(spent)
+                    seconds[host]["hop" if bins[0] == bins[1] else "hop and bin"].append(spent)
     return {
         host: {
-            kind: {name: float(np.quantile(own, q)) for name, q in (("p50", 0.5), ("p99", 0.99))}
+            kind: dict(zip(("p50", "p99"), np.quantile(own, (0.5, 0.99)).tolist(), strict=True))
             for kind, own in kinds.items()
         }
         for host, kinds in seconds.items()
@@ -273,23 +245,16 @@ def watch(seconds: float) -> dict[str, Any]:
         now_s = number_of_push * PUSH / RATE_HZ
         if now_s >= len(at_s) * each_s:
             at_s.append(now_s)
-            resident.append(_resident_bytes())
+            resident.append(int(psutil.Process().memory_info().rss))
             state_bytes = max(state_bytes, stream.state_bytes)
     return {"at_s": at_s, "resident_bytes": resident, "state_bytes": state_bytes}
-
-
-def _resident_bytes() -> int:
-    import psutil
-
-    return int(psutil.Process().memory_info().rss)
 
 
 def _naive(detector: SlipDetector, samples: Array, hop: int) -> Callable[[], Any]:
     """Every bin from the raw samples around it, at a distance of ``hop``."""
     whole = torch.from_numpy(samples.T.copy())
     length = detector.context_before + detector.pool.bin_samples + detector.context_after
-    starts = range(0, whole.shape[-1] - length, hop)
-    each = cycle(starts)
+    each = cycle(range(0, whole.shape[-1] - length, hop))
     return lambda: detector.predict_raw(whole[None, :, (at := next(each)) : at + length])
 
 
@@ -300,13 +265,6 @@ def _next_push(stream: StreamingDetector, samples: Iterator[Array]) -> None:
 def _times(row: Report) -> Spread:
     """Seconds of stream over seconds of watching it."""
     return Spread.of([row["push"] / RATE_HZ / seconds for seconds in row["seconds"]])
-
-
-def _growth_mb(numbers: Report) -> float:
-    memory = numbers["memory"]
-    looks = zip(memory["at_s"], memory["resident_bytes"], strict=True)
-    settled: list[float] = [resident for at_s, resident in looks if at_s >= numbers["settled_s"]]
-    return (max(settled) - settled[0]) / 1e6
 
 
 def _ms(samples: int) -> str:

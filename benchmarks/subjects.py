@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 from omegaconf import DictConfig
@@ -20,7 +21,7 @@ from torch import Tensor
 from benchmarks.harness import say, trained
 from benchmarks.selection import kept_selection
 from tactslip_torch import AlarmSettings, FeaturePool, HandLayout, SlipDetector
-from tactslip_torch.commands.configuration import conf_dir
+from tactslip_torch.commands.configuration import conf_dir, unknown_choice
 from tactslip_torch.commands.crossval import Materials
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource
@@ -174,9 +175,18 @@ def onset_settings(detector: SlipDetector, samples: Array) -> AlarmSettings:
 
 # -------------------------------------------------------------------------- trained detectors
 def composed(name: str, overrides: Sequence[str]) -> DictConfig:
-    """A configuration by its overrides."""
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose(name, list(overrides))
+    """A configuration by its overrides.
+
+    Raises:
+        ValueError: if an override names what does not exist.
+    """
+    if problem := unknown_choice(overrides):
+        raise ValueError(problem)
+    try:
+        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return compose(name, list(overrides))
+    except HydraException as error:
+        raise ValueError(str(error)) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +207,7 @@ class Trained:
         Raises:
             RuntimeError: if the training fails.
         """
-        metrics = trained(folder.name, overrides, folder, cache_folder)
+        metrics = trained(overrides, folder, cache_folder)
         config = composed("train", overrides)
         source, rule = instantiate(config.data, _convert_="all"), instantiate(config.labels)
         (split,) = instantiate(config.split, _convert_="all")(source.ids)
@@ -222,12 +232,11 @@ def statistics_from(
     seen: Sequence[str],
     train_bins: int,
     scored_bins: int,
-    train_fraction: float,
-    seed: int,
 ) -> Materials:
     """What one pass over all recordings keeps of each material, split by cycle."""
     rule = instantiate(config.labels)
-    by_cycle = seen6(source.ids, seen=list(seen), train_fraction=train_fraction, seed=seed)[0]
+    by = {"train_fraction": config.train_fraction, "seed": config.seed}
+    by_cycle = seen6(source.ids, seen=list(seen), **by)[0]
     maker = feature_maker(source, rule, **config.features)
     materials = Materials(maker.pool, train_bins, scored_bins)
     for place, recording in enumerate(source.ids):
@@ -243,7 +252,6 @@ class FittedMachine:
 
     plan: Any
     statistics: TrainingStatistics
-    recipe: Recipe
     weights: Tensor
     head: Any
 
@@ -253,10 +261,8 @@ class FittedMachine:
         """Rank, scale, choose K and C, and fit."""
         plan = plan_detector(recipe, statistics)
         training = plan.training_bins(statistics.sample.bins())
-        weights = training.sample_weight
-        return cls(
-            plan, statistics, recipe, weights, fit_machine(training, plan.penalty, plan.kernel)
-        )
+        head = fit_machine(training, plan.penalty, plan.kernel)
+        return cls(plan, statistics, training.sample_weight, head)
 
     @torch.no_grad()
     def scores(self, features: Tensor) -> Tensor:
@@ -270,5 +276,5 @@ def small_recipe(
 ) -> Recipe:
     """The default recipe on a sample of bins."""
     whole: Recipe = instantiate(config.recipes.robust, _convert_="all")
-    recipe = replace(whole, sample_bins=train_bins, num_features=num_features)
-    return replace(recipe, penalties=tuple(penalties)) if penalties else recipe
+    choices = tuple(penalties) or whole.penalties
+    return replace(whole, sample_bins=train_bins, num_features=num_features, penalties=choices)

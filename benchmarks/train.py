@@ -13,15 +13,18 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import psutil
 from matplotlib.figure import Figure
 
-from benchmarks.harness import COLORS, Benchmark, Job, Report, Table, by, limit, limits, say
+from benchmarks.harness import Benchmark, Job, say
+from benchmarks.tables import COLORS, Report, Table, by, limits
 
 KINDS = ("cold", "warm")
 SAMPLE_S = 0.1
@@ -31,59 +34,43 @@ MOST_GB = 6.0
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
+class Train(Benchmark):
+    """Cold and warm runs of the main job.
 
     Args:
         overrides: of ``tactslip_torch.train``, before those of the command line.
         repeats: of cold and warm.
     """
 
+    title = "Training"
+    about = "python -m tactslip_torch.train, with an empty feature cache and with a full one"
+    quick = "overrides=[+exp=quick] repeats=1"
     overrides: tuple[str, ...] = ("+exp=unseen4",)
     repeats: int = 3
 
-
-class Train(Benchmark[Sizes]):
-    """Cold and warm runs of the main job."""
-
-    name = "train"
-    title = "Training"
-    about = "python -m tactslip_torch.train, with an empty feature cache and with a full one"
-    sizes = Sizes()
-    quick = Sizes(("+exp=quick",), repeats=1)
-
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """Runs in turns, each pair from an empty cache."""
-        overrides = [*job.sizes.overrides, *job.overrides]
+        overrides = [*self.overrides, *job.overrides]
         runs = []
-        for repeat in range(job.sizes.repeats):
+        for repeat in range(self.repeats):
             with TemporaryDirectory(prefix="tactslip-bench-") as folder:
                 for kind in KINDS:
-                    say(f"train: repeat {repeat + 1} of {job.sizes.repeats}, {kind}")
+                    say(f"train: repeat {repeat + 1} of {self.repeats}, {kind}")
                     runs.append({"kind": kind} | _training(overrides, Path(folder), kind))
         return {"overrides": overrides, "runs": runs}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Limits, stages and totals."""
         by_kind = {kind: of for (kind,), of in by(numbers["runs"], "kind").items()}
-        stages = dict.fromkeys(stage for run in numbers["runs"] for stage in run["stages"])
+        walls = {kind: [run["wall_s"] for run in runs] for kind, runs in by_kind.items()}
         rows = []
-        for stage in stages:
+        for stage, of_kind in _stages(numbers).items():
             row = {"stage": stage}
-            for kind, runs in by_kind.items():
-                seconds = median(run["stages"].get(stage, 0.0) for run in runs)
-                whole = median(run["wall_s"] for run in runs)
-                row |= {
-                    f"{kind}, s": f"{seconds:.2f}",
-                    f"{kind}, %": f"{100 * seconds / whole:.1f}",
-                }
+            for kind, seconds in of_kind.items():
+                row[f"{kind}, s"] = f"{seconds:.2f}"
+                row[f"{kind}, %"] = f"{100 * seconds / median(walls[kind]):.1f}"
             rows.append(row)
-        for name, key, factor in (
-            ("whole process, s", "wall_s", 1.0),
-            ("peak memory, GB", "peak_bytes", 1e-9),
-            ("workers, s in all", "worker_s", 1.0),
-            ("bins a second of its passes", "bins_a_second", 1.0),
-        ):
+        for name, (key, factor) in _TOTALS.items():
             row = {"stage": name}
             for kind, runs in by_kind.items():
                 value = factor * median(run[key] for run in runs)
@@ -98,28 +85,36 @@ class Train(Benchmark[Sizes]):
         found = {"Stages": Table(rows, note)}
         if numbers["overrides"] != ["+exp=unseen4"]:
             return found
-        goals = [
-            limit(f"{kind}, s, worst", max(run["wall_s"] for run in by_kind[kind]), LIMITS[kind])
-            for kind in KINDS
-        ]
+        goals = [(f"{kind}, s, worst", max(walls[kind]), LIMITS[kind], "") for kind in KINDS]
         most = max(run["peak_bytes"] for run in by_kind["cold"]) / 1e9
-        goals.append(limit("cold, peak memory, GB, worst", most, MOST_GB))
+        goals.append(("cold, peak memory, GB, worst", most, MOST_GB, ""))
         return {"Limits": limits(goals), **found}
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Stages of both kinds, stacked."""
-        axes = drawing.subplots()
-        stages = dict.fromkeys(stage for run in numbers["runs"] for stage in run["stages"])
-        left = dict.fromkeys(KINDS, 0.0)
-        for place, stage in enumerate(stages):
-            for (kind,), runs in by(numbers["runs"], "kind").items():
-                seconds = median(run["stages"].get(stage, 0.0) for run in runs)
-                color = COLORS[place % len(COLORS)]
-                label = stage if kind == KINDS[0] else None
-                axes.barh(kind, seconds, left=left[kind], color=color, label=label)
-                left[kind] += seconds
+        axes, left = drawing.subplots(), np.zeros(len(KINDS))
+        for color, (stage, seconds) in zip(cycle(COLORS), _stages(numbers).items(), strict=False):
+            axes.barh(list(seconds), list(seconds.values()), left=left, color=color, label=stage)
+            left += list(seconds.values())
         axes.set_xlabel("s")
         drawing.legend(loc="outside lower center", ncols=4)
+
+
+_TOTALS = {
+    "whole process, s": ("wall_s", 1.0),
+    "peak memory, GB": ("peak_bytes", 1e-9),
+    "workers, s in all": ("worker_s", 1.0),
+    "bins a second of its passes": ("bins_a_second", 1.0),
+}
+
+
+def _stages(numbers: Report) -> dict[str, dict[str, float]]:
+    """Median seconds by stage and kind of run."""
+    runs = by(numbers["runs"], "kind").items()
+    return {
+        stage: {kind: median(run["stages"].get(stage, 0.0) for run in of) for (kind,), of in runs}
+        for stage in dict.fromkeys(stage for run in numbers["runs"] for stage in run["stages"])
+    }
 
 
 def _training(overrides: list[str], folder: Path, kind: str) -> dict[str, Any]:
@@ -150,15 +145,12 @@ def _training(overrides: list[str], folder: Path, kind: str) -> dict[str, Any]:
     stages = {name: seconds for name, seconds in timing_s.items() if name != "total"}
     passes_s = sum(seconds for name, seconds in stages.items() if name.endswith("_pass"))
     num_bins = sum(scores["num_bins"] for scores in metrics["splits"].values())
+    other_s = timing_s["total"] - sum(stages.values())
     return {
         "wall_s": wall_s,
         "peak_bytes": peak_bytes,
         "memory": memory,
-        "stages": {
-            "start-up": wall_s - timing_s["total"],
-            **stages,
-            "other": timing_s["total"] - sum(stages.values()),
-        },
+        "stages": {"start-up": wall_s - timing_s["total"], **stages, "other": other_s},
         "worker_s": sum(metrics["worker_s"].values()),
         "num_bins": num_bins,
         "bins_a_second": num_bins / max(passes_s, 1e-9),

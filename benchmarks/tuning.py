@@ -6,57 +6,52 @@ training materials held out from it and, as a detector, on test and held-out mat
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from statistics import mean
 from typing import Any
 
-from matplotlib.figure import Figure
+from benchmarks.harness import Benchmark, Job, trained
+from benchmarks.tables import Report, Table, percent
 
-from benchmarks.harness import Benchmark, Job, Overrides, Report, Table, bars, percent, trained
-
-LEARNED = {
-    "C and c": "[penalty,offset]",
-    "C, c and scales": "[penalty,offset,scales]",
-}
+LEARNED = {"C and c": "[penalty,offset]", "C, c and scales": "[penalty,offset,scales]"}
 GRID = {"recipe": "grid, by balanced accuracy", "grid": "grid, by loss"}
 
 
-class Tuning(Benchmark[Overrides]):
-    """Tuned by gradient, beside the grid of the recipe."""
+@dataclass(frozen=True)
+class Tuning(Benchmark):
+    """Tuned by gradient, beside the grid of the recipe.
 
-    name = "tuning"
+    Args:
+        overrides: of the training.
+    """
+
     title = "Tuned by gradient"
     about = "the kernel machine of the simulated hand tuned by gradient, beside its recipe's grid"
-    sizes = Overrides(("+exp=tuned",))
-    quick = Overrides(
-        (
-            "+exp=quick",
-            "tuning=gradient",
-            "tuning.bins=6",
-            "tuning.steps=2",
-            "recipe=robust",
-            "recipe.num_features=8",
-        )
+    bars = (("Beside the grid", "held-out loss"),)
+    quick = (
+        "overrides=[+exp=quick,tuning=gradient,tuning.bins=6,tuning.steps=2,recipe=robust,"
+        "recipe.num_features=8]"
     )
+    overrides: tuple[str, ...] = ("+exp=tuned",)
 
-    def measure(self, job: Job[Overrides]) -> dict[str, Any]:
+    def measure(self, job: Job) -> dict[str, Any]:
         """A training for each way."""
         found = {}
         for place, (name, learn) in enumerate(LEARNED.items()):
-            overrides = [*job.sizes.overrides, *job.overrides, f"tuning.learn={learn}"]
+            overrides = [*self.overrides, *job.overrides, f"tuning.learn={learn}"]
             folder = job.folder / str(place)
-            metrics = trained(f"tuning {name}", overrides, folder, job.folder / "cache")
+            metrics = trained(overrides, folder, job.folder / "cache")
             found[name] = metrics["tuning"] | {"tuned_splits": metrics["splits"]}
         return {"ways": found}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Losses and accuracies of every way."""
-        rows = []
-        for place, (name, found) in enumerate(numbers["ways"].items()):
-            for way, words in GRID.items() if place == 0 else ():
-                seconds = found["fit_s"] if way == "recipe" else None
-                rows.append(_row(words, found, way, found["splits"][way], seconds))
-            splits = found["tuned_splits"]
-            rows.append(_row(f"{name} tuned", found, "tuned", splits, found["seconds"]))
+        first = next(iter(numbers["ways"].values()))
+        rows = [_row(words, first, way, first["splits"][way]) for way, words in GRID.items()]
+        rows[0]["seconds"] = round(first["fit_s"])
+        for name, found in numbers["ways"].items():
+            row = _row(f"{name} tuned", found, "tuned", found["tuned_splits"])
+            rows.append(row | {"seconds": round(found["seconds"])})
         note = (
             "Held out: mean log loss (nats) and balanced accuracy of each training material under "
             "settings chosen without it; ranking and ranges met it. Seconds: of tuning, and of the "
@@ -64,29 +59,15 @@ class Tuning(Benchmark[Overrides]):
         )
         return {"Beside the grid": Table(rows, note)}
 
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Held-out losses."""
-        first = next(iter(numbers["ways"].values()))
-        losses = {words: _held_mean(first, way, "loss") for way, words in GRID.items()}
-        losses |= {of: _held_mean(found, "tuned", "loss") for of, found in numbers["ways"].items()}
-        values = {"loss": list(losses.values())}
-        bars(drawing.subplots(), list(losses), values, "held-out loss", is_log=False)
 
+def _row(name: str, found: Report, way: str, splits: Report) -> dict[str, object]:
+    def held_mean(measure: str) -> float:
+        return mean(float(group[way][measure]) for group in found["held"])
 
-def _row(
-    name: str, found: Report, way: str, splits: Report, seconds: float | None
-) -> dict[str, object]:
-    row: dict[str, object] = {
-        "settings": name,
-        "held-out loss": f"{_held_mean(found, way, 'loss'):.4f}",
-        "held-out %": percent(_held_mean(found, way, "balanced_accuracy")),
-    }
+    row: dict[str, object] = {"settings": name, "held-out loss": held_mean("loss")}
+    row["held-out %"] = percent(held_mean("balanced_accuracy"))
     row |= {f"{of} %": percent(splits[of]["balanced_accuracy"]) for of in ("test", "unseen")}
-    return row | {"seconds": None if seconds is None else round(seconds)}
-
-
-def _held_mean(found: Report, way: str, measure: str) -> float:
-    return mean(float(group[way][measure]) for group in found["held"])
+    return row | {"seconds": None}
 
 
 if __name__ == "__main__":
