@@ -57,8 +57,11 @@ def certificate_figure(
 
 def _scatter(axes: Axes, content: Mapping[str, Any], sets: Mapping[str, Any]) -> None:
     """Above the diagonal an error is larger than its score: only there a decision can flip."""
-    scores = np.concatenate([own.exact.abs() for own in sets.values()])
-    errors = np.concatenate([own.error for own in sets.values()])
+    bins = {
+        name: (own.exact.abs().numpy(), own.error.numpy(), own.flips.numpy())
+        for name, own in sets.items()
+    }
+    scores, errors, _ = (np.concatenate(parts) for parts in zip(*bins.values(), strict=True))
     margin, bound = content["margin"]["score"], content["head"]["bound"]
     known = [value for value in (margin, bound) if value]
     floor = _least_positive([*errors.tolist(), *known])
@@ -66,10 +69,10 @@ def _scatter(axes: Axes, content: Mapping[str, Any], sets: Mapping[str, Any]) ->
     high = 2 * max(scores.max(), *known, 1e-300)
     top = 5 * max(np.max(errors, where=np.isfinite(errors), initial=floor), *known, floor)
     colours = style.colours_of(sets)
-    for name, own in sets.items():
-        x, y = np.maximum(own.exact.abs(), low), np.clip(own.error, floor, top / 1.5)
+    for name, (score, error, flips) in bins.items():
+        x, y = np.maximum(score, low), np.clip(error, floor, top / 1.5)
         axes.scatter(x, y, s=5, color=colours[name], alpha=0.45, linewidths=0, label=name)
-        axes.scatter(x[own.flips], y[own.flips], s=34, marker="x", color=_BAD, zorder=4)
+        axes.scatter(x[flips], y[flips], s=34, marker="x", color=_BAD, zorder=4)
     axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(floor / 2, top))
     axes.minorticks_off()  # of hundreds of decades they take seconds
     axes.plot([low, high], [low, high], color=style.GREY, linewidth=0.9, linestyle=":")
