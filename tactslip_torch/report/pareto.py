@@ -162,7 +162,7 @@ def pareto_figure(content: Mapping[str, Any], path: str | Path) -> None:
         axes.axvline(limit, color="black", linestyle=":", linewidth=1)
     left.set_xlabel("worst-case latency, onset to decision, ms")
     left.set_ylabel("balanced accuracy, %, a material left out")
-    left.set_title("front: shortest hop; chosen: longest that keeps the deadline (dotted)")
+    left.set_title("front: shortest hop; chosen: longest by the deadline (dotted)")
     right.plot([], [], "s", color="white", mec="black", label="pooled over channels")
     for letter, what in _NAMED.values():
         right.plot([], [], marker=f"${letter}$", color="black", linestyle="", label=what)
