@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import runpy
 import sys
 from difflib import get_close_matches
+from importlib import import_module
 
 COMMANDS = {
     "demo": "find the slip in a sample recording, draw it, export; nothing is needed",
@@ -23,6 +23,8 @@ COMMANDS = {
     "calibrate-simulator": "set the free parameters of the simulator",
     "hosts": "copy a program that runs an exported detector: python, c, node or web",
 }
+OF_THEIR_OWN = ("demo", "hosts")
+"""Commands without a configuration."""
 
 
 def main() -> None:
@@ -51,26 +53,25 @@ def run(command: str, arguments: list[str]) -> None:
     Raises:
         SystemExit: with another status than 0 if it failed.
     """
-    from tactslip_torch.commands.configuration import conf_dir
+    from tactslip_torch.commands.configuration import Composed, Mistake, checked, help_text
     from tactslip_torch.commands.stopping import stopping
 
-    name = command.replace("-", "_")
-    is_ours = (conf_dir() / f"{name}.yaml").is_file()
     with stopping():
-        if is_ours and {"-h", "--help"} & set(arguments):
-            from tactslip_torch.commands.configuration import Composed, Mistake, checked, help_text
-
-            asked = [each for each in arguments if each not in ("-h", "--help")]
-            try:
-                _, composed = checked(command, asked)
-            except Mistake as mistake:
-                print(f"error: {mistake}", file=sys.stderr)
-                raise SystemExit(2) from None
-            print(help_text(command, COMMANDS[command], composed or Composed(command)))
+        if command in OF_THEIR_OWN:
+            sys.argv = [f"tactslip {command}", *arguments]
+            import_module(f"{__package__}.commands.{command}").main()
             return
-        sys.argv = [f"tactslip {command}", *arguments]
-        # as __main__, so that Lightning finds what to start again in further processes
-        runpy.run_module(f"tactslip_torch.commands.{name}", run_name="__main__", alter_sys=True)
+        asked = [each for each in arguments if each not in ("-h", "--help")]
+        try:
+            found = checked(command, asked)
+        except Mistake as mistake:
+            print(f"error: {mistake}", file=sys.stderr)
+            raise SystemExit(2) from None
+        if len(asked) < len(arguments):
+            composed = found.composed or Composed(command)
+            print(help_text(command, COMMANDS[command], composed))
+            return
+        import_module(f"{__package__}.commands.{command.replace('-', '_')}").main(found)
 
 
 if __name__ == "__main__":

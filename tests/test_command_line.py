@@ -183,7 +183,7 @@ def test_a_mistake_is_answered_in_one_line(line):
 )
 def test_a_text_is_a_list_of_one_where_a_list_is_wanted(line, key, value):
     command, *rest = typed(line)
-    _, composed = checked(command, rest)
+    composed = checked(command, rest).composed
     with_lists(composed.config, composed)
     found = composed.config
     for part in key.split("."):

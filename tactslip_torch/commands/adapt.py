@@ -240,6 +240,3 @@ def _entry(config: DictConfig, bins: Mapping[str, RecordingBins], change: Change
 
 
 main = entry_point("adapt", adapt)
-
-if __name__ == "__main__":
-    main()

@@ -319,6 +319,3 @@ def _failed(point: Point) -> str:
 
 
 main = entry_point("calibrate_simulator", calibrate)
-
-if __name__ == "__main__":
-    main()

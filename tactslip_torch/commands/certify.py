@@ -143,6 +143,3 @@ def _certify_or_exit(config: DictConfig, _: Path) -> None:
 
 
 main = entry_point("certify", _certify_or_exit)
-
-if __name__ == "__main__":
-    main()

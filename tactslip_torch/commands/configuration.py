@@ -16,16 +16,18 @@ be ones that something takes.
 from __future__ import annotations
 
 import inspect
+import os
 import re
-import shutil
 import tempfile
 import textwrap
 import typing
+from argparse import ArgumentError, Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
-from functools import cache, cached_property
+from functools import cache, cached_property, reduce
+from operator import getitem
 from pathlib import Path
 from types import UnionType
 from typing import Any, NamedTuple
@@ -70,52 +72,20 @@ def conf_dir() -> Path:
     return packaged_folder("conf", "train.yaml")
 
 
-_NEEDED = {"web": ("web", "node")}
-"""Hosts of several folders: the page shares the reader and the stream of ``node``."""
-_LEFT = shutil.ignore_patterns("node_modules", "__pycache__", "*.o")
-
-
-def hosts_dir() -> Path:
-    """The ``export`` folder."""
-    return packaged_folder("export", "README.md")
-
-
-def host_names() -> list[str]:
-    """The hosts there are."""
-    return sorted(path.name for path in hosts_dir().iterdir() if (path / "README.md").is_file())
-
-
-def copy_host(name: str, folder: Path) -> Path:
-    """Copy a host program, with what it shares with others, into a folder.
-
-    Returns:
-        Its own folder, ``folder / name``.
-
-    Raises:
-        ValueError: if there is no such host.
-        FileExistsError: if there is something in its place.
-    """
-    if name not in host_names():
-        raise ValueError(f"no host {name!r}; there are {', '.join(host_names())}")
-    parts = _NEEDED.get(name, (name,))
-    for part in parts:
-        if (folder / part).exists():
-            raise FileExistsError(f"{folder / part} is there already; give another folder")
-    for part in parts:
-        shutil.copytree(hosts_dir() / part, folder / part, ignore=_LEFT)
-    return folder / name
-
-
-class Comments(NamedTuple):
-    """What a YAML file says of itself.
+class _File(NamedTuple):
+    """What is in a YAML file, and what it says of itself.
 
     Attributes:
+        content: without Hydra's section.
+        defaults: its defaults list.
         head: the lines at its top, without examples.
         examples: command lines.
         keys: what stands behind or above each key, by its dotted path.
         groups: the same of its defaults list, by ``group`` or ``group@package``.
     """
 
+    content: Mapping[str, Any]
+    defaults: Sequence[Any]
     head: str
     examples: tuple[str, ...]
     keys: Mapping[str, str]
@@ -123,8 +93,7 @@ class Comments(NamedTuple):
 
 
 @cache
-def comments_of(path: Path) -> Comments:
-    """The comments of a YAML file."""
+def _read(path: Path) -> _File:
     text = path.read_text(encoding="utf-8")
     lines = text.splitlines()
     top: list[str] = []
@@ -162,12 +131,15 @@ def comments_of(path: Path) -> Comments:
             if is_block and isinstance(value, yaml.MappingNode) and name != "hydra":
                 walk(value, f"{name}.")
 
-    root = yaml.compose(text, yaml.SafeLoader)
-    if isinstance(root, yaml.MappingNode):
+    loader = yaml.SafeLoader(text)
+    if root := loader.get_single_node():
         walk(root, "")
     head = [line for line in top if not line.startswith(("tactslip ", "@package"))]
     examples = tuple(line for line in top if line.startswith("tactslip "))
-    return Comments(" ".join(head), examples, keys, groups)
+    content: dict[str, Any] = loader.construct_document(root) if root else {}
+    content.pop("hydra", None)
+    defaults = content.pop("defaults", [])
+    return _File(content, defaults, " ".join(head), examples, keys, groups)
 
 
 class Group(NamedTuple):
@@ -205,8 +177,6 @@ class Composed:
     Attributes:
         whole: all of it, Hydra's own section as well, which ``run`` uses up.
         config: without Hydra's own section, unresolved.
-        keys: those that may be set, in the order of their sections.
-        groups: those that apply.
         head: what the command does.
         examples: command lines.
 
@@ -227,22 +197,41 @@ class Composed:
         own_keys = [key for key in self.whole if key != "hydra"]
         self.config: DictConfig = OmegaConf.masked_copy(self.whole, own_keys)
         OmegaConf.set_struct(self.config, False)
-        own = comments_of(conf_dir() / f"{name}.yaml")
+        own = _read(conf_dir() / f"{name}.yaml")
         self.head, self.examples = own.head, own.examples
+        self._own = own
         self._files: list[tuple[Path, str]] = []
         places = [conf_dir(), *([Path(folder)] if folder is not None else [])]
         for file in files:
             found = [p for at in places if (p := at / f"{file.config_path}.yaml").is_file()]
             if found and not (file.package or "").startswith("hydra"):
                 self._files.append((found[0], f"{file.package}." if file.package else ""))
-        said: dict[str, str] = {}
+        self._said: dict[str, str] = {}
         for path, prefix in self._files:
-            for key, text in comments_of(path).keys.items():
-                said.setdefault(prefix + key, text)  # the base describes
-        self._said = said
+            for key, text in _read(path).keys.items():
+                self._said.setdefault(prefix + key, text)  # the base describes
+
+    @cached_property
+    def keys(self) -> tuple[Key, ...]:
+        """Those that may be set, in the order of their sections."""
         plain: Any = OmegaConf.to_container(self.config, resolve=False)
-        self.keys = tuple(_keys(plain, "", said))
-        self.groups = tuple(self._groups(name, own.groups))
+        return tuple(_keys(plain, "", self._said))
+
+    @cached_property
+    def groups(self) -> tuple[Group, ...]:
+        """Those that apply."""
+        entries = [entry for entry in self._own.defaults if isinstance(entry, dict)]
+        used = {k: v for each in entries for k, v in each.items() if not k.startswith("override")}
+        groups = [Group(k, v, options_of(k), self._own.groups.get(k, "")) for k, v in used.items()]
+        fitting = tuple(each for each in options_of("exp") if self._fits(each, set(used)))
+        about = "an experiment: other defaults for several keys"
+        return (*groups, *([Group("+exp", None, fitting, about)] if fitting else []))
+
+    def _fits(self, experiment: str, used: set[str]) -> bool:
+        """Whether an experiment changes nothing that this command does not have."""
+        file = _read(conf_dir() / f"exp/{experiment}.yaml")
+        groups = {k.removeprefix("override /") for each in file.defaults for k in each}
+        return groups <= used and set(file.content) <= set(self.config)
 
     def run(self, task: Callable[[DictConfig], None]) -> None:
         """Carry out a task as ``hydra.main`` does, which would compose everything twice more.
@@ -269,38 +258,19 @@ class Composed:
 
         def walk(section: Mapping[str, Any], prefix: str) -> None:
             for key, value in section.items():
-                found[f"{prefix}{key}"] = value
                 name = f"{prefix}{key}"
+                found[name] = value
                 if isinstance(value, dict) and (name not in self._said or _has(self._said, name)):
                     walk(value, f"{name}.")
 
         for path, prefix in self._files:
             if path.parent.name == "exp":
                 continue
-            content: Any = OmegaConf.to_container(OmegaConf.load(path))
-            for name in ("defaults", "hydra"):
-                content.pop(name, None)
             parts = prefix.split(".")[:-1]
             for depth in range(1, len(parts) + 1):
                 found.setdefault(".".join(parts[:depth]), {})
-            walk(content, prefix)
+            walk(_read(path).content, prefix)
         return found
-
-    def _groups(self, name: str, said: Mapping[str, str]) -> Iterator[Group]:
-        content: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{name}.yaml"))
-        entries = [entry for entry in content.get("defaults", ()) if isinstance(entry, dict)]
-        used = {k: v for entry in entries for k, v in entry.items() if not k.startswith("override")}
-        for group, chosen in used.items():
-            yield Group(group, chosen, options_of(group), said.get(group, ""))
-        fitting = tuple(each for each in options_of("exp") if self._fits(each, used))
-        if fitting:
-            yield Group("+exp", None, fitting, "an experiment: other defaults for several keys")
-
-    def _fits(self, experiment: str, used: Mapping[str, str]) -> bool:
-        """Whether an experiment changes nothing that this command does not have."""
-        content: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"exp/{experiment}.yaml"))
-        groups = {k.removeprefix("override /") for e in content.pop("defaults", ()) for k in e}
-        return groups <= set(used) and set(content) <= set(self.config)
 
 
 @contextmanager
@@ -358,8 +328,7 @@ def help_text(command: str, summary: str, composed: Composed) -> str:
             if group.name == "+exp":
                 lines += _row("+exp=NAME", group.description)
                 for option in options:
-                    head = comments_of(conf_dir() / f"exp/{option}.yaml").head
-                    lines += _row(f"  {option}", head)
+                    lines += _row(f"  {option}", _read(conf_dir() / f"exp/{option}.yaml").head)
             else:
                 lines += _row(group.name, f"{group.description}: {' '.join(options)}")
         lines += _row("", "GROUP=OPTION beside --help lists the keys of that option")
@@ -408,9 +377,9 @@ def _row(name: str, text: str) -> list[str]:
     return [f"  {name}", *rows]
 
 
-_ELSEWHERE = {"--config-name", "-cn", "--config-path", "-cp", "--hydra-help", "--info", "--version"}
-_ELSEWHERE |= {"--shell-completion", "-sc", "-i"}
-_SCENES = re.compile(r"(.+\.)?extra_scenes$")
+_ELSEWHERE = (
+    "config_name", "config_path", "hydra_help", "info", "shell_completion", "experimental_rerun"
+)  # fmt: skip
 _PAIRS = {"[": "]", "{": "}", "(": ")"}
 _MIRROR = str.maketrans("[]{}()", "][}{)(")
 
@@ -419,39 +388,50 @@ class Mistake(ValueError):
     """A command line that cannot be carried out; its text is one line for the user."""
 
 
-def checked(command: str, arguments: Sequence[str]) -> tuple[list[str], Composed | None]:
-    """A command line in the order that Hydra wants, and its configuration.
+class Checked(NamedTuple):
+    """A command line that can be carried out.
+
+    Attributes:
+        arguments: in the order that Hydra wants, options last.
+        options: as Hydra reads them.
+        composed: the configuration; ``None`` where another one or help of Hydra's is asked for.
+    """
+
+    arguments: list[str]
+    options: Namespace
+    composed: Composed | None
+
+
+def checked(command: str, arguments: Sequence[str]) -> Checked:
+    """A command line, read and composed.
 
     Args:
         command: as it is typed.
         arguments: of the command line.
 
-    Returns:
-        The same arguments, options last; ``None`` where another configuration is asked for.
-
     Raises:
         Mistake: if it cannot be composed, or has a key that nothing takes.
     """
-    overrides, options = _apart(command, arguments)
-    given = {option.partition("=")[0] for option in options}
-    if given & _ELSEWHERE:
-        return [*overrides, *options], None
-    folder = _folder_of(options)
-    if folder is not None and not Path(folder).is_dir():
-        raise Mistake(f"--config-dir {folder}: there is no such folder")
-    _check_words(command, overrides)
-    if problem := unknown_choice(arguments):
-        raise Mistake(problem)
-    overrides = [_readable(override) for override in overrides]
-    several = bool(given & {"-m", "--multirun"})
-    first = [_first_of(override) for override in overrides] if several else overrides
-    try:
-        composed = Composed(command, first, folder)
-    except (HydraException, OmegaConfBaseException, ValueError) as error:
-        raise Mistake(_translated(command, first, error, folder)) from error
-    for key in unknown_keys(composed):
-        raise Mistake(_no_key(command, first, key, composed))
-    return [*overrides, *options], composed
+    if "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("RANK", "0") != "0":
+        nowhere = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
+        arguments = [*nowhere, *arguments]
+    options, rest = _apart(command, arguments)
+    overrides, folder, composed = options.overrides, options.config_dir, None
+    if not any(getattr(options, name) for name in _ELSEWHERE):
+        if folder is not None and not Path(folder).is_dir():
+            raise Mistake(f"--config-dir {folder}: there is no such folder")
+        _check_words(command, overrides)
+        if problem := unknown_choice(arguments):
+            raise Mistake(problem)
+        overrides = [_readable(override) for override in overrides]
+        first = [_first_of(each) for each in overrides] if options.multirun else overrides
+        try:
+            composed = Composed(command, first, folder)
+        except (HydraException, OmegaConfBaseException, ValueError) as error:
+            raise Mistake(_translated(command, first, error, folder)) from error
+        for key in unknown_keys(composed):
+            raise Mistake(_no_key(command, first, key, composed))
+    return Checked([*overrides, *rest], options, composed)
 
 
 @cache
@@ -473,42 +453,27 @@ def _composed_or_plain(
 # Words ------------------------------------------------------------------------------------------
 
 
-def _apart(command: str, arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Overrides, and options with their values: Hydra wants no option between overrides."""
-    actions = get_args_parser()._option_string_actions
-    overrides: list[str] = []
-    options: list[str] = []
-    takes = 0
-    for place, argument in enumerate(arguments):
-        if takes:
-            known = actions[options[-1]].choices
-            if known and argument not in known:
-                wanted = ", ".join(map(str, known))
-                raise Mistake(f"{options[-1]} must be one of {wanted}, got {argument}")
-            options.append(argument)
-            takes = 0
-        elif not argument.startswith("-") or argument == "-":
-            overrides.append(argument)
-        else:
-            option, found, value = argument.partition("=")
-            if option not in actions:
-                key = option.lstrip("-").replace("-", "_")
-                near = _nearest(key, _names(_plain(command))) or "KEY"
-                if not found:
-                    value = next((x for x in arguments[place + 1 :][:1] if x[:1] != "-"), "")
-                hint = f"write {near}={value or 'VALUE'}, without dashes"
-                raise Mistake(f"{command} has no option {option}; {hint}")
-            options.append(argument)
-            takes = 0 if found or actions[option].nargs == 0 else 1
-    if takes and actions[options[-1]].nargs is None:
-        raise Mistake(f"{options[-1]} needs a value; {_LIST_KEYS.format(command)}")
-    return overrides, options
-
-
-def _folder_of(arguments: Sequence[str]) -> str | None:
-    """The user's own folder of configuration, ``--config-dir``."""
-    folder: str | None = get_args_parser().parse_known_args(arguments)[0].config_dir
-    return folder
+def _apart(command: str, arguments: Sequence[str]) -> tuple[Namespace, list[str]]:
+    """What Hydra's parser makes of arguments in any order, and those that are no overrides."""
+    parser = get_args_parser()
+    parser.exit_on_error, parser.allow_abbrev = False, False
+    try:
+        options, unknown = parser.parse_known_intermixed_args(arguments)
+    except ArgumentError as error:
+        raise Mistake(f"{error}; {_LIST_KEYS.format(command)}") from None
+    if unknown:
+        option, found, value = unknown[0].partition("=")
+        key = option.lstrip("-").replace("-", "_")
+        near = _nearest(key, _names(_plain(command))) or "KEY"
+        if not found:
+            behind = arguments[arguments.index(unknown[0]) + 1 :][:1]
+            value = next((each for each in behind if each[:1] != "-"), "")
+        hint = f"write {near}={value or 'VALUE'}, without dashes"
+        raise Mistake(f"{command} has no option {option}; {hint}")
+    rest = list(arguments)
+    for override in options.overrides:
+        rest.remove(override)
+    return options, rest
 
 
 def _check_words(command: str, overrides: Sequence[str]) -> None:
@@ -626,7 +591,7 @@ def unknown_choice(arguments: Sequence[str]) -> str | None:
         >>> unknown_choice(["+exp=quik"])[:31]
         'unknown exp quik; known: quick,'
     """
-    own = _folder_of(arguments)
+    own = get_args_parser().parse_known_args(arguments)[0].config_dir
     for argument in arguments:
         key, found, value = argument.lstrip("+").partition("=")
         group = key.partition("@")[0]
@@ -714,8 +679,8 @@ def _no_key(
 @cache
 def _keys_of(file: str) -> frozenset[str]:
     """The keys of a file of a group and of its bases."""
-    content: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{file}.yaml"))
-    bases = [entry for entry in content.pop("defaults", ()) if isinstance(entry, str)]
+    content, defaults, *_ = _read(conf_dir() / f"{file}.yaml")
+    bases = [entry for entry in defaults if isinstance(entry, str)]
     own = {key for key, _ in _leaves(content)}
     folder = file.partition("/")[0]
     return frozenset(own.union(*(_keys_of(f"{folder}/{b}") for b in bases if b != "_self_")))
@@ -755,19 +720,19 @@ def unknown_keys(composed: Composed) -> list[str]:
     inner = {name.rpartition(".")[0] for name in known}
     found: dict[str, None] = {}
     for path, _ in _leaves(config):
-        parts = path.split(".")
+        parts, section = path.split("."), _scene_of(path)
         depth = next(n for n in range(len(parts), -1, -1) if not n or ".".join(parts[:n]) in known)
         above = ".".join(parts[:depth])
-        if depth == len(parts) or (above and above not in inner and not _scene_of(path)):
-            continue  # a key of a file, or below a value that is free
-        if (_SCENES.match(above) and depth + 1 < len(parts)) or _SCENES.match(path):
-            above = ".".join(parts[: depth + 1])
-        if section := _scene_of(path):
-            if parts[section.count(".") + 1] in _scene_parameters():
-                continue
-        elif parts[depth] in _accepted(config, parts[:depth]):
+        is_free = above != "" and above not in inner and not section
+        if depth == len(parts) or is_free:
             continue
-        found[".".join(parts[: depth + 1])] = None
+        if section:
+            is_taken = parts[section.count(".") + 1] in _scene_parameters()
+        else:
+            target = reduce(getitem, parts[:depth], config).get("_target_", "")
+            is_taken = parts[depth] in {"_target_", "_convert_", "_partial_", *_arguments(target)}
+        if not is_taken:
+            found[".".join(parts[: depth + 1])] = None
     return list(found)
 
 
@@ -799,14 +764,6 @@ def _scene_parameters() -> frozenset[str]:
     return frozenset(names)
 
 
-def _accepted(config: Mapping[str, Any], parts: Sequence[str]) -> set[str]:
-    """Names of arguments of what a section is made into."""
-    section: Any = config
-    for part in parts:
-        section = section[part]
-    return set(_arguments(section.get("_target_", ""))) | {"_target_", "_convert_", "_partial_"}
-
-
 @cache
 def _arguments(target: str) -> Mapping[str, Any]:
     """The arguments of a target with their types, as far as they are stated."""
@@ -836,11 +793,8 @@ def with_lists(config: DictConfig, composed: Composed) -> None:
         is_simple = isinstance(value, str | int | float) and not isinstance(value, bool)
         if not is_simple or value == "???" or str(value).startswith("${"):
             continue
-        section: Any = plain
         *parts, last = path.split(".")
-        for part in parts:
-            section = section[part]
-        wanted = _arguments(section.get("_target_", "")).get(last)
+        wanted = _arguments(reduce(getitem, parts, plain).get("_target_", "")).get(last)
         if _wants_list(wanted, type(value)) if wanted else said.get(path, "").startswith("list"):
             OmegaConf.update(config, path, [value], merge=False)
 
@@ -858,27 +812,31 @@ def _wants_list(wanted: Any, kind: type) -> bool:
 # Folders ------------------------------------------------------------------------------------------
 
 
-def folder_problem(composed: Composed, *, is_sweep: bool = False) -> str | None:
-    """One line about a results folder that cannot be made; Hydra alone would show a trace.
+def check_folder(composed: Composed, *, is_sweep: bool = False) -> None:
+    """Refuse a results folder that cannot be made; Hydra alone would show a trace.
 
     Args:
         composed: says where results go; ``"."`` is not looked at.
         is_sweep: whether there are several runs.
 
+    Raises:
+        Mistake: that says why.
+
     Example:
-        >>> folder_problem(Composed("evaluate", ["hydra.run.dir=/dev/null/recordings"]))
-        'cannot write to hydra.run.dir=/dev/null/recordings: Not a directory at /dev/null'
+        >>> check_folder(Composed("evaluate", ["hydra.run.dir=/dev/null/recordings"]))
+        Traceback (most recent call last):
+        Mistake: cannot write to hydra.run.dir=/dev/null/recordings: Not a directory at /dev/null
     """
-    hydra: Any = OmegaConf.to_container(composed.whole.hydra)
     of = "sweep" if is_sweep else "run"
-    name, wanted = f"hydra.{of}.dir", str(hydra[of]["dir"])
-    wanted = wanted.partition("${")[0]  # what it holds of the configuration is new
+    where: Any = OmegaConf.to_container(composed.whole.hydra[of])
+    wanted = str(where["dir"]).partition("${")[0]  # what it holds of the configuration is new
     if wanted == ".":
-        return None
+        return
     folder = Path(wanted).absolute()
     nearest = next(place for place in (folder, *folder.parents) if place.exists())
     try:
         with tempfile.TemporaryDirectory(dir=nearest):
-            return None
+            pass
     except OSError as error:
-        return f"cannot write to {name}={folder}: {error.strerror} at {nearest}"
+        said = f"cannot write to hydra.{of}.dir={folder}: {error.strerror} at {nearest}"
+        raise Mistake(said) from error

@@ -185,6 +185,3 @@ def _read(
 
 
 main = entry_point("crossval", crossval)
-
-if __name__ == "__main__":
-    main()

@@ -236,6 +236,3 @@ def _act(config: DictConfig, _: Path) -> None:
 
 
 main = entry_point("data", _act)
-
-if __name__ == "__main__":
-    main()

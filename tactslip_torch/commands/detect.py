@@ -304,6 +304,3 @@ def _saved(config: DictConfig, folder: Path, again: str) -> str:
 
 
 main = entry_point("detect", detect, _saved)
-
-if __name__ == "__main__":
-    main()

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.types import RunMode
@@ -21,13 +20,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from tactslip_torch.commands.configuration import (
-    Mistake,
+    Checked,
+    check_folder,
     checked,
     conf_dir,
-    folder_problem,
     with_lists,
 )
-from tactslip_torch.commands.stopping import Stopped, stopping
+from tactslip_torch.commands.stopping import Stopped
 from tactslip_torch.report.sweep import sweep_table, write_sweep
 from tactslip_torch.runtime import is_first_process, process_number, write_json
 
@@ -53,14 +52,13 @@ def entry_point(
     name: str,
     run: Callable[[DictConfig, Path], Any],
     saved: Callable[[DictConfig, Path, str], str] = lambda config, folder, again: NOTHING_SAVED,
-) -> Callable[[], None]:
-    """The command ``name`` as a function of the command line alone.
+) -> Callable[[Checked | None], None]:
+    """The command ``name`` as a function of the command line, by default that of the process.
 
     It refuses what is no configuration (``mistakes``) or no folder, composes the configuration,
     and calls ``run`` with it and the folder for results. What bad input raises is printed in one
     line, and the exit status is 2; where a signal stops it, what is saved and how to go on, and the
-    exit status is 130 (SIGINT) or 143 (SIGTERM). Of the processes that torchrun starts, only the
-    first gets a folder.
+    exit status is 130 (SIGINT) or 143 (SIGTERM).
 
     Args:
         name: of the file in ``conf``, and of the module in ``commands``.
@@ -70,18 +68,11 @@ def entry_point(
     """
     command = name.replace("_", "-")
 
-    def main() -> None:
-        with stopping(), errors_in_one_line():
-            arguments, further = sys.argv[1:], []
-            if "TORCHELASTIC_RUN_ID" in os.environ and not is_first_process():
-                further = ["hydra.run.dir=.", "hydra.output_subdir=null"]
-                further.append("hydra/job_logging=stdout")
-            known, composed = checked(command, [*further, *arguments])
-            options = get_args_parser().parse_args(known)
-            is_sweep = options.multirun
-            if composed and (problem := folder_problem(composed, is_sweep=is_sweep)):
-                raise Mistake(problem)
-
+    def main(given: Checked | None = None) -> None:
+        with errors_in_one_line():
+            arguments, options, composed = given or checked(command, sys.argv[1:])
+            if composed:
+                check_folder(composed, is_sweep=options.multirun)
             runs: list[_Run] = []
 
             def in_folder(config: DictConfig) -> None:
@@ -100,14 +91,14 @@ def entry_point(
                         raise stop.saying(saved(config, folder, again)) from None
                     if HydraConfig.get().mode == RunMode.MULTIRUN and _are_scores(returned):
                         source = str(OmegaConf.select(config, "data._target_"))
-                        given = list(HydraConfig.get().overrides.task)
-                        runs.append(_Run(given, returned, folder.parent, "simulation" in source))
+                        words = list(HydraConfig.get().overrides.task)
+                        runs.append(_Run(words, returned, folder.parent, "simulation" in source))
 
             in_folder.__module__ = f"{__package__}.{name}"  # Hydra names job and log file by it
-            sys.argv[1:] = known
-            if composed and not (is_sweep or options.cfg or options.resolve or options.help):
+            if composed and not (options.multirun or options.cfg or options.resolve):
                 composed.run(in_folder)
             else:
+                sys.argv[1:] = arguments
                 of_hydra = hydra.main(str(conf_dir()), name, version_base="1.3")
                 of_hydra(in_folder)()
             if runs and is_first_process():

@@ -109,6 +109,3 @@ def _print_overlap(fold: Split, trained_on: dict[str, list[str]]) -> None:
 
 
 main = entry_point("evaluate", evaluate)
-
-if __name__ == "__main__":
-    main()

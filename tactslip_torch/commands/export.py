@@ -24,6 +24,3 @@ def export(config: DictConfig, _: Path) -> None:
 
 
 main = entry_point("export", export)
-
-if __name__ == "__main__":
-    main()

@@ -121,6 +121,3 @@ def _saved(config: DictConfig, folder: Path, again: str) -> str:
 
 
 main = entry_point("generate", generate, _saved)
-
-if __name__ == "__main__":
-    main()

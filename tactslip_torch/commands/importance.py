@@ -233,6 +233,3 @@ def _origin(config: DictConfig, trained: Trained, refit: Refit) -> dict[str, Any
 
 
 main = entry_point("importance", sensors)
-
-if __name__ == "__main__":
-    main()

@@ -263,6 +263,3 @@ def _pareto_or_exit(config: DictConfig, folder: Path) -> None:
 
 
 main = entry_point("pareto", _pareto_or_exit)
-
-if __name__ == "__main__":
-    main()

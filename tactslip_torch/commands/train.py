@@ -407,6 +407,3 @@ def _saved(config: DictConfig, folder: Path, again: str) -> str:
 
 
 main = entry_point("train", train, _saved)
-
-if __name__ == "__main__":
-    main()
