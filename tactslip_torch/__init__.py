@@ -41,23 +41,7 @@ _MODULES = {
 }
 """Where each name is imported from when it is first asked for: ``--help`` needs no torch."""
 
-__all__ = [
-    "AlarmSettings",
-    "Channel",
-    "FeatureName",
-    "FeaturePool",
-    "HandLayout",
-    "Prediction",
-    "Recording",
-    "Scene",
-    "SlipClassifier",
-    "SlipDetector",
-    "StreamingDetector",
-    "SufficientStats",
-    "TactileFeatures",
-    "sample_recording",
-    "simulate",
-]
+__all__ = sorted(_MODULES.keys() - {"__version__"})
 
 
 def __getattr__(name: str) -> Any:

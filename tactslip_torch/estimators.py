@@ -66,17 +66,37 @@ Array = NDArray[Any]
 class _OfWindows(BaseEstimator):  # type: ignore[misc]  # scikit-learn has no annotations
     """What both estimators do with windows ``[N, C, T]``: read, filter, describe."""
 
-    sample_rate_hz: float | None
-    hand: HandLayout | None
-    frames: Mapping[str, int] | None
-    filtered: bool
-    align: Align
-    wavelet: str
-    level: int | None
-    spectrum: SpectrumMethod
-    backend: BackendName
     _pool: FeaturePool
     _filter: ChannelFilter
+
+    def __init__(
+        self,
+        sample_rate_hz: float | None,
+        hand: HandLayout | None = None,
+        *,
+        use: str | Sequence[str] = "both",
+        pooling: str | Sequence[str] = POOLING,
+        descriptors: Sequence[str] | None = DESCRIPTORS,
+        frames: Mapping[str, int] | None = None,
+        filtered: bool = False,
+        align: Align = "centred",
+        wavelet: str = "rbio2.2",
+        level: int | None = None,
+        spectrum: SpectrumMethod = "reference",
+        backend: BackendName = "auto",
+    ) -> None:
+        self.sample_rate_hz = sample_rate_hz
+        self.hand = hand
+        self.use = use
+        self.pooling = pooling
+        self.descriptors = descriptors
+        self.frames = frames
+        self.filtered = filtered
+        self.align = align
+        self.wavelet = wavelet
+        self.level = level
+        self.spectrum = spectrum
+        self.backend = backend
 
     def _lay_out(self, shape: tuple[int, ...]) -> tuple[FeaturePool, ChannelFilter]:
         """The features and the filter for training windows of this shape."""
@@ -143,42 +163,30 @@ class _OfWindows(BaseEstimator):  # type: ignore[misc]  # scikit-learn has no an
                 f"expected {' or '.join(named[num] for num in wanted)}, got an array of shape "
                 f"{shape}. Reshape your data: one sample is X[None]"
             )
-        options: dict[str, Any] = {
-            "dtype": (np.float64, np.float32),
-            "allow_nd": True,
-            "ensure_all_finite": False,
-        }
-        if len(shape) == 3 and not reset:
-            self._check_windows(shape, self._pool.hand)
-        elif len(shape) == 3 and self.hand is not None and isinstance(self.hand, HandLayout):
-            self._check_windows(shape, self.hand)
-        if y is None:
-            x = validate_data(self, X, reset=reset, **options)
-        else:
-            x, y = validate_data(self, X, y, reset=reset, **options)
-        if not np.isfinite(x).all():
-            self._refuse_nonfinite(x)
-        return x, y
-
-    def _check_windows(self, shape: tuple[int, ...], hand: HandLayout) -> None:
-        if shape[1] != len(hand):
+        hand = self.hand if reset else self._pool.hand if len(shape) == 3 else None
+        if len(shape) == 3 and isinstance(hand, HandLayout) and shape[1] != len(hand):
             swapped = "; transpose them: X.transpose(0, 2, 1)" * (shape[2] == len(hand))
             raise ValueError(
                 f"X is windows [{shape[0]} windows, {shape[1]} channels, {shape[2]} samples], "
                 f"expected {len(hand)} channels, {hand.names[0]} to {hand.names[-1]}"
                 f"{swapped or '; give windows [N, C, T] of this hand, or another hand='}"
             )
-
-    def _refuse_nonfinite(self, x: Array) -> None:
-        first = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
-        where = f"row {first[0]}, column {first[1]}"
-        if x.ndim == 3:
-            where = f"window {first[0]}, channel {first[1]}, sample {first[2]}"
-        value = "NaN" if np.isnan(x[first]) else "inf"
-        raise ValueError(
-            f"X holds {value}: {where} (counted from 0); repair or leave out such samples. "
-            "SlipDetector.predict takes windows with broken channels"
-        )
+        x: Any = validate_data(
+            self, X, "no_validation" if y is None else y, reset=reset, allow_nd=True,
+            dtype=(np.float64, np.float32), ensure_all_finite=False,
+        )  # fmt: skip
+        if y is not None:
+            x, y = x
+        if not np.isfinite(x).all():
+            first = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
+            kinds = ("window", "channel", "sample") if x.ndim == 3 else ("row", "column")
+            where = ", ".join(f"{what} {i}" for what, i in zip(kinds, first, strict=True))
+            value = "NaN" if np.isnan(x[first]) else "inf"
+            raise ValueError(
+                f"X holds {value}: {where} (counted from 0); repair or leave out such samples. "
+                "SlipDetector.predict takes windows with broken channels"
+            )
+        return x, y
 
     def _bins(self, x: Array) -> Tensor:
         """Filtered bins of windows."""
@@ -231,35 +239,6 @@ class TactileFeatures(TransformerMixin, _OfWindows):  # type: ignore[misc]
         >>> TactileFeatures(2000.0).fit_transform(windows).shape
         (8, 1120)
     """
-
-    def __init__(
-        self,
-        sample_rate_hz: float,
-        hand: HandLayout | None = None,
-        *,
-        use: str = "both",
-        pooling: str | Sequence[str] = POOLING,
-        descriptors: Sequence[str] | None = DESCRIPTORS,
-        frames: Mapping[str, int] | None = None,
-        filtered: bool = False,
-        align: Align = "centred",
-        wavelet: str = "rbio2.2",
-        level: int | None = None,
-        spectrum: SpectrumMethod = "reference",
-        backend: BackendName = "auto",
-    ) -> None:
-        self.sample_rate_hz = sample_rate_hz
-        self.hand = hand
-        self.use = use
-        self.pooling = pooling
-        self.descriptors = descriptors
-        self.frames = frames
-        self.filtered = filtered
-        self.align = align
-        self.wavelet = wavelet
-        self.level = level
-        self.spectrum = spectrum
-        self.backend = backend
 
     def fit(self, X: ArrayLike | Tensor, y: Any = None) -> TactileFeatures:
         """Learn what pooling compresses by, and what a working channel moves by at least.
@@ -385,24 +364,17 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         spectrum: SpectrumMethod = "reference",
         backend: BackendName = "auto",
     ) -> None:
-        self.sample_rate_hz = sample_rate_hz
-        self.hand = hand
-        self.use = use
+        super().__init__(
+            sample_rate_hz, hand, use=use, pooling=pooling, descriptors=descriptors, frames=frames,
+            filtered=filtered, align=align, wavelet=wavelet, level=level, spectrum=spectrum,
+            backend=backend,
+        )  # fmt: skip
         self.num_features = num_features
         self.degree = degree
         self.penalties = penalties
         self.tolerance = tolerance
         self.drop_channels = drop_channels
         self.slip_label = slip_label
-        self.pooling = pooling
-        self.descriptors = descriptors
-        self.frames = frames
-        self.filtered = filtered
-        self.align = align
-        self.wavelet = wavelet
-        self.level = level
-        self.spectrum = spectrum
-        self.backend = backend
 
     def fit(self, X: ArrayLike | Tensor, y: Any, groups: Any = None) -> SlipClassifier:
         """Choose and fit.
@@ -431,7 +403,13 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
                 f"Only binary classification is supported: y must have two classes, got "
                 f"{len(self.classes_)} class{'es' * (len(self.classes_) != 1)}; relabel it"
             )
-        self.slip_label_ = _slip_label(self.classes_, self.slip_label)
+        labels, wanted = self.classes_.tolist(), self.slip_label
+        if wanted is not None and wanted not in labels:
+            raise ValueError(
+                f"slip_label={wanted!r} is none of the labels in y, {labels}; give one of them"
+            )
+        wanted = "slip" if wanted is None and labels[0] == "slip" else wanted
+        self.slip_label_ = self.classes_[1 if wanted is None else labels.index(wanted)]
         is_slip = torch.from_numpy(np.asarray(y == self.slip_label_))
         pool, recipe, features = None, self._recipe(x.ndim == 3), _tensor(x).double()
         if x.ndim == 3:
@@ -441,7 +419,9 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         plan, head = _solved(recipe, pool, features, is_slip, *_groups(y, groups))
         self.penalty_: Any = plan.penalty
         self.validation_: list[dict[str, Any]] = plan.validation
-        self._slope = _neutral(plan.calibration)
+        self._slope: Calibration = _UNCALIBRATED
+        if plan.calibration is not None:
+            self._slope = Platt(plan.calibration["slope"], 0.0)  # a score of 0 tells nothing
         info = plan.metadata | {
             "validation": plan.validation,
             "head": head.cost._asdict(),
@@ -541,18 +521,15 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
             spectrum=pool.spectrum,
         )
         labels = list(classes or info.get("classes") or (0, 1))
-        made.classes_, made.slip_label_ = np.unique(np.array(labels)), np.array(labels)[1]
-        if len(made.classes_) != 2:
+        if len(labels) != 2 or labels[0] == labels[1]:
             raise ValueError(f"classes must be two labels, non-slip and slip, got {labels}")
         made.slip_label = labels[1]
         made.detector_, made._pool, made._filter = detector, pool, detector.channel_filter
-        made.n_features_in_, made._info = len(pool.hand), info
         made._selection = FeatureSelection(detector.selected, detector.scaler, detector.pooling)
         made._head, made._slope = detector.head, _UNCALIBRATED
         if (found := calibration_of(detector)) is not None:
             made._slope = found[0]
-        made.penalty_, made.validation_ = info.get("penalty"), info.get("validation", [])
-        made.feature_names_ = [str(name) for name in detector.selected_names]
+        made._take(info, labels, len(pool.hand), detector.selected_names)
         return made
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -589,36 +566,35 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
             metadata, tensors = load_table(path, FORMAT)
         except ValueError:
             return cls.from_detector(SlipDetector.load(path))
-        try:
-            return cls._from_table(metadata, tensors)
-        except FORGED as error:
-            raise ValueError(f"{os.fspath(path)} is a damaged classifier: {error}") from error
 
-    @classmethod
-    def _from_table(
-        cls, metadata: Mapping[str, Any], tensors: Mapping[str, Tensor]
-    ) -> SlipClassifier:
         def part(name: str) -> dict[str, Tensor]:
             start = f"{name}."
             return {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
 
-        info, kernel = metadata["info"], metadata["kernel"]
-        labels = np.array(info["classes"])
-        made: SlipClassifier = cls(slip_label=info["classes"][1])
-        made.classes_, made.slip_label_ = np.unique(labels), labels[1]
-        made._selection = FeatureSelection(
-            tuple(metadata["selected"]), FeatureScaler(**part("scaler"))
-        )
-        head: Head = QuadraticForm(**part("head")) if kernel is None else KernelSum(
-            **part("head"), kernel=kernel_from_dict(kernel)
-        )  # fmt: skip
-        made._head, made._info = head, info
-        made._slope = calibration_from_dict(info["calibration"])
-        made.penalty_, made.validation_ = info["penalty"], info["validation"]
-        made.n_features_in_, made.feature_names_ = metadata["num_features"], metadata["columns"]
-        if metadata["names"]:
-            made.feature_names_in_ = np.array(metadata["names"], dtype=object)
-        return made
+        try:
+            info, kernel = metadata["info"], metadata["kernel"]
+            made: SlipClassifier = cls(slip_label=info["classes"][1])
+            scaler, head = FeatureScaler(**part("scaler")), part("head")
+            made._selection = FeatureSelection(tuple(metadata["selected"]), scaler)
+            made._head = (
+                QuadraticForm(**head)
+                if kernel is None
+                else KernelSum(**head, kernel=kernel_from_dict(kernel))
+            )
+            made._slope = calibration_from_dict(info["calibration"])
+            made._take(info, info["classes"], metadata["num_features"], metadata["columns"])
+            if metadata["names"]:
+                made.feature_names_in_ = np.array(metadata["names"], dtype=object)
+            return made
+        except FORGED as error:
+            raise ValueError(f"{os.fspath(path)} is a damaged classifier: {error}") from error
+
+    def _take(self, info: dict[str, Any], labels: Any, num: int, columns: Sequence[Any]) -> None:
+        """What is known of a fit elsewhere: labels (non-slip, slip), columns of X and in use."""
+        self.classes_, self.slip_label_ = np.unique(np.array(labels)), np.array(labels)[1]
+        self.penalty_, self.validation_ = info.get("penalty"), info.get("validation", [])
+        self.n_features_in_, self.feature_names_ = num, [str(name) for name in columns]
+        self._info = info
 
     def export_onnx(self, folder: str | os.PathLike[str]) -> tuple[Any, ...]:
         """Write ``model.onnx`` of a classifier of windows, and ``stream.onnx`` if it has an alarm.
@@ -692,17 +668,6 @@ def _with_shape(X: Any) -> tuple[Any, tuple[int, ...]]:
         ) from None
 
 
-def _slip_label(classes: Array, wanted: Any) -> Any:
-    if wanted is not None:
-        if wanted not in classes.tolist():
-            raise ValueError(
-                f"slip_label={wanted!r} is none of the labels in y, {classes.tolist()}; give one "
-                "of them"
-            )
-        return classes[classes.tolist().index(wanted)]
-    return classes[0] if classes[0] == "slip" else classes[1]
-
-
 def _tensor(x: Array) -> Tensor:
     """The same values; a copy where torch could write to what nobody may."""
     return torch.from_numpy(np.require(x, requirements=("C", "W")))
@@ -753,10 +718,3 @@ def _solved(
             for part, some in enumerate(rows.split(_BLOCK)):
                 gathered.update(f"{index}.{part} {name}", features[some], is_slip[some])
         return plan, gathered.solve()
-
-
-def _neutral(calibration: Mapping[str, Any] | None) -> Calibration:
-    """The calibration by which a score of 0 tells nothing."""
-    if calibration is None:
-        return _UNCALIBRATED
-    return Platt(calibration["slope"], 0.0)

@@ -180,11 +180,12 @@ def read_json(path: str | os.PathLike[str], form: str, most_bytes: int = 2**24) 
 
 # Schema ------------------------------------------------------------------------------------------
 #
-# What a field may be: a function of its value that returns what was wanted, or None if it is right;
-# a dictionary of the fields of a mapping ("name?" may be absent or null, "*" is of all others); a
-# list of one such thing for a list, and of how many entries it may have at most.
+# What a field may be: a type; a function of its value that returns what was wanted, or None if it
+# is right; a dictionary of the fields of a mapping ("name?" may be absent or null, "*" is of all
+# others); a list of one such thing for a list, and of how many entries it may have at most.
 
-Wanted = Callable[[Any], str | None] | Mapping[str, Any] | list[Any]
+Wanted = type[Any] | Callable[[Any], str | None] | Mapping[str, Any] | list[Any]
+_TYPES: Mapping[Any, str] = {str: "text", bool: "true or false"}
 
 
 def checked(name: str, content: Any, form: str) -> Any:
@@ -193,19 +194,23 @@ def checked(name: str, content: Any, form: str) -> Any:
     Raises:
         ValueError: that names the file, the field, what was wanted and what it is.
     """
-    if problem := _problem(content, SCHEMAS.get(form, _any), ""):
+    if problem := _problem(content, SCHEMAS.get(form, object), ""):
         raise ValueError(f"{name} is damaged: {problem}; make it again")
     return content
 
 
 def _problem(value: Any, wanted: Wanted, field: str) -> str | None:
     if callable(wanted):
-        said = wanted(value)
+        if not isinstance(wanted, type):
+            said = wanted(value)
+        else:
+            said = None if isinstance(value, wanted) else _TYPES[wanted]
         return said and f"{field} must be {said}, got {value!r:.60}"
     if isinstance(wanted, list):
         each, most = wanted
-        if not isinstance(value, list) or len(value) > most:
-            got = len(value) if isinstance(value, list) else f"{value!r:.60}"
+        is_list = isinstance(value, list | tuple)  # no JSON has the latter
+        if not is_list or len(value) > most:
+            got = len(value) if is_list else f"{value!r:.60}"
             return f"{field} must be a list of at most {most}, got {got}"
         problems = (_problem(x, each, f"{field}[{i}]") for i, x in enumerate(value))
         return next(filter(None, problems), None)
@@ -248,35 +253,12 @@ def _one_of(*choices: Any) -> Callable[[Any], str | None]:
     return wanted
 
 
-def _any(value: Any) -> str | None:
-    return None
-
-
-def _text(value: Any) -> str | None:
-    return None if isinstance(value, str) else "text"
-
-
-def _bool(value: Any) -> str | None:
-    return None if isinstance(value, bool) else "true or false"
-
-
 def _either(first: Wanted, second: Wanted) -> Callable[[Any], str | None]:
     """The first or, of mappings and where the first is wrong, the second."""
 
     def wanted(value: Any) -> str | None:
         said = _problem(value, first, "it") and _problem(value, second, "it")
         return said and said.removeprefix("it must be ").split(", got ")[0]
-
-    return wanted
-
-
-def _tuple_of(each: Wanted, most: int) -> Callable[[Any], str | None]:
-    """In a checkpoint, which is no JSON."""
-
-    def wanted(value: Any) -> str | None:
-        is_tuple = isinstance(value, tuple) and len(value) <= most
-        is_right = is_tuple and not any(_problem(x, each, "") for x in value)
-        return None if is_right else f"at most {most} such values"
 
     return wanted
 
@@ -291,44 +273,44 @@ _finite, _seconds = _number(-1e300, 1e300), _number(0, 1e9)
 _threshold = _number(-1e300, math.inf)
 _rate = _number(1e-3, 1e7)
 _count = _number(0, 2**48, whole=True)
-_names = [_text, 10**6]
+_names = [str, 10**6]
 MOST_BIN_SAMPLES, MOST_CHANNELS, MOST_FRAME = 1024, 2048, 4001
 """Of a detector: beyond these its constant matrices take gigabytes or minutes."""
 
 _CHANNELS = [
     {
-        **dict.fromkeys(("name", "kind", "finger", "segment"), _text),
+        **dict.fromkeys(("name", "kind", "finger", "segment"), str),
         "adapting?": _one_of(*get_args(Adapting)),
     },
     MOST_CHANNELS,
 ]
 _FILTERS = {
-    "name": _text,
+    "name": str,
     **{name: [_number(-1e6, 1e6), 512] for name in ("dec_lo", "dec_hi", "rec_lo", "rec_hi")},
 }
 _POOL = {
     "sample_rate_hz": _rate,
     "bin_samples": _number(1, MOST_BIN_SAMPLES, whole=True),
-    "wavelet": _either(_text, _FILTERS),
+    "wavelet": _either(str, _FILTERS),
     "level": _number(1, 16, whole=True),
-    "spectrum": _text,
-    "arithmetic": _text,
+    "spectrum": str,
+    "arithmetic": str,
 }
 _KERNEL = {
-    "kind": _text,
+    "kind": str,
     "degree?": _number(1, 100),
     "offset?": _number(0, 1e100),
     "gamma?": _positive,
 }
 _CALIBRATION = {
-    "kind": _text,
+    "kind": str,
     "slope?": _number(0, 1e300),
     "offset?": _finite,
     "scores?": [_finite, 10**5],
     "llrs?": [_finite, 10**5],
 }
 _RULE = {
-    "name": _text,
+    "name": str,
     "k?": _number(1, 10**4, whole=True),
     "n?": _number(1, 10**4, whole=True),
     "drift?": _finite,
@@ -357,55 +339,55 @@ _ALARM = {
     "rearm_s": _seconds,
     "refractory_s": _seconds,
     "lead_s": _number(-1e6, 1e6),
-    "metadata": {"*": _any},
+    "metadata": {"*": object},
     "onset?": _ONSET,
 }
-_ABSTAIN = {"coverage": _share, "low": _number(-1e300, 0), "high": _number(0, 1e300), "*": _any}
+_ABSTAIN = {"coverage": _share, "low": _number(-1e300, 0), "high": _number(0, 1e300), "*": object}
 _INFO = {
     "alarm?": _ALARM,
     "calibration?": _CALIBRATION,
     "abstain?": _ABSTAIN,
-    "simulated?": _bool,
-    "units?": _text,
+    "simulated?": bool,
+    "units?": str,
     "features_dtype?": _one_of("float64", "float32"),
     "train_materials?": _names,
     "train_sessions?": _names,
-    "*": _any,
+    "*": object,
 }
 CHECKPOINT = "tactslip_torch checkpoint 1"
 _epoch = _number(0, 2, whole=True)
 _CHECKPOINT = {
     "format": _one_of(CHECKPOINT),
     "epoch": _epoch,
-    "fingerprint": _text,
+    "fingerprint": str,
     "loops": {
         "fit_loop": {
             "epoch_progress": {"*": {"*": _epoch}},
-            "*": _any,
+            "*": object,
         },
-        "*": _any,
+        "*": object,
     },
     "plan": {
         "kernel": _KERNEL,
         "penalty": _number(1e-300, math.inf),
-        "fractions": _tuple_of(_share, 2),
+        "fractions": [_share, 2],
         "bin_weight": _number(0, 1e300),
         "num_bins": _count,
         "imputation": _tensor_of_finite,
         "gaussians?": {"*": _tensor_of_finite},
-        "selected": _tuple_of(_number(0, 10**7, whole=True), 10**6),
+        "selected": [_number(0, 10**7, whole=True), 10**6],
         "scaler": {"*": _tensor_of_finite},
         "abstain?": _ABSTAIN,
-        "*": _any,
+        "*": object,
     },
-    "*": _any,
+    "*": object,
 }
-_TENSOR = {"tensor": _text}
-_BINS = {"material": _text, "z": _TENSOR, "is_slip": _TENSOR, "key?": _text}
+_TENSOR = {"tensor": str}
+_BINS = {"material": str, "z": _TENSOR, "is_slip": _TENSOR, "key?": str}
 _SUMS = {
     "num_features": _number(1, 10**5, whole=True),
     "degree?": _one_of(1, 2),
-    "about?": {"*": _any},
+    "about?": {"*": object},
 }
 DETECTOR, SUMS, STATISTICS = (
     "tactslip_torch detector 3",
@@ -419,18 +401,18 @@ SCHEMAS: Mapping[str, Wanted] = {
         "pool": _POOL,
         "window_lengths": [_number(1, MOST_FRAME, whole=True), MOST_CHANNELS],
         "polyorder": _number(0, 20, whole=True),
-        "align": _text,
+        "align": str,
         "kernels?": {"*": [_number(-1e6, 1e6), MOST_FRAME]},
         "selected": [_number(0, 10**7, whole=True), 10**6],
-        "pooling?": {"names": [[_text, 8], 10**6]},
+        "pooling?": {"names": [[str, 8], 10**6]},
         "kernel?": _KERNEL,
         "info": _INFO,
     },
-    SUMS: {**_SUMS, "batches": {"*": _text}},
+    SUMS: {**_SUMS, "batches": {"*": str}},
     STATISTICS: {
         "sums": {
             **_SUMS,
-            "seen_batches": {"*": _text},
+            "seen_batches": {"*": str},
             "sums": _TENSOR,
             "count": _TENSOR,
         },
@@ -439,22 +421,22 @@ SCHEMAS: Mapping[str, Wanted] = {
             "offset": _number(0, 1e100),
             "balance": _one_of("weights", "none"),
         },
-        "labels": {"*": _any},
+        "labels": {"*": object},
         "rehearsal": {
             **dict.fromkeys(("z", "is_slip", "weight", "sample_weight", "recording"), _TENSOR),
             "recordings": _names,
             "materials": _names,
         },
-        "detector": _text,
+        "detector": str,
         "bins": {"*": _BINS},
         "weights": {"*": _number(0, 1e300)},
         "steps": [
             {
-                "entry": {"*": _any},
+                "entry": {"*": object},
                 "weights": {"*": _number(0, 1e300)},
                 "changed": {"*": _number(0, 1e300)},
                 "replaced": {"*": _BINS},
-                "detector": _text,
+                "detector": str,
                 "file": _TENSOR,
             },
             10**4,
@@ -464,23 +446,23 @@ SCHEMAS: Mapping[str, Wanted] = {
         "format": _one_of(SIDECAR),
         "graph": _one_of("bin", "stream"),
         "precision": _one_of("float32", "float64"),
-        "channels": [_text, MOST_CHANNELS],
-        "kinds": [_text, MOST_CHANNELS],
+        "channels": [str, MOST_CHANNELS],
+        "kinds": [str, MOST_CHANNELS],
         "sample_rate_hz": _rate,
         "bin_samples": _number(1, MOST_BIN_SAMPLES, whole=True),
         "onnx_bytes": _count,
-        "onnx_sha256": _text,
-        "detector_sha256": _text,
+        "onnx_sha256": str,
+        "detector_sha256": str,
         "calibration?": _CALIBRATION,
         "abstain?": _ABSTAIN,
-        "check": {"worst_sd": _number(0, 1e300), "*": _any},
+        "check": {"worst_sd": _number(0, 1e300), "*": object},
         "certificate?": {
-            "holds": _bool,
-            "simulated?": _bool,
+            "holds": bool,
+            "simulated?": bool,
             "margin": _number(0, 1e300),
-            "*": _any,
+            "*": object,
         },
-        "*": _any,
+        "*": object,
     },
     CHECKPOINT: _CHECKPOINT,
 }
