@@ -18,6 +18,7 @@ from __future__ import annotations
 import inspect
 import os
 import re
+import shutil
 import tempfile
 import textwrap
 import typing
@@ -70,6 +71,42 @@ def packaged_folder(name: str, hint: str) -> Path:
 def conf_dir() -> Path:
     """The ``conf`` folder."""
     return packaged_folder("conf", "train.yaml")
+
+
+_NEEDED = {"web": ("web", "node")}
+"""Hosts of several folders: the page shares the reader and the stream of ``node``."""
+_LEFT = shutil.ignore_patterns("node_modules", "__pycache__", "*.o")
+
+
+def hosts_dir() -> Path:
+    """The ``export`` folder."""
+    return packaged_folder("export", "README.md")
+
+
+def host_names() -> list[str]:
+    """The hosts there are."""
+    return sorted(path.name for path in hosts_dir().iterdir() if (path / "README.md").is_file())
+
+
+def copy_host(name: str, folder: Path) -> Path:
+    """Copy a host program, with what it shares with others, into a folder.
+
+    Returns:
+        Its own folder, ``folder / name``.
+
+    Raises:
+        ValueError: if there is no such host.
+        FileExistsError: if there is something in its place.
+    """
+    if name not in host_names():
+        raise ValueError(f"no host {name!r}; there are {', '.join(host_names())}")
+    parts = _NEEDED.get(name, (name,))
+    for part in parts:
+        if (folder / part).exists():
+            raise FileExistsError(f"{folder / part} is there already; give another folder")
+    for part in parts:
+        shutil.copytree(hosts_dir() / part, folder / part, ignore=_LEFT)
+    return folder / name
 
 
 class _File(NamedTuple):
