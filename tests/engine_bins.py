@@ -7,13 +7,11 @@ says what is usual in it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import torch
 from torch import Tensor
 
-from tactslip_torch import FeaturePool, HandLayout
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch import HandLayout
 
 PLAIN_KINDS = ("random", "tied", "near_constant")
 DEGENERATE_KINDS = ("zeros", "constants", "ramps", "impulses", "square", "rails", "dead_channel")
@@ -112,67 +110,10 @@ def assert_equals_reference(
 ) -> None:
     """1e-10 in float64, mode included; mixed 1e-4 and .1 bit of entropy, mode passed over.
 
-    In float32 values near each other count as equal that are not: ``assert_modes_are_fair``.
+    In float32 values near each other count as equal that are not.
     """
     limits = {"entropy": 0.1, "mode": 1.0} if mixed else {"mode": 0.0}
     usual = 1e-4 if mixed else 1e-10
     worst = worst_errors(found, reference, names, LARGE_CV)
     beyond = {name: worst[name] for name in worst if worst[name] > limits.get(name, usual)}
     assert not beyond, f"errors beyond the rule ({'mixed' if mixed else 'float64'}): {beyond}"
-
-
-def rows_of(pool: FeaturePool, bins: Tensor) -> dict[tuple[str, str, str], Tensor]:
-    """The reference's gauges, branches and spectra, ``[N, n or L]``, by the parts of a name."""
-    rows, maps = {}, pool.maps
-    for channel in pool.hand.channels:
-        x = bins[:, pool.hand.names.index(channel.name)]
-        if channel.adapting == "slow":
-            rows[channel.name, "raw", "time"] = x
-            continue
-        first = x[:, :1]
-        for branch, dense, is_detail in zip(
-            maps.branches, maps.dense, (not a for a in maps.is_approximation), strict=True
-        ):
-            values = (x - first) @ dense.T + (0.0 if is_detail else first)
-            rows[channel.name, branch, "time"] = values
-            lines = (values @ maps.dense_lines.T).unflatten(-1, (2, -1))
-            rows[channel.name, branch, "freq"] = lines.square().sum(1).sqrt()
-    return rows
-
-
-def assert_modes_are_fair(
-    found: Tensor, bins: Tensor, pool: FeaturePool, names: Sequence[FeatureName]
-) -> None:
-    """Every mode in float32 is as frequent, of values rounded a little, as the true mode is.
-
-    Where it lies, a run starts in which neighbours are within 1e-12 of the bin's magnitude and
-    2^-20 of the row's span; it is no shorter than the longest by the first tolerance alone.
-    """
-    rows = rows_of(pool, bins)
-    num_judged = 0
-    for column, name in enumerate(names):
-        if name.descriptor != "mode":
-            continue
-        scale = bins[:, pool.hand.names.index(name.channel)].abs().amax(-1)
-        row = rows[name.channel, name.component, name.domain].sort(-1).values
-        for ordered, value, size in zip(row, found[:, column].double(), scale, strict=True):
-            slack = 1e-12 * size + 2.0**-20 * (ordered[-1] - ordered[0]) + 1e-6 * value.abs()
-            start = int((ordered < value - slack).sum())
-            assert start < len(ordered)
-            assert abs(ordered[start] - value) <= slack, f"{name} is no value"
-            assert run_length(ordered[start:], slack) >= longest_run(ordered, 1e-12 * size), name
-            num_judged += 1
-    assert num_judged
-
-
-def run_length(ordered: Tensor, tolerance: Tensor) -> int:
-    """Values of the run that sorted values begin with."""
-    is_end = (ordered.diff() > tolerance).nonzero()
-    return int(is_end[0]) + 1 if len(is_end) else len(ordered)
-
-
-def longest_run(ordered: Tensor, tolerance: Tensor) -> int:
-    """Values of the longest run of sorted ones."""
-    ends = (ordered.diff() > tolerance).nonzero().flatten().tolist()
-    edges = [-1, *ends, len(ordered) - 1]
-    return max(b - a for a, b in pairwise(edges))

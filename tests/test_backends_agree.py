@@ -7,7 +7,7 @@ import pytest
 import torch
 from engine_bins import KINDS, bins_of
 from small_detector import HAND, alarming_detector, raw_bins
-from test_onnx_bins import run_on
+from test_onnx import run_on
 
 from tactslip_torch.analysis.certificate import certify
 from tactslip_torch.deploy.check import EXTREMES, extreme_bins

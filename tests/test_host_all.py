@@ -134,12 +134,3 @@ def test_a_shot_leaves_a_picture_of_rest_slip_and_alarms(room, shot):
     for name in ("page", "panel", "rest", "slip", "alarm"):  # it is dark, and both states are there
         assert num_pixels[dark.split(f"--{name}: ")[1][:7]] > 100, name
     assert [path.name for path in (room / "web").glob("page.png*")] == ["page.png"]
-
-
-def test_a_recording_of_ours_becomes_an_array(tmp_path):
-    channels_first = slipping_stream()[:50].T
-    np.savez(tmp_path / "recording.npz", samples=channels_first)
-    run(tmp_path, command(".", "recording"))
-    array = np.load(tmp_path / "recording.npy")
-    assert np.array_equal(array, channels_first.T)
-    assert array.flags.c_contiguous

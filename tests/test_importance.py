@@ -88,18 +88,6 @@ def by_hand(is_right, bins, recordings):
     return sum(means) / len(means)
 
 
-def test_accuracy_is_the_mean_over_groups_bin_by_bin_in_every_draw():
-    bins = sampled(4, {})
-    is_right = torch.rand(len(bins.is_slip), generator=torch.Generator().manual_seed(1)) < 0.7
-    counts = count_right(is_right, bins)
-    times = [[1.0] * 12, [2.0, 0, 1, 1] * 3, [1, 3, 0, 0] * 3]
-    found = balanced_accuracy(counts, torch.tensor(times, dtype=torch.float64))
-    assert float(balanced_accuracy(counts)) == float(found[0])
-    for draw, accuracy in zip(times, found, strict=True):
-        drawn = [r for r, count in enumerate(draw) for _ in range(int(count))]
-        assert float(accuracy) == pytest.approx(by_hand(is_right, bins, drawn))
-
-
 def test_a_paired_interval_is_nothing_between_equals_and_holds_the_difference():
     bins = sampled(5, {})
     draw = torch.rand(len(bins.is_slip), generator=torch.Generator().manual_seed(2))
@@ -190,24 +178,6 @@ def test_gradients_are_those_of_finite_differences():
     torch.testing.assert_close((gradients * way).sum((1, 2)), slope, rtol=1e-6, atol=0)
     used = {name.channel for name in detector.selected_names}
     assert [bool(part.any()) for part in gradients.unbind(1)] == [n in used for n in HAND.names]
-
-
-def test_first_order_of_a_linear_score_is_the_spread_of_its_parts():
-    # score = sum over channels of w_c x_c: what a channel moves is the spread of its own part
-    generator = torch.Generator().manual_seed(3)
-    samples = torch.randn(400, 3, 5, generator=generator, dtype=torch.float64) + 7.0
-    weights = torch.randn(3, 5, generator=generator, dtype=torch.float64)
-    weights[2] = 0
-    parts = (samples * weights).sum(-1)  # [N, C]
-    scores = parts.sum(-1)
-    is_slip = torch.arange(400) % 3 == 0
-    moved = first_order(scores, weights.expand_as(samples), samples, is_slip)
-    torch.testing.assert_close(moved[1], parts.std(0) / scores.std())
-    torch.testing.assert_close(moved[0], moved[1])
-    twice = weights.expand_as(samples) * torch.where(is_slip, 2.0, 1.0)[:, None, None]
-    louder = first_order(scores, twice, samples, is_slip)
-    torch.testing.assert_close(louder[1], 2 * moved[1])
-    torch.testing.assert_close(louder[0], moved[0])
 
 
 @pytest.mark.parametrize(

@@ -1,26 +1,22 @@
 """Which bins of a recording are slip, which are not, and which windows of time they need."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from small_set import SmallSet, SmallTimeline, small_maker
+from small_set import SmallSet, small_maker
 
 from tactslip_torch.data.labels import (
     NO_POSITION,
     LabelRule,
     clear_of,
     label_bins,
-    needed_windows,
     slip_by_speed,
 )
-from tactslip_torch.data.recording import RecordingId, Timeline
-from tactslip_torch.data.splits import Split
-from tactslip_torch.signals.filtering import ChannelFilter, bins_at
+from tactslip_torch.data.recording import Timeline
 
 RATE = 2000.0
 ONSETS = (2.0, 9.0, 13.5)  # REFERENCE.md section 1, with slides of 100 mm at 20, 40, 60 mm/s
@@ -211,62 +207,6 @@ def test_a_speed_that_is_noisy_lost_or_begins_in_slip():
 def test_a_speed_is_wanted_of_recordings_that_have_one():
     with pytest.raises(ValueError, match=r"labels\.speed_over=5 needs recordings with a column of"):
         small_maker(SmallSet(), speed_over=5.0)
-
-
-# Of a feature maker ----------------------------------------------------------------------------
-
-
-def test_a_feature_maker_lays_bins_in_stretches_and_gives_them_no_speed():
-    class Handled(SmallSet):
-        def timeline(self, recording):
-            return SmallTimeline(non_slip_s=((1.96, 2.0), (0.0, 0.09)))
-
-    recording = RecordingId("a", 0)
-    split = Split("all", {recording: "train"})
-    plain, made = (small_maker(s)(recording, split) for s in (SmallSet(), Handled()))
-    assert len(made.is_slip) == len(plain.is_slip) + 1  # 40 ms hold no bin, 90 hold one
-    assert torch.equal(made.features[:-1], plain.features)
-    assert made.speed_mm_s.tolist() == [*plain.speed_mm_s.tolist(), 0.0]
-    assert made.position.tolist() == [*range(-20, 17), NO_POSITION]
-    assert not bool(made.is_slip[-1])
-    assert small_maker(SmallSet()).key(recording) != small_maker(Handled()).key(recording)
-
-
-# Windows and shuffled labels -------------------------------------------------------------------
-
-CASES = {
-    "paper": lay(),
-    "half_second": lay(HALF),
-    "gaps": lay(LabelRule(hop_ms=150.0)),
-    "close to both ends": lay(HALF, (0.505, DURATION - 0.51), ((0.5, 1.0), (14.9, 15.4))),
-    "at both ends": lay(HALF, (0.5, DURATION - 0.5), ((0.5, 1.0), (15.0, 15.5))),
-}
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_windows_are_all_that_filtering_the_bins_needs(name, rng):
-    """Samples outside the windows are NaN; not one of them reaches a bin."""
-    bins, channel_filter = CASES[name], ChannelFilter([51, 11, 51])
-    context, num_samples = channel_filter.context, round(DURATION * RATE)
-    windows = needed_windows(bins, context, DURATION, RATE)
-    flat = [edge for window in windows for edge in window]
-    assert all(earlier < later for earlier, later in pairwise(flat))
-    np.testing.assert_allclose(np.array(flat) * RATE, np.round(np.array(flat) * RATE), atol=1e-6)
-    covered, needed = np.zeros((2, num_samples), dtype=bool)
-    samples = torch.from_numpy(rng.standard_normal((3, num_samples)))
-    partial = torch.full_like(samples, torch.nan)
-    for low, high in windows:
-        window = slice(round(low * RATE), round(high * RATE))
-        covered[window] = True
-        partial[:, window] = samples[:, window]
-    for start in bins.starts.tolist():
-        needed[max(start - context, 0) : start + 100 + context] = True
-    assert covered[needed].all()
-    extra = np.flatnonzero(covered & ~needed)
-    assert bool(np.all((extra < 2 * context) | (extra >= num_samples - 2 * context)))
-    whole = bins_at(channel_filter(samples), bins.starts, bins.bin_samples)
-    cut = bins_at(channel_filter(partial), bins.starts, bins.bin_samples)
-    torch.testing.assert_close(cut, whole, rtol=0, atol=0)
 
 
 # Errors --------------------------------------------------------------------------------------

@@ -55,13 +55,6 @@ def cache(tmp_path_factory):
     return FeatureCache(tmp_path_factory.mktemp("features"))
 
 
-@pytest.fixture(scope="module")
-def plain(cache):
-    """A learner of the unperturbed set, tested."""
-    source = SmallSet()
-    return learn(source, unseen_c(source), small_maker(source, cache))
-
-
 def learned_state(learner):
     detector = learner.detector
     return {"selected": detector.selected, **learner.metadata, **detector.state_dict()}
@@ -102,13 +95,6 @@ def test_a_detector_computes_by_the_backend_of_its_training(cache):
     pool = FeaturePool(SMALL_HAND, backend="torch")
     maker = FeatureMaker(source, pool, ChannelFilter([51, 11]), LabelRule(), cache)
     assert learn(source, unseen_c(source), maker).detector.extractor.backend == "torch"
-
-
-def test_a_test_without_a_detector_is_refused():
-    maker = small_maker(SmallSet())
-    learner = SlipLearner(maker.pool, maker.channel_filter)
-    with pytest.raises(ValueError, match="nothing to test"):
-        trainer().test(learner, datamodule=SlipDataModule(maker, unseen_c(maker.source), 0))
 
 
 # What a test tells -------------------------------------------------------------------------------

@@ -242,19 +242,6 @@ def test_lines_of_text_are_read_with_their_faults(rng):
     assert events == []
 
 
-def test_garbage_without_end_is_told_ever_less_often():
-    now = [0.0]
-    frames = Frames("binary", header=HEADER)
-    reader = frames.reader(NAMES, RATE, now=lambda: now[0])
-    told = []
-    for second in range(300):
-        now[0] = float(second)
-        told += [second for _ in reader.feed((START + bytes(20)) * 50)]
-    assert 3 <= len(told) <= 12
-    (event,) = reader.end()
-    assert "10 bytes that begins with aa 55 (two such headers are 22 apart)" in event.text
-
-
 @pytest.mark.parametrize(
     ("how", "words"),
     [
@@ -611,14 +598,6 @@ def test_files_of_the_page_and_no_others_are_read(serve):
     ):
         status, body = asked(server, path)
         assert (status, "secret" in body) == (404, False), path
-
-
-def test_a_file_that_became_a_link_to_elsewhere_is_not_read(serve, folders):
-    server = serve()
-    page = folders[""] / "page.mjs"
-    page.unlink()
-    page.symlink_to(folders[""].parent / "secret.html")
-    assert asked(server, "/page.mjs")[0] == 404
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,6 @@
 """Manifests that people write: what they may look like, and that every mistake is named."""
 
-import json
-
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tactslip_torch.data.file_recordings import on_time
 from tactslip_torch.data.manifest import manifest_of, read_manifest, truth_of
@@ -287,21 +283,3 @@ def test_what_leaves_the_recording_is_named_and_what_is_off_by_a_sample_is_cut()
         missing_s=((4.0, 4.1),),
         duration_s=11.4995,
     )
-
-
-# Whatever is in it -----------------------------------------------------------------------------
-
-
-@given(
-    st.lists(st.floats(0, 1e6, allow_nan=False), unique=True, min_size=1, max_size=5).map(sorted)
-)
-def test_numbers_are_read_as_they_are_written(moments):
-    for text in (json.dumps(moments), "; ".join(map(repr, moments)), [repr(m) for m in moments]):
-        truth, wrong = truth_of({"onsets_s": text})
-        assert not wrong
-        assert truth.onsets_s == tuple(moments)
-
-
-def test_lines_keep_their_numbers_behind_cells_of_several_lines(root):
-    found = listed(root, 'file,material,note\na.csv,wood,"two\nlines"\nb.csv,iron,\n')
-    assert [entry.place for entry in found.entries] == ["manifest.csv:2", "manifest.csv:4"]

@@ -15,7 +15,6 @@ from tactslip_torch.report.metrics import (
     bin_metrics,
     confusion_matrix,
     covered_fractions,
-    merged_answers,
     split_metrics,
     weights_at_share,
 )
@@ -145,16 +144,6 @@ def test_coverage_is_a_mean_over_recordings_that_have_the_class():
     assert covered_fractions(torch.tensor(list(RECORDINGS.values())), 0).tolist() == [1.0, 0.5]
     exactly = {str(i): [[0, 0, 0], [0, 1, 19]] for i in range(3)}
     assert answer_metrics(exactly, 0.95)["slip"]["reached"] == 1
-
-
-def test_folds_are_pooled_by_recording():
-    parts = list(RECORDINGS.items())
-    folds = {"x": answer_metrics(dict(parts[:2]), 0.8), "y": answer_metrics(dict(parts[2:]), 0.8)}
-    pooled, whole = merged_answers(folds), answer_metrics(RECORDINGS, 0.8)
-    assert list(pooled["recordings"]) == ["x/a/0", "x/a/1", "y/b/0"]
-    assert {**pooled, "recordings": None} == {**whole, "recordings": None}
-    assert merged_answers({"x": whole, "y": whole})["slip"]["num_recordings"] == 6
-    assert merged_answers({"x": whole}) == whole
 
 
 # Weights ---------------------------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """Sums over training bins: what they hold, that they add, and the machines solved from them."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -7,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.kernel_ridge import KernelRidge
 
-from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.model.moments import FORMAT, ProductSums, SufficientStats
-from tactslip_torch.own_files import load_table, save_table
+from tactslip_torch.features.statistics import TrainingStatistics
+from tactslip_torch.model.moments import SufficientStats
 
 NUM = 4
 ABOUT = {"hand": {"name": "paper24", "channels": ["SG1", "PVDF1"]}, "scaler": "range"}
@@ -55,26 +56,6 @@ def balanced(is_slip, weights):
 
 
 # What is summed -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize(("num_features", "used"), [(1, None), (3, 2), (9, None), (36, 23)])
-def test_the_normal_matrix_is_that_of_the_monomials(num_features, used, degree, rng):
-    """Variables in one block and several, bins in two chunks; 36 features are more than a strip."""
-    z = torch.from_numpy(rng.uniform(-1, 1, (600, num_features)))
-    weights = torch.from_numpy(rng.uniform(0, 2, 600))
-    layout = ProductSums(num_features, degree)
-    total = z.new_zeros(layout.num_held)
-    layout.add_(total, z, weights)
-    assert float(total[0]) == pytest.approx(float(weights.sum()))
-    x = Polynomial(degree, 0.7).monomials(z[:, :used])
-    normal = layout.normal_matrix(total, 0.7, used)
-    torch.testing.assert_close(normal, x.mT @ (x * weights[:, None]), rtol=1e-11, atol=1e-10)
-    torch.testing.assert_close(normal, normal.mT, rtol=1e-13, atol=1e-13)
-    moment = layout.moment_vector(total, 0.7, used)
-    torch.testing.assert_close(moment, x.mT @ weights, rtol=1e-11, atol=1e-10)
-    layout.add_(total, z, -weights)
-    assert float(total.abs().max()) < 1e-10
 
 
 @settings(max_examples=20)
@@ -159,19 +140,6 @@ def test_a_batch_that_is_refused_changes_nothing(place, value, message):
     assert_same(stats, stats_of([("a", *BATCH[1:])]))
 
 
-def test_a_batch_is_added_once_and_taken_out_as_it_was():
-    stats = stats_of([BATCH])
-    name, z, is_slip, weights = BATCH
-    with pytest.raises(ValueError, match="batch 'b' is in these statistics already; add it once"):
-        stats.update(name, z / 2, is_slip)
-    with pytest.raises(ValueError, match="batch 'a' was never added"):
-        stats.remove("a", z, is_slip, weights)
-    for other in ((z.flip(0), is_slip, weights), (z, ~is_slip, weights), (z, is_slip, weights * 2)):
-        with pytest.raises(ValueError, match="batch 'b' was added with other content"):
-            stats.remove(name, *other)
-    assert_same(stats, stats_of([BATCH]))
-
-
 @pytest.mark.parametrize(
     ("other", "message"),
     [
@@ -213,20 +181,97 @@ def test_one_class_is_not_enough_and_neither_is_no_feature():
         SufficientStats(1, {"x": float("nan")})
 
 
-# Files ----------------------------------------------------------------------------------------
+def make_recordings(num=9, seed=0):
+    rng = np.random.default_rng(seed)
+    recordings = []
+    for number in range(num):
+        size = int(rng.integers(0, 12))
+        features = rng.standard_normal((size, NUM)) * 10.0 ** rng.integers(-4, 4, NUM)
+        features[:, 3] = rng.choice([0.0, -0.0], size)  # ranges must not show which came first
+        features = torch.from_numpy(features.astype(np.float32))
+        is_slip = torch.from_numpy(rng.uniform(size=size) < 0.6)
+        recordings.append((f"M{number % 3}/{number}", f"M{number % 3}", features, is_slip))
+    return recordings
 
 
-@pytest.mark.parametrize("degree", [1, 2])
-def test_sums_come_back_from_their_file(degree, tmp_path):
-    stats = stats_of(make_batches(), degree=degree)
-    stats.save(tmp_path / "sums.pt")
-    again = SufficientStats.load(tmp_path / "sums.pt")
-    assert_same(again, stats)
-    assert torch.equal(again.sums, stats.sums)
-    again.merge(stats_of([BATCH], degree=degree))
-    assert load_table(tmp_path / "sums.pt", FORMAT)[0]["degree"] == degree
-    save_table(tmp_path / "other.pt", "tactslip_torch sums 1", {}, {})
-    with pytest.raises(ValueError, match=r"made by version 0\.1\.0 or earlier"):
-        SufficientStats.load(tmp_path / "other.pt")
-    with pytest.raises(FileNotFoundError):
-        SufficientStats.load(tmp_path / "nothing.pt")
+def statistics_of(recordings, sample_bins=3):
+    statistics = TrainingStatistics(NUM, sample_bins)
+    for recording in recordings:
+        statistics.update(*recording)
+    return statistics
+
+
+def bits_of(statistics):
+    """All of a statistics but its moments, as bytes and text, so that 0 and -0 differ."""
+    sample = statistics.sample.state_dict()
+    tensors = {**sample["tensors"], "minimum": statistics.minimum, "maximum": statistics.maximum}
+    bits = {
+        name: (str(tensor.dtype), tuple(tensor.shape), tensor.numpy().tobytes())
+        for name, tensor in tensors.items()
+    }
+    return sorted(statistics.seen_batches.items()), sample["facts"], bits
+
+
+@given(
+    seed=st.integers(0, 99),
+    order=st.randoms(use_true_random=False),
+    num_shards=st.integers(1, 5),
+    sample_bins=st.integers(0, 6),
+)
+def test_any_order_and_sharding_gives_the_same_bits(seed, order, num_shards, sample_bins):
+    recordings = make_recordings(seed=seed)
+    whole = statistics_of(recordings, sample_bins)
+    order.shuffle(recordings)
+    shards = [statistics_of(recordings[i::num_shards], sample_bins) for i in range(num_shards)]
+    order.shuffle(shards)
+    merged = TrainingStatistics(NUM, sample_bins)
+    for shard in shards:
+        before = bits_of(shard)
+        merged.merge(shard)
+        assert bits_of(shard) == before
+    assert bits_of(merged) == bits_of(whole)
+    assert bits_of(statistics_of(recordings, sample_bins)) == bits_of(whole)
+
+
+def broken_bins(value):
+    features = torch.zeros(5, NUM)
+    features[2, 1] = value
+    return features
+
+
+@pytest.mark.parametrize(
+    ("name", "features", "labels", "match"),
+    [
+        ("M1/1", torch.zeros(5, NUM), torch.zeros(5), "'M1/1' is in these statistics already"),
+        ("new", torch.zeros(5, 3), torch.zeros(5), r"'new'.*\[N, 4\].*\(5, 3\)"),
+        ("new", torch.zeros(5, NUM), torch.zeros(4), r"'new'.*\(5, 4\) and \(4,\)"),
+        ("new", torch.zeros(5, NUM), torch.zeros(()), r"'new'.*\(5, 4\) and \(\)"),
+        ("new", torch.zeros(5, NUM).double(), torch.zeros(5), "'new'.*hand float32"),
+        ("new", broken_bins(math.nan), torch.zeros(5), "'new'.*nan in row 2, column 1"),
+        ("new", broken_bins(-math.inf), torch.zeros(5), "'new'.*-inf in row 2, column 1"),
+    ],
+)
+def test_a_refused_recording_changes_nothing(name, features, labels, match):
+    statistics = statistics_of(make_recordings())
+    before = bits_of(statistics)
+    with pytest.raises(ValueError, match=match) as error:
+        statistics.update(name, "M1", features, labels)
+    assert "\n" not in str(error.value)
+    assert bits_of(statistics) == before
+    if name == "new":
+        statistics.update(name, "M1", torch.zeros(5, NUM), torch.zeros(5))
+
+
+def test_other_refusals_of_merge_change_nothing():
+    recordings = make_recordings()
+    statistics = statistics_of(recordings[:5])
+    before = bits_of(statistics)
+    for other, match in [
+        (statistics_of(recordings[4:]), "1 batches are in both statistics, such as 'M1/4'"),
+        (statistics, "5 batches are in both"),
+        (statistics_of(recordings[5:], sample_bins=4), "statistics of 3 and 4 sample_bins"),
+        (TrainingStatistics(NUM + 1, 3), "4 and 5 features"),
+    ]:
+        with pytest.raises(ValueError, match=match):
+            statistics.merge(other)
+        assert bits_of(statistics) == before

@@ -12,7 +12,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from engine_bins import KINDS, assert_equals_reference, assert_modes_are_fair, bins_of, some_hand
+from engine_bins import KINDS, assert_equals_reference, bins_of, some_hand
 from small_detector import raw_bins, small_detector
 
 from tactslip_torch import FeaturePool, HandLayout, native
@@ -61,23 +61,6 @@ def test_whole_pool_on_bins_of_every_kind(kind):
     bins = bins_of(kind, 20, HAND, 100, generator(0))
     # float32 does not hold the vibration of what is nearly constant
     assert_is_reference(bins, pool, kinds=(False,) if kind == "near_constant" else (False, True))
-    if kind in ("tied", "rails"):
-        mixed = FeaturePool(HAND, spectrum=spectrum, arithmetic="native")
-        few = bins[:4].float()
-        assert_modes_are_fair(mixed(few, torch.float64), few.double(), pool, NAMES)
-
-
-@needs_engine
-@pytest.mark.parametrize("kind", ["tap", "step"])
-@pytest.mark.parametrize(("num", "noise"), [(100, 1e-3), (65, 1e-5)])
-def test_quiet_but_for_a_tap_or_a_step(num, kind, noise):
-    """Where float32 crowds about the median and the quartiles."""
-    made_by, shape = generator(3), (40, len(HAND), num)
-    place, time = torch.randint(1, num - 1, (*shape[:2], 1), generator=made_by), torch.arange(num)
-    form = time == place if kind == "tap" else time >= place
-    size = torch.randn(*shape[:2], 1, generator=made_by, dtype=torch.float64)
-    bins = size * (form + noise * torch.randn(shape, generator=made_by, dtype=torch.float64))
-    assert_is_reference(bins, FeaturePool(HAND, bin_samples=num, level=3), kinds=(True,))
 
 
 @needs_engine
@@ -104,14 +87,6 @@ def test_instruction_sets_agree_on_the_papers_hand(level, monkeypatch):
     for num in (1, 20):
         torch.testing.assert_close(fresh(bins[:num]), plain[:num], rtol=1e-12, atol=1e-12)
     assert_equals_reference(plain, made(pool, backend="torch")(bins), pool.names, mixed=False)
-
-
-@needs_engine
-@pytest.mark.parametrize(("exponent", "arithmetic"), [(-300, "double"), (400, "native")])
-def test_magnitudes_in_range_need_no_reference(exponent, arithmetic):
-    bins = torch.ldexp(noise(20), torch.tensor(exponent))
-    found = FeaturePool(HAND, arithmetic=arithmetic)(bins)
-    assert_equals_reference(found, POOL(bins), NAMES, mixed=False)
 
 
 @needs_engine
@@ -203,18 +178,6 @@ def test_detectors_in_threads_and_processes_score_alike(how):
             np.testing.assert_allclose(found, one, rtol=1e-12, atol=1e-12)
 
 
-def test_copies_of_a_detector_score_alike_and_one_that_is_changed_anew():
-    detector, samples = small_detector(), raw_bins(3)
-    expected = detector.score_raw(samples)
-    for other in (copy.deepcopy(detector), pickle.loads(pickle.dumps(detector))):
-        assert torch.equal(other.score_raw(samples), expected)
-        other.head.constant += 1.0
-        torch.testing.assert_close(other.score_raw(samples), expected + 1.0)
-        other.scaler.maximum = other.scaler.maximum + 1e6
-        assert (other.score_raw(samples) != expected + 1.0).any()
-    assert torch.equal(detector.score_raw(samples), expected)
-
-
 @pytest.mark.parametrize("backend", ["auto", "torch"])
 def test_leading_axes_strides_copies_and_modes(backend):
     extractor, bins = made(POOL, [5, 90, 17], backend), noise(6, dtype=torch.float32)
@@ -231,20 +194,6 @@ def test_leading_axes_strides_copies_and_modes(backend):
     assert torch.equal(inside(bins), flat)
     with torch.device("meta"):
         assert torch.equal(made(POOL, [5, 90, 17])(bins), flat)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"selected": []}, "empty selection"),
-        ({"selected": [len(NAMES)]}, rf"must lie in 0..{len(NAMES) - 1}, the pool's {len(NAMES)}"),
-        ({"backend": "fast"}, "backend must be one of auto, native, torch, got 'fast'"),
-    ],
-)
-def test_what_is_refused_is_one_line(arguments, message):
-    with pytest.raises(ValueError, match=message) as caught:
-        made(POOL, **arguments)
-    assert "\n" not in str(caught.value)
 
 
 # Built and found ---------------------------------------------------------------------------------
@@ -357,17 +306,3 @@ def test_a_detector_that_is_changed_after_use_scores_as_torch_does(change):
         _ = [np.full(12, 7.0) for _ in range(500)]  # takes memory that was given back
         found.append(detector.score_raw(bins))
     torch.testing.assert_close(*found, rtol=1e-9, atol=1e-9)
-
-
-def test_a_gradient_asked_for_after_use_is_given():
-    detector, bins = small_detector(), raw_bins(2)
-    detector.score_raw(bins)
-    detector.head.linear.requires_grad_()
-    detector.score_raw(bins).sum().backward()
-    assert detector.head.linear.grad.abs().max() > 0
-
-
-def test_half_precision_is_torchs():
-    bins = noise(3)
-    expected = POOL(bins, torch.float16)
-    torch.testing.assert_close(made(POOL)(bins, torch.float16), expected, rtol=1e-3, atol=1e-3)

@@ -1,7 +1,7 @@
 """Evidence of onsets against plain loops over the definition; a stream of it in any pieces."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,15 +9,29 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles import plausible_bins, wavelet_branches
+from small_detector import HAND, raw_bins, small_detector
+from small_set import SMALL_HAND, SmallTimeline
 
+from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import why_not
+from tactslip_torch.onset.baselines import (
+    FLOOR_V,
+    VIBRATION_HZ,
+    BaselineDetector,
+    film_band_power,
+    largest_detail,
+)
 from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence, OnsetStream
 from tactslip_torch.onset.rules import NOTHING_YET, KOfN
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.onset import OnsetTraining, kinds_of
 
 RATE = 2000.0
 FAST_KNEE, SLOW_KNEE = (0.01, 0.02, 0.03, 0.04), (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
@@ -165,12 +179,6 @@ def test_scale_moves_sizes_of_steps_alone():
     torch.testing.assert_close(after[:, ways], before[:, ways], rtol=0, atol=1e-10)
 
 
-def test_an_offset_changes_nothing():
-    x = samples_of(evidence_of())
-    before, after = columns_of(evidence_of(), x)[0], columns_of(evidence_of(), x + 1e6)[0]
-    torch.testing.assert_close(after, before, rtol=0, atol=1e-6)
-
-
 # Channels that are left out ----------------------------------------------------------------------
 
 
@@ -200,19 +208,6 @@ def test_a_fast_channel_is_left_out_while_what_is_missing_is_remembered(value):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
 
 
-def test_a_silent_fast_channel_is_left_out_and_none_at_all_is_told():
-    evidence = evidence_of()
-    x = samples_of(evidence)
-    x[4] = 2.5
-    found, is_usable = columns_of(evidence, x)
-    np.testing.assert_allclose(found, oracle(evidence, x.numpy(), {4})[0], atol=1e-10)
-    assert bool(is_usable.all())
-    x[1], x[2, 1500] = 0.0, torch.nan
-    assert not bool(columns_of(evidence, x)[1].any())
-    score = classifier_of(evidence).score_recording(x)
-    assert score.tolist() == [NOTHING_YET] * 300
-
-
 # The classifier, whole and in pieces -------------------------------------------------------------
 
 
@@ -237,18 +232,6 @@ BACKENDS = ["torch", *([] if why_not() else ["native"])]
 def in_pieces(stream, samples, cuts, masked=None):
     places = [0, *sorted(cuts), samples.shape[-1]]
     return torch.cat([stream.push(samples[:, a:b], masked) for a, b in pairwise(places)])
-
-
-def test_a_score_is_that_of_the_machine_on_scaled_columns():
-    evidence, first = CLASSIFIER.evidence, CLASSIFIER.evidence.first_hop
-    score = CLASSIFIER.score_recording(SAMPLES)
-    z = CLASSIFIER.scaler(columns_of(evidence, SAMPLES)[0]).numpy()
-    head = CLASSIFIER.head
-    expected = np.einsum("ki,ij,kj->k", z, head.quadratic, z) + z @ head.linear.numpy() + 0.5
-    assert len(score) == 4000 // 9
-    assert score[: first + 2].tolist() == [NOTHING_YET] * (first + 2)
-    mean = [np.mean(expected[i - 2 : i + 1]) for i in range(2, len(expected))]
-    np.testing.assert_allclose(score[first + 2 :], mean, rtol=1e-10, atol=1e-10)
 
 
 @given(
@@ -277,15 +260,6 @@ def test_backends_agree_on_any_hand_with_channels_missing(kinds, backend):
         expected = alone.unfold(0, 3, 1).mean(-1).nan_to_num(NOTHING_YET)
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-8)
         assert (kinds == "F" and masked is not None) or (found > NOTHING_YET).any()
-
-
-@pytest.mark.parametrize("size", [9, 50, 63])
-def test_memory_does_not_grow(size):
-    stream, held = OnsetStream(CLASSIFIER), []
-    for start in range(0, 40_000, size):
-        stream.push(samples_of(CLASSIFIER.evidence, size / RATE, seed=start))
-        held.append(stream.state_bytes)
-    assert max(held[: len(held) // 4]) == max(held[len(held) // 4 :]) > 0
 
 
 # As plain data, and what is refused --------------------------------------------------------------
@@ -340,11 +314,286 @@ def test_gradients_are_those_of_differences():
     assert torch.autograd.gradcheck(lambda x: columns_of(evidence, x)[0], (x,), fast_mode=True)
 
 
-def test_gradients_are_finite_where_a_channel_is_silent():
-    evidence = evidence_of("SFFS", **{name: (1e-30,) * len(own) for name, own in KNEES.items()})
-    x = samples_of(evidence)
-    x[2:] = 0.0
-    (pull,) = torch.autograd.grad(columns_of(evidence, x.requires_grad_())[0].sum(), x)
-    assert bool(pull.isfinite().all())
-    assert bool((pull[:2, -200:] != 0).all())
-    assert not bool(pull[2:].any())
+FILMS = HandLayout.paper24().indices("PVDF")
+SCORES = {"film_band_power": film_band_power, "largest_detail": largest_detail}
+
+
+def band_rms(x, rate=2000.0):
+    """Root mean square of what is left of a bin if all lines outside the band are taken out."""
+    lines, hz = np.fft.rfft(x), np.fft.rfftfreq(len(x), 1 / rate)
+    lines[(hz < VIBRATION_HZ[0]) | (hz > VIBRATION_HZ[1]) | (hz == 0)] = 0
+    return np.sqrt(np.mean(np.fft.irfft(lines, len(x)) ** 2))
+
+
+# ------------------------------------------------------------------------------------ the values
+
+
+@pytest.mark.parametrize("num", [99, 128])
+@pytest.mark.parametrize("rate", [2000.0, 700.0])
+def test_band_power_is_numpys_for_bins_of_any_length_and_rate(num, rate, rng):
+    """At 700 Hz up to half the rate, where an even bin has a line that is no pair."""
+    bins = 0.2 + rng.standard_normal((3, 2, num))
+    expected = [np.log(max(band_rms(x, rate) for x in bin_)) for bin_ in bins]
+    actual = film_band_power(torch.from_numpy(bins), [0, 1], rate)
+    np.testing.assert_allclose(actual, expected, atol=1e-10)
+
+
+def test_the_largest_detail_is_pywavelets(rng):
+    bins = plausible_bins(rng, 6)
+    details = [[np.abs(wavelet_branches(x)[1::2]).max() for x in bin_[14:]] for bin_ in bins]
+    actual = largest_detail(torch.from_numpy(bins), FILMS)
+    np.testing.assert_allclose(actual, np.log(np.max(details, axis=1)), atol=1e-10)
+
+
+# ----------------------------------------------------------------------------------- the manners
+
+
+# ---------------------------------------------------------------------------------- the extremes
+
+
+@pytest.mark.parametrize("name", SCORES)
+@pytest.mark.parametrize("value", [0.0, 5.0, -1e30, 1e-40])
+def test_a_dead_hand_has_the_lowest_score(name, value):
+    dead = torch.full((2, 3, 100), value, dtype=torch.float64).requires_grad_()
+    score = SCORES[name](dead, [0, 1, 2])
+    if abs(value) < 1e6:  # beyond, rounding is more than a microvolt
+        assert (score == torch.tensor(FLOOR_V, dtype=torch.float64).log()).all()
+    assert score.isfinite().all()
+    score.sum().backward()
+    assert dead.grad.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda x: film_band_power(x, []), "needs a film"),
+        (lambda x: largest_detail(x, torch.zeros(3, dtype=torch.bool)), "needs a film"),
+        (lambda x: film_band_power(x, [0], 8.0), "no line of 100 samples"),
+        (lambda x: largest_detail(x[..., :20], [0]), "level must lie in"),
+        (lambda x: largest_detail(x, [0], wavelet="none"), "unknown wavelet"),
+    ],
+)
+def test_what_is_no_baseline_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(torch.randn(2, 3, 100))
+
+
+# --------------------------------------------------------------------------------- in the harness
+def baseline(name, **change):
+    detector = small_detector()
+    parts = {"pool": detector.pool, "channel_filter": detector.channel_filter} | change
+    return BaselineDetector(name, parts["pool"], parts["channel_filter"])
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_a_baseline_scores_filtered_bins(name, rng):
+    detector = baseline(name)
+    films = list(HAND.indices("PVDF"))
+    assert detector.needed_index.tolist() == films
+    assert detector.look_ahead == 5  # half the films' frame, not the gauges' 25
+    samples = raw_bins(20)
+    score, is_valid, is_missing, _ = detector.predict_raw(samples)
+    assert torch.equal(score, SCORES[name](ChannelFilter([51, 51, 11, 11]).valid(samples), films))
+    assert is_valid.all()
+    assert not is_missing.any()
+    in_32 = detector.predict_raw(samples, given=torch.float32)
+    assert in_32.score.dtype == torch.float32
+    torch.testing.assert_close(in_32.score.double(), score, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_a_missing_film_is_flagged_and_counts_as_silent(name):
+    detector = baseline(name)
+    samples = raw_bins(5)
+    whole = detector.predict_raw(samples)
+    samples[1, 2, 60] = torch.nan  # a film
+    samples[2, 0, 60] = torch.inf  # a gauge, which no score depends on
+    samples[3, 3] = 0.1  # a dead film
+    samples[4] = torch.nan
+    found = detector.predict_raw(samples)
+    assert found.score.isfinite().all()
+    assert found.is_valid.tolist() == [True, False, True, False, False]
+    assert found.is_missing.sum(-1).tolist() == [0, 1, 1, 0, 4]
+    other = SCORES[name](ChannelFilter([51, 51, 11, 11]).valid(samples)[1:2], [3])
+    torch.testing.assert_close(found.score[1:2], other)
+    torch.testing.assert_close(found.score[[0, 2]], whole.score[[0, 2]])
+
+
+def test_a_baseline_that_does_not_exist_or_feels_nothing_is_refused():
+    with pytest.raises(ValueError, match="no baseline 'loudest'; take one of film_band_power"):
+        baseline("loudest")
+    gauges = HandLayout(tuple(c for c in HAND.channels if c.kind == "SG"))
+    with pytest.raises(ValueError, match="needs a film"):
+        baseline("largest_detail", pool=FeaturePool(gauges), channel_filter=ChannelFilter([51, 51]))
+    with pytest.raises(ValueError, match="expected samples"):
+        baseline("largest_detail").predict_raw(torch.randn(2, 3, 150))
+
+
+TRAINING_RATE = 1000.0
+
+
+def ms(*spans):
+    return [t for first, last in spans for t in range(first, last + 1, 5)]
+
+
+def test_hops_are_learned_as_what_they_are():
+    """Edges lie 1 ms off the ends of hops."""
+    times = SmallTimeline(
+        onsets_s=(1.021, 1.651),
+        released_s=((1.001, 1.07), (1.651, 1.66)),
+        sliding_s=((1.021, 1.501), (1.651, 1.801)),
+        non_slip_s=((0.201, 0.401),),
+        slip_s=((2.001, 2.201),),
+    )
+    expected = {
+        "onset paper": ms((1025, 1050), (1655, 1680)),  # 2 to 30 ms behind
+        "before": ms((705, 1000), (1605, 1650)),  # 300 ms, but not what is still sliding or unclear
+        "slide": ms((1125, 1500), (1755, 1800)),  # from 100 ms on
+        "handled paper": ms((205, 400)),
+        # unclear: until 100 ms behind onset, slide and slip
+        "rest paper": ms((5, 200), (405, 700), (1905, 2000), (2305, 2400)),
+    }
+    at = np.arange(5, 2401, 5)
+    found = kinds_of(times, at / 1000, "paper")
+    assert {kind: at[mask].tolist() for kind, mask in found.items()} == expected
+    of_onsets = kinds_of(
+        SmallTimeline(onsets_s=(1.021,), sliding_s=((1.021, 1.5),)), at / 1000, "x"
+    )
+    assert at[of_onsets["before"]].tolist() == ms((725, 1020))
+    assert at[of_onsets["onset x"]].tolist() == ms((1025, 1050))
+
+
+@dataclass(frozen=True)
+class Bursts:
+    """Noise; on paper a burst at the onset and a little more in the slide, else a knock."""
+
+    materials: str = "abc"
+    cycles: int = 3
+    hand: HandLayout = SMALL_HAND
+    burst: float = 4.0
+    sample_rate_hz = TRAINING_RATE
+    is_simulated = True
+
+    @property
+    def ids(self):
+        return [
+            RecordingId(m, c, scene)
+            for scene in ("paper", "taps")
+            for m in self.materials
+            for c in range(self.cycles)
+        ]
+
+    def timeline(self, recording):
+        if recording.scene == "taps":
+            return SmallTimeline(onsets_s=(), sliding_s=(), non_slip_s=((1.3, 1.4),))
+        onset_s = 1.3 + 0.05 * recording.cycle
+        return SmallTimeline(onsets_s=(onset_s,), sliding_s=((onset_s, 1.95),))
+
+    def load(self, recording, windows=None):
+        times = self.timeline(recording)
+        generator = torch.Generator().manual_seed(sum(str(recording).encode()) * 7919)
+        noise = torch.randn(2, 2000, generator=generator)
+        for start_s, end_s in times.sliding_s:
+            onset = round(start_s * TRAINING_RATE)
+            noise[:, onset : round(end_s * TRAINING_RATE)] *= 1.3
+            noise[:, onset : onset + 40] *= self.burst + 0.2 * ord(recording.material) % 1
+        if times.non_slip_s:
+            noise[:, 1310:1312] *= 2.5 * self.burst
+        noise = noise[-len(self.hand) :]
+        speeds = (20.0,) * len(times.onsets_s)
+        return Recording(
+            noise, TRAINING_RATE, recording.material, speeds, times.onsets_s, times.sliding_s
+        )
+
+
+def fitted(source=None, ids=None, **numbers):
+    source = source or Bursts()
+    values = {"penalty": 1e3} | numbers
+    return OnsetTraining(**values)(source, source.ids if ids is None else ids, num_workers=0)
+
+
+def hops_of(source, evidence, most=10**6, likeness=None, without=()):
+    """Columns and kinds of hops at even places, and 60 of each recording by likeness."""
+    columns, kinds = [], []
+    for recording in (one for one in source.ids if one.material not in without):
+        found, _ = evidence.columns(evidence.blocks_of_recording(source.load(recording).samples))
+        ends_s = (
+            (evidence.first_hop + 1 + np.arange(len(found))) * evidence.hop_samples / TRAINING_RATE
+        )
+        for kind, mask in kinds_of(source.timeline(recording), ends_s, recording.scene).items():
+            own = found[torch.from_numpy(mask)]
+            if likeness and not kind.startswith("onset"):
+                columns.append(own[likeness(own).argsort(descending=True, stable=True)][:60])
+                kinds += [f"like {kind}"] * len(columns[-1])
+            own = own[np.linspace(0, len(own) - 1, most).astype(int)] if len(own) > most else own
+            columns.append(own)
+            kinds += [kind] * len(own)
+    return torch.cat(columns), np.array(kinds)
+
+
+def kernel_ridge(columns, kinds):
+    """Scores of a machine on hops, whose kinds weigh alike."""
+    scaler = FeatureScaler.fit(columns, tail=0.001)
+    z, is_onset = scaler(columns).numpy(), np.char.startswith(kinds, "onset")
+    weight = np.zeros(len(z))
+    for mask in (is_onset, ~is_onset):
+        for kind in (of_mask := set(kinds[mask])):
+            weight[kinds == kind] = 0.5 / len(of_mask) / (kinds == kind).sum()  # of all: 1
+    system = (0.5 + z @ z.T) ** 2 + np.diag(1 / (1e3 * weight))
+    beta = np.linalg.solve(system, np.where(is_onset, 1.0, -1.0))
+    return lambda hops: torch.from_numpy((0.5 + scaler(hops).numpy() @ z.T) ** 2 @ beta)
+
+
+def test_the_machine_is_kernel_ridge_on_hops_that_a_first_machine_finds_most_like_a_slip():
+    source = Bursts(burst=2.0)
+    classifier, left_out, counts = fitted(source)
+    evidence = classifier.evidence
+    first = kernel_ridge(*hops_of(source, evidence, 100))
+    fresh, _ = hops_of(Bursts("d"), evidence)
+    for without, own in {(): classifier, **left_out}.items():
+        columns, kinds = hops_of(source, evidence, 20, first, without)
+        score = own.head(own.scaler(fresh))
+        expected = kernel_ridge(columns, kinds)(fresh)
+        torch.testing.assert_close(score, expected, rtol=1e-6, atol=1e-6)
+        if not without:
+            assert counts == {kind: int((kinds == kind).sum()) for kind in dict.fromkeys(kinds)}
+    assert set(left_out) == set(source.materials)
+
+
+def test_knees_are_a_tenth_of_the_usual_power_and_the_usual_step():
+    source = Bursts(cycles=2)
+    evidence = fitted(source)[0].evidence
+    plain = type(evidence)(source.hand, TRAINING_RATE, 5)
+    blocks = [plain.blocks_of_recording(source.load(r).samples) for r in source.ids]
+    fast = np.median([np.median(own.power[0].sqrt(), -1) for own in blocks], 0)
+    assert evidence.fast_knee == pytest.approx(0.1 * fast, rel=0.02)
+    means = [own.mean[0, 96:].numpy() for own in blocks]  # the longest step takes 100 blocks
+    steps = [np.median(np.abs(m[3:] + m[2:-1] - m[1:-2] - m[:-3])) / 2 for m in means]
+    assert evidence.slow_knee[0] == pytest.approx(np.median(steps), rel=0.02)
+
+
+def test_a_classifier_finds_onsets_of_recordings_it_never_saw_and_no_knocks():
+    classifier, *_ = fitted(comb_periods=2)
+    assert classifier.evidence.comb_periods == 2
+    assert classifier.threshold == float("inf")
+    fresh = Bursts("de")
+    columns, kinds = hops_of(fresh, classifier.evidence)
+    scores = classifier.head(classifier.scaler(columns)).numpy()
+    onsets = scores[kinds == "onset paper"]
+    for kind in ("before", "slide", "handled taps", "rest paper", "rest taps"):
+        auc = np.mean(onsets[:, None] > scores[kinds == kind])
+        assert auc > 0.8, kind
+
+
+@pytest.mark.parametrize(
+    ("source", "scene", "numbers", "match"),
+    [
+        (Bursts(), "taps", {}, "no slip begins in the recordings that onsets are learned from"),
+        (Bursts(), "none", {}, "no recording is left to learn onsets from; give onset.streams"),
+        (Bursts(), "paper", {"hop_ms": 5.6}, "a hop of 6 samples at 1000 Hz is no hop of at most"),
+    ],
+)
+def test_what_nothing_can_be_learned_from_is_refused_in_one_line(source, scene, numbers, match):
+    with pytest.raises(ValueError, match=match) as caught:
+        fitted(source, [r for r in source.ids if r.scene == scene], **numbers)
+    assert "\n" not in str(caught.value)

@@ -3,39 +3,47 @@
 import itertools
 import json
 import sys
-from dataclasses import replace
 
 import pytest
 import torch
+from small_detector import HAND as FOUR_CHANNELS
+from small_detector import small_detector
 from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
 from test_commands import BAD_INPUT, TinyRecordings, composed
 
 import tactslip_torch.analysis.pareto as module
 import tactslip_torch.commands.pareto as command
 from tactslip_torch import SlipDetector
-from tactslip_torch.analysis.latency import GROUPS, CostModel, Latency, Limits, Timing
+from tactslip_torch.analysis import latency as latency_module
+from tactslip_torch.analysis.latency import (
+    GROUPS,
+    CostModel,
+    Latency,
+    Limits,
+    Timing,
+    detector_parts,
+    main,
+    measure_costs,
+    parts_of,
+    time_calls,
+)
 from tactslip_torch.analysis.pareto import (
     Candidate,
     Group,
     ParetoSearch,
     Search,
-    landmarks,
     nondominated,
-    worth_naming,
-    worth_timing,
 )
 from tactslip_torch.commands.entry import one_line
 from tactslip_torch.data.splits import seen6, unseen4
-from tactslip_torch.features.bank import pool_names
+from tactslip_torch.features.bank import make_plan, pool_names
 from tactslip_torch.features.groups import allowed
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.features.selection import rank_features, t_scores
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.report.pareto import none_meets
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.recipe import (
@@ -90,21 +98,6 @@ def searching(source=None, recipe=RECIPE, channel_filter=None, **changes):
 def searched():
     made = searching(**POOLED)
     return made, made.candidates()
-
-
-def described(candidates):
-    """What can be compared of candidates."""
-    return [
-        (
-            c.group[:3],
-            c.columns,
-            c.ranking,
-            c.detector,
-            c.point,
-            c.selection.scaler.minimum.tolist(),
-        )
-        for c in candidates
-    ]
 
 
 def only(candidates, channels, components, ranking, degree, size, columns="channel"):
@@ -204,30 +197,6 @@ def test_what_cannot_be_searched_is_refused(changes, message):
 
 
 # What is found -----------------------------------------------------------------------------------
-def test_every_group_ranking_head_and_size_is_there_once(searched):
-    made, candidates = searched
-    groups = {("all", "all"), ("all", "time"), ("films", "all"), ("films", "time")}
-    groups.add(("gauges", "all"))  # a gauge has no spectra: gauges in time are the same again
-    candidates = [c for c in candidates if c.columns == "channel"]
-    met = [(*c.group[1:3], c.ranking, c.degree, c.selection.size) for c in candidates]
-    expected = itertools.product(groups, SMALL["rankings"], (1, 2), (3, 6))
-    assert sorted(met) == sorted((*group, *rest) for group, *rest in expected)
-    for each in candidates:
-        assert bool(each.group.mask[list(each.selected)].all())
-        # frames of 51 and 11 samples, half of them behind a sample
-        with_gauge = any(made.pool.names[index].channel == "SG1" for index in each.selected)
-        assert each.latency.look_ahead_ms == (12.5 if with_gauge else 2.5)
-        assert (each.latency.bin_ms, each.latency.hop_ms) == (50.0, 5.0)
-    expected = tuple(
-        rank_features(t_scores(made.training_statistics["centred"].moments), 6).tolist()
-    )
-    assert only(candidates, "all", "all", "t", 1, 6).selected == expected
-    causal = searching(
-        channel_filter=ChannelFilter([51, 11], align="causal"), rankings=["t"], degrees=[1]
-    )
-    assert {c.latency.look_ahead_ms for c in causal.candidates()} == {0.0}
-
-
 @pytest.mark.parametrize("degree", [1, 2])
 def test_a_score_is_that_of_machines_that_never_met_the_material(searched, degree):
     made, candidates = searched
@@ -276,43 +245,6 @@ def test_a_pooled_score_is_that_of_everything_learned_without_the_material(searc
     assert list(found.by_group.values()) == pytest.approx(expected)
 
 
-def test_neither_threads_nor_test_cycles_change_what_is_found(searched):
-    few = {"rankings": ["t"], "channels": ["all"], "components": ["all"], "degrees": [2]}
-    quiet = described(searching(**few).candidates())
-    torch.set_num_threads(2)
-    try:
-        assert described(searching(**few).candidates()) == quiet
-    finally:
-        torch.set_num_threads(1)
-    fold = searched[0].fold
-    loud = SmallSet(gains=dict.fromkeys(fold.having("test"), 9.0))
-    assert described(searching(loud, **few).candidates()) == quiet
-    loud = SmallSet(gains=dict.fromkeys(fold.having("train")[:3], 9.0))
-    assert described(searching(loud, **few).candidates()) != quiet
-
-
-def test_each_finger_goes_that_is_missed_least(monkeypatch):
-    made = searching(rankings=["t"], components=["all"])
-    made.pool = FeaturePool(HAND)
-    made._channel_of = [HAND.names.index(name.channel) for name in made.pool.names]
-    worth = {"little": 0.01, "ring": 0.3, "middle": 0.02, "index": 0.2, "thumb": 0.1}
-
-    def played(group, ranking, degrees):
-        gone = group.channels.split(" without ")[1].split(" and ")
-        names = zip(made.pool.names, group.mask, strict=True)
-        assert {HAND.channel(n.channel).finger for n, m in names if m} == set(worth) - set(gone)
-        return [at(60.0, 100.0, 0.9 - sum(worth[finger] for finger in gone))]
-
-    monkeypatch.setattr(made, "_of_channels", played)
-    one_of_each = tuple(made._channel_of.index(channel) for channel in (0, 3, 6, 9, 12))
-    best = at(60.0, 100.0, 0.9, 5)
-    best = replace(best, selection=replace(best.selection, selected=one_of_each))
-    found = made.without_fingers(best)
-    kept = [max(c.balanced_accuracy for c in part) for part in (found[:5], found[5:9], found[9:12])]
-    assert kept == pytest.approx([0.89, 0.87, 0.77])  # little, then middle, then the thumb
-    assert len(found) == 5 + 4 + 3 + 2
-
-
 # The front ---------------------------------------------------------------------------------------
 def test_the_front_is_what_nothing_beats(rng):
     points = rng.integers(0, 6, (80, 3)).tolist()
@@ -327,39 +259,6 @@ def test_the_front_is_what_nothing_beats(rng):
     ]
     assert nondominated(points) == expected
     assert nondominated([]) == []
-
-
-def test_landmarks_are_the_best_the_cheap_and_the_small():
-    def found(*rows):
-        return list(landmarks(rows).values())
-
-    best, third, poor, few, fewer, quick = (
-        at(60.0, us, accuracy, size)
-        for accuracy, us, size in (
-            *((0.99, 300.0, 100), (0.981, 100.0, 60), (0.979, 10.0, 30)),
-            *((0.95, 200.0, 20), (0.94, 90.0, 8), (0.99, 200.0, 100)),
-        )
-    )
-    assert found(poor, few, third, best, fewer) == [best, third, few]
-    assert found(best, third, poor) == [best, third, None]
-    assert found(best, quick, third) == [quick, None, None]  # as accurate: the quickest
-    assert found() == [None, None, None]
-    made = [at(60.0, 100.0, accuracy) for accuracy in (0.8, 0.9, 0.7)]
-    pooled = [replace(each, columns="pooled mean") for each in made]
-    small = [at(60.0, 100.0, accuracy, 20) for accuracy in (0.4, 0.5)]
-    assert set(worth_naming([*made, *pooled, *small])) == {made[1], pooled[1], small[1]}
-
-
-def test_what_is_close_to_the_limits_is_timed(rng):
-    """Two filters: the quick one waits longer, so accuracy does not rise with compute."""
-    line = [at(61.0, 100.0 + 10 * i, 0.8 - 0.001 * (39 - i)) for i in range(40)]
-    line += [at(59.0, 500.0 + 10 * i, 0.6 + 0.001 * i) for i in range(40)]
-    timed = worth_timing([line[i] for i in rng.permutation(80)], 10, Limits(80.0, 300.0, [5.0]))
-    # 450 us and 300 us at most, then 200 us, best first: the model may err either way
-    compute = [each.latency.compute_us for each in timed]
-    assert compute[:5] == [490.0, 450.0, 300.0, 200.0, 440.0]
-    assert {100.0, 890.0} < set(compute)  # the cheapest and the dearest
-    assert len(set(compute)) == 10
 
 
 # The command -------------------------------------------------------------------------------------
@@ -504,15 +403,159 @@ def test_none_that_meets_the_limits_is_said_plainly(monkeypatch, capsys, tmp_pat
     assert not list(tmp_path.glob("*.pt"))
 
 
-def test_what_is_missed_least_is_said():
-    def row(worst_ms, compute_us, hop_ms):
-        latency = Latency(worst_ms - 40 - hop_ms - compute_us / 1000, 40.0, hop_ms, compute_us)
-        return {"latency": latency.to_dict(), "misses": Limits(80.0, 500.0, [5.0]).misses(latency)}
+RATE_HZ = 2000
 
-    found = {"limits": {"deadline_ms": 80.0, "compute_us": 500.0}, "tries": []}
-    found["front"] = [row(50.5, 900.0, 5.0), row(50.5, 421.0, 0.4), row(99.0, 100.0, 5.0)]
-    assert none_meets(found).endswith(": the closest has compute 421 us not below the hop 0.4 ms")
-    tried = found | {"tries": found["front"][:1], "tried": 1, "not_tried": 2}
-    assert "in a fresh process (1 tried, 2 that kept both when timed not tried)" in none_meets(
-        tried
+
+def decided_after_ms(onset, num_samples, hop, look_ahead, compute_us):
+    """Samples come one by one; the first bin that begins at or behind the onset decides."""
+    for newest in range(10**6):
+        start = newest - look_ahead - num_samples + 1
+        if start >= onset and start % hop == 0:
+            return (newest + 1 - onset) * 1000 / RATE_HZ + compute_us / 1000
+    raise AssertionError("never decided")
+
+
+@pytest.mark.parametrize("look_ahead", [0, 5, 25])
+@pytest.mark.parametrize("hop", [10, 37, 100])
+def test_no_onset_waits_longer_and_one_waits_so_long(look_ahead, hop):
+    played = [decided_after_ms(400 + i, 100, hop, look_ahead, 700.0) for i in range(hop)]
+    stated = Latency(look_ahead / 2, 50.0, hop / 2, 700.0)
+    # an onset just behind the first sample of a bin is the worst: it misses that bin by nothing
+    assert max(played) == pytest.approx(stated.worst_ms - 1000 / RATE_HZ)
+    assert stated.to_dict()["worst_ms"] == stated.worst_ms
+
+
+def test_what_is_missed_is_named():
+    latency = Latency(2.5, 50.0, 5.0, 400.0)
+    assert Limits(57.9, 400, [5.0]).misses(latency) == []
+    assert Limits(57.8, 399, [5.0]).misses(latency) == [
+        "latency 57.90 ms above deadline_ms=57.8",
+        "compute 400 us above compute_us=399",
+    ]
+    assert Limits(100, 9999, [5.0]).misses(Latency(0.0, 50.0, 5.0, 5000.0)) == [
+        "compute 5000 us not below the hop 5 ms"
+    ]
+    assert Latency(0.0, 50.0, 5.0, 1000.0).load == pytest.approx(0.2)
+
+
+def test_the_hop_leaves_head_room_where_one_does():
+    limits = Limits(80.0, 500.0, [5.0, 10.0, 25.0])
+    parts = Latency(4.6, 50.0, 5.0, 1.0)
+    assert limits.latency(parts, 380.0).hop_ms == 25  # 79.98 ms
+    roomy = limits.latency(parts, 380.0, headroom=1.25)
+    assert (roomy.hop_ms, roomy.compute_us) == (10, 380)  # 25 ms with 475 us are 80.075 ms
+    assert limits.latency(parts, 390.0, headroom=1.5).hop_ms == 25  # 585 us are none: without
+    assert Limits(60.0, 5000.0, [5.0]).headroom(Latency(2.0, 50.0, 5.0, 400.0)) == pytest.approx(
+        7.5
     )
+    assert Limits(900.0, 500.0, [5.0]).headroom(Latency(2.0, 50.0, 5.0, 400.0)) == 1.25
+    for us, hop_ms in ((12_000.0, 25), (60_000.0, 25), (5_000.0, 10)):
+        assert Latency(0.0, 50.0, 5.0, us).with_shortest_hop(limits.hops_ms).hop_ms == hop_ms
+
+
+# Costs -------------------------------------------------------------------------------------------
+POOL = FeaturePool(FOUR_CHANNELS)
+PRIMES = dict(zip(GROUPS, (2.0, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37), strict=True))
+MODEL = CostModel(0.5, {name: 1000 * price for name, price in PRIMES.items()}, PRIMES, tail=2.0)
+
+
+def parts(*names):
+    return parts_of(make_plan(FOUR_CHANNELS, 4, names))
+
+
+def priced(**groups):
+    """The bill by hand: each group once, and so many of its parts."""
+    return 2 * (0.5 + sum((1000 + num) * PRIMES[name] for name, num in groups.items()))
+
+
+@pytest.mark.parametrize(
+    ("names", "bill"),
+    [
+        (["SG1 raw time mean"], {"gauges": 1, "moments": 1, "columns": 1}),
+        (["SG1 raw time mode"], {"gauges": 1, "sorts": 1, "columns": 1}),
+        (
+            ["PVDF1 A2 time std", "PVDF1 A2 time median", "PVDF1 A2 time iqr"],
+            {"films": 1, "branches": 1, "moments": 1, "sorts": 1, "columns": 3},
+        ),
+        (
+            ["PVDF1 A2 time correlation", "PVDF2 A2 time entropy"],
+            {
+                "films": 2,
+                "branches": 2,
+                "correlations": 1,
+                "sorts": 1,
+                "histograms": 1,
+                "columns": 2,
+            },
+        ),
+        (
+            ["PVDF1 D4 freq spectral_centroid", "PVDF1 D4 freq spectral_spread"],
+            {"films": 1, "spectra": 1, "lines": 1, "columns": 2},
+        ),
+        (
+            ["PVDF1 A1 freq band_energy_ratio", "PVDF1 D3 freq band_energy_ratio"],
+            {"films": 1, "energies": 1, "columns": 2},
+        ),
+    ],
+)
+def test_shared_work_is_on_the_bill_once(names, bill):
+    needed, everything = parts(*names), range(len(names))
+    assert MODEL.compute_us(detector_parts(needed, everything)) == pytest.approx(priced(**bill))
+    pooled = priced(**bill | {"columns": 5, "pooled": len(names)})  # five numbers of all of them
+    assert MODEL.compute_us(detector_parts(needed, everything, 5)) == pytest.approx(pooled)
+
+
+def test_prices_are_found_again_in_timings_that_follow_them(monkeypatch):
+    needed = parts_of(make_plan(POOL.hand, POOL.level, POOL.names))
+
+    def played(detector, calls):
+        layer = detector.pooling
+        num_pooled = None if layer is None else len(layer.names)
+        us = MODEL.compute_us(detector_parts(needed, detector.selected, num_pooled))
+        return Timing(us / 2, us, us, calls)
+
+    monkeypatch.setattr(latency_module, "time_detector", played)
+    costs = measure_costs(POOL, ChannelFilter([51, 51, 11, 11]), [4, 8], "auto", ["mean", "std"])
+    assert costs.tail == pytest.approx(2.0)
+    assert costs.error < 0.02
+    assert min(costs.base_us, *costs.group_us.values(), *costs.part_us.values()) >= 0
+    some = detector_parts(needed, range(0, len(needed), 50))
+    assert costs.compute_us(some) == pytest.approx(MODEL.compute_us(some), rel=0.05)
+    assert (
+        json.loads(json.dumps(costs.to_dict(), allow_nan=False))["groups"].keys() == GROUPS.keys()
+    )
+
+
+# The clock ---------------------------------------------------------------------------------------
+class Played:
+    """A clock and calls that are played: microseconds as given, interrupted if negative."""
+
+    def __init__(self, monkeypatch, *runs):
+        self.now, self.switches = 0, 0
+        self.left = iter([1, *(us for run in runs for us in run)])  # the first is not timed
+        monkeypatch.setattr(latency_module.time, "perf_counter_ns", lambda: self.now)
+        monkeypatch.setattr(latency_module, "_interruptions", lambda: self.switches)
+
+    def __call__(self, given):
+        us = next(self.left)
+        self.now += 1000 * abs(us)
+        self.switches += us < 0
+
+
+def test_calls_are_timed_one_by_one_and_interrupted_ones_told_but_not_counted(monkeypatch):
+    run = list(range(1, 101))
+    played = Played(monkeypatch, run[::-1], [10 * us for us in run], run)
+    # one run that a neighbour slows down does not decide
+    assert time_calls(played, [None], 100, runs=3) == Timing(51.0, 99.0, 99.0, 100, 0.0)
+    played = Played(monkeypatch, [*run[:50], *[-5000] * 25, *run[50:]])
+    assert time_calls(played, [None], 100, runs=1) == Timing(51.0, 99.0, 5000.0, 100, 0.2)
+    played = Played(monkeypatch, [7, *[-5000] * 100])
+    assert time_calls(played, [None], 100, runs=1).p50_us == 5000  # hardly one was left alone
+
+
+def test_the_timing_of_a_detector_is_a_line_of_json(tmp_path, capsys):
+    small_detector().save(tmp_path / "detector.pt")
+    main([str(tmp_path / "detector.pt"), "10", "auto"])
+    assert json.loads(capsys.readouterr().out)["calls"] == 10
+    with pytest.raises(SystemExit, match=r"usage: python -m tactslip_torch.analysis.latency"):
+        main([])

@@ -5,7 +5,6 @@ It is the one that comes with the package; commands are tested on a small one of
 
 import copy
 
-import numpy as np
 import onnxruntime
 import pytest
 import torch
@@ -15,10 +14,8 @@ from test_commands import TINY, composed, run_train
 from tactslip_torch import SlipDetector
 from tactslip_torch.commands.importance import sensors
 from tactslip_torch.commands.train import train
-from tactslip_torch.deploy.check import simulated_bins
 from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.onset.decisions import score_stream
-from tactslip_torch.onset.streaming import StreamingDetector
 
 HOP = 50
 STUCK_AT = 9_000  # sample
@@ -83,13 +80,6 @@ def test_a_nanovolt_of_noise_moves_no_score(detector, recording, whole):
     assert torch.equal(found.score >= 0, whole.score >= 0)
 
 
-def test_float32_in_place_of_float64_moves_no_score(detector, recording, whole):
-    assert not torch.equal(recording.float().double(), recording)
-    found = score_stream(detector, recording.float(), HOP)
-    sd = float(whole.score.std())
-    assert float((found.score.double() - whole.score).abs().max()) < MOST_MOVED * sd
-
-
 @pytest.mark.parametrize("noise", [0.0, 1e-9], ids=["constant", "1 nV"])
 @pytest.mark.parametrize("channel", DEAD)
 def test_a_stuck_channel_is_left_out_within_a_second(channel, noise, detector, recording, whole):
@@ -107,25 +97,6 @@ def test_a_stuck_channel_is_left_out_within_a_second(channel, noise, detector, r
     before = starts + detector.pool.bin_samples + detector.look_ahead < STUCK_AT
     assert torch.equal(found.score[before], whole.score[before])
     assert not torch.equal(found.score[later], whole.score[later])  # it was in use
-
-
-def test_decisions_of_a_stream_with_a_stuck_channel_are_those_without_it(detector, recording):
-    place = detector.pool.hand.names.index("PVDF7")
-    stuck = recording.clone()
-    stuck[place, STUCK_AT:] = 0.2
-    streams = [
-        StreamingDetector(detector, dtype=torch.float64),
-        StreamingDetector(detector, dtype=torch.float64, masked_channels=["PVDF7"]),
-    ]
-    found, wanted = (
-        stream.push(samples.T) for stream, samples in zip(streams, (stuck, recording), strict=True)
-    )
-    later = found.available_s > (STUCK_AT + 2000) / 2000.0 + 1.0  # the rule remembers 3 decisions
-    assert int(later.sum()) > 20
-    for name in ("score", "llr", "probability", "statistic"):
-        one, other = (getattr(each, name)[later] for each in (found, wanted))
-        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
-    assert not found.is_valid[later].any()
 
 
 # Dead channels -----------------------------------------------------------------------------------
@@ -155,24 +126,6 @@ def graphs(detector, tmp_path_factory):
     folder = tmp_path_factory.mktemp("graphs")
     paths = export_detector(detector, folder, ["bin", "stream"], precision="float64")
     return [onnxruntime.InferenceSession(str(path)) for path in paths if path.suffix == ".onnx"]
-
-
-@pytest.mark.onnx
-@pytest.mark.parametrize("broken", [None, "dead", "nan", "stuck"])
-def test_the_graph_of_a_bin_is_torch(graphs, broken, detector):
-    hand, length = detector.pool.hand, graphs[0].get_inputs()[0].shape[-1]
-    bins = simulated_bins(hand, 2000.0, 40, length, torch.float64)
-    dead = torch.tensor([broken == "dead" and name in DEAD for name in hand.names])
-    if broken == "nan":
-        bins[::2, 3, 50] = bins[1::2, 17, 60] = torch.nan
-    if broken == "stuck":
-        bins[:, [3, 17]] = 0.4 + noise_like(bins[:, [3, 17]])
-    judged = detector.predict_raw(bins, masked_channels=dead)
-    bins[:, dead] = torch.nan
-    score, valid = graphs[0].run(["score", "valid"], {"samples": bins.numpy()})
-    atol = 1e-9 * float(judged.score.std())
-    np.testing.assert_allclose(score, judged.score.numpy(), rtol=0, atol=atol)
-    assert valid.tolist() == judged.is_valid.tolist()
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ import pytest
 import torch
 from oracles import pooled
 
-from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import STATISTICS, ChannelPooling, pooled_names
 from tactslip_torch.hand import HandLayout
@@ -70,17 +69,6 @@ def test_equals_plain_numpy_where_channels_are_missing_too(rng, setting):
         torch.testing.assert_close(whole, found[:6], rtol=1e-12, atol=1e-13)
 
 
-def test_a_stuck_channel_is_one_that_is_missing(rng):
-    layer, features = fitted(rng)
-    is_missing = torch.zeros(len(features), 7, dtype=torch.bool)
-    is_missing[:, [0, 3]] = True
-    bins = torch.from_numpy(rng.standard_normal((len(features), 7, 100)))
-    alive = POOL(bins)
-    bins[:, [0, 3]] = 0.3 + 1e-9 * torch.from_numpy(rng.standard_normal((len(features), 2, 100)))
-    stuck = layer(inputs_of(layer, POOL(bins)))
-    torch.testing.assert_close(stuck, layer(inputs_of(layer, alive), is_missing))
-
-
 def test_without_any_channel_of_a_kind_a_column_is_its_training_median(rng):
     layer, features = fitted(rng)
     is_missing = torch.zeros(len(features), 7, dtype=torch.bool)
@@ -105,15 +93,6 @@ def test_one_dead_channel_in_training_does_not_hide_the_others(rng):
     torch.testing.assert_close(layer(inputs_of(layer, POOL(bins))), wanted)
 
 
-def test_nan_is_never_left_out_in_silence(rng):
-    layer, features = fitted(rng)
-    given = inputs_of(layer, features)
-    given[3] = torch.nan
-    found = layer(given)
-    assert found[3].isnan().all()
-    assert found[[0, 1, 2, 4]].isfinite().all()
-
-
 def test_gradients_flow_and_are_finite_where_channels_agree(rng):
     layer, features = fitted(rng, ["mean", "std", "min", "max", "median"])
     layer = layer.select([3, 40, 77, 100, len(layer.names) - 1])
@@ -123,21 +102,6 @@ def test_gradients_flow_and_are_finite_where_channels_agree(rng):
     layer(same).sum().backward()
     assert same.grad is not None
     assert same.grad.isfinite().all()
-
-
-def test_select_and_with_channels_take_no_more_than_they_need(rng):
-    layer, features = fitted(rng)
-    few = layer.select([5, 2])
-    assert [str(name) for name in few.names] == [str(layer.names[5]), str(layer.names[2])]
-    assert len(few.inputs) < len(layer.inputs)
-    torch.testing.assert_close(
-        few(inputs_of(few, features)), layer(inputs_of(layer, features))[:, [5, 2]]
-    )
-    own = FeatureName("PVDF2", "A1", "time", "mode")
-    both = few.with_channels([own])
-    found = both(inputs_of(both, features))
-    torch.testing.assert_close(found[:, 0], features[:, PLACE[own]])
-    torch.testing.assert_close(found[:, 1:], few(inputs_of(few, features)))
 
 
 @pytest.mark.parametrize("setting", ["largest", [], ["mean", "mode"]])

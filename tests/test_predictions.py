@@ -1,4 +1,4 @@
-"""Predictions with their validity: NaN and Inf, masked and broken channels, extremes, float32."""
+"""Predictions with their validity: what is missing, masked or extreme; vmap, grad and autocast."""
 
 import copy
 
@@ -126,17 +126,6 @@ def test_every_extreme_gives_a_finite_score_or_a_flag(kind, detector):
     torch.testing.assert_close(single.score_raw(samples[is_known]), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_all_channels_missing_gives_the_score_of_what_is_known_beforehand(detector):
-    """That of imputation values, or the mean over both classes, alike in number."""
-    found = detector.predict(torch.full((2, 24, 100), torch.nan))
-    expected = detector.head(detector.imputation)
-    if (known := detector.gaussians) is not None:
-        lift = (detector.head.quadratic * known.covariance).sum((-2, -1))
-        expected = (detector.head(known.mean) + lift).mean()
-    torch.testing.assert_close(found.score.double(), expected.expand(2), rtol=1e-6, atol=1e-7)
-    assert not found.is_valid.any()
-
-
 def test_a_head_that_overflows_is_not_valid():
     detector = random_detector()
     detector.head.quadratic *= 1e40
@@ -226,3 +215,163 @@ def test_the_file_holds_what_stands_in_for_a_channel(kind, small, tmp_path):
 def test_what_is_no_channel_of_the_hand_is_refused_in_one_line(masked, said, small):
     with pytest.raises(ValueError, match=said):
         small.predict_raw(raw_bins(1), masked_channels=masked)
+
+
+SEED = 4  # of a transformed that needs no SG1
+
+
+@pytest.fixture(scope="module", params=["imputation", "gaussians"])
+def transformed(request):
+    return {"imputation": small_detector, "gaussians": with_gaussians}[request.param](seed=SEED)
+
+
+def healthy_bins(transformed):
+    return transformed.channel_filter.valid(raw_bins(6))
+
+
+def broken_bins(transformed):
+    """Bins that miss nothing, what no feature needs, a sensor, two (twice), and all."""
+    bins = healthy_bins(transformed)
+    bins[1, 0, 50] = bins[2, 2, 50] = torch.nan
+    bins[3:5, 1:3, 50] = torch.inf
+    bins[5] = torch.nan
+    return bins
+
+
+BINS = pytest.mark.parametrize("bins_of", [healthy_bins, broken_bins])
+
+
+def assert_same(found, expected, most=1e-9):
+    for each, wanted in zip(found, expected, strict=True):
+        torch.testing.assert_close(each, wanted, rtol=most, atol=most)
+
+
+def gradient_of(transformed, bins):
+    """Of the sum of the scores; the patterns are looked at here, and bins go by them."""
+    bins = bins.clone().requires_grad_()
+    transformed.predict(bins).score.sum().backward()
+    return bins.grad
+
+
+@BINS
+def test_mapped_over_bins(bins_of, transformed):
+    bins = bins_of(transformed)
+    assert_same(torch.vmap(transformed.predict)(bins), transformed.predict(bins))
+    dead = ["SG2", "PVDF2"]
+    mapped = torch.vmap(lambda part: transformed.predict(part, masked_channels=dead))(bins)
+    assert_same(mapped, transformed.predict(bins, masked_channels=dead))
+
+
+@BINS
+def test_gradients_are_those_of_backward(bins_of, transformed):
+    bins = bins_of(transformed)
+    expected = gradient_of(transformed, bins)
+    assert expected.isfinite().all()
+    assert expected[0].abs().max() > 0
+
+    def score(part):
+        return transformed.predict(part).score.sum()
+
+    for take in (torch.func.grad(score), torch.vmap(torch.func.grad(score))):
+        torch.testing.assert_close(take(bins), expected, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_compiled_it_holds_for_other_bins(transformed, monkeypatch):
+    """With samples for features, as capturing the descriptors takes half a minute."""
+
+    def samples(bins):
+        return bins.index_select(-2, transformed.channel_index)[..., 7]
+
+    monkeypatch.setattr(transformed, "_features", samples)
+    monkeypatch.setattr(transformed.extractor, "backend", "torch")  # the engine would ask for none
+    torch.compiler.reset()
+    compiled = torch.compile(
+        transformed.predict, backend="eager"
+    )  # capture alone, without a compiler
+    for bins in (healthy_bins(transformed), broken_bins(transformed)):
+        assert_same(compiled(bins), transformed.predict(bins))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
+def test_a_detector_compiles():
+    transformed = with_gaussians(seed=SEED)
+    torch.compiler.reset()
+    compiled = torch.compile(transformed, backend="eager")
+    for bins in (healthy_bins(transformed), healthy_bins(transformed).float()):
+        assert_same([compiled(bins)], [transformed(bins)])
+
+
+# Autocast and other kinds of numbers -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("backend", ["native", "torch"])
+def test_autocast_changes_nothing(backend):
+    """Not even in a head of float32, whose products it would make in bfloat16."""
+    transformed = small_detector(backend=backend).float()
+    samples = raw_bins(20).float()
+    bins = transformed.channel_filter.valid(samples)
+    features = transformed.extractor(bins)
+    calls = (
+        (transformed.predict_raw, samples),
+        (transformed.score_raw, samples.clone().requires_grad_()),
+        (transformed, bins),
+        (transformed.pool, bins.clone().requires_grad_()),
+        (transformed.score_features, features),
+    )
+    for call, x in calls:
+        plain = call(x)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            narrowed = call(x)
+        torch.testing.assert_close(narrowed, plain, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("convert", "message"),
+    [
+        (torch.Tensor.bfloat16, r"got torch.bfloat16; convert with .float\(\) or .double\(\)"),
+        (torch.Tensor.half, "got torch.float16; convert"),
+        (torch.Tensor.int, "got torch.int32; convert"),
+        (torch.Tensor.numpy, "got numpy.ndarray; use torch.as_tensor"),
+        (torch.Tensor.tolist, "got list; use torch.as_tensor"),
+    ],
+)
+def test_what_is_no_tensor_of_volts_is_refused(convert, message):
+    transformed, samples = small_detector(), raw_bins(2)
+    for call in (transformed.predict_raw, transformed.score_raw):
+        with pytest.raises((TypeError, ValueError), match=message):
+            call(convert(samples))
+    for call in (transformed.predict, transformed, transformed.pool):
+        with pytest.raises((TypeError, ValueError), match=message):
+            call(convert(samples[..., 25:125]))
+
+
+# Inference mode ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["loaded", "moved"])
+def test_what_is_made_under_inference_mode_judges_what_is_missing(how, transformed, tmp_path):
+    """Once refused by torch: tensors of that mode do not count how often they are changed."""
+    bins = broken_bins(transformed)
+    transformed.save(tmp_path / "transformed.pt")
+    with torch.inference_mode():
+        made = SlipDetector.load(tmp_path / "transformed.pt")
+        if how == "moved":
+            made = made.float().double()
+        inside = made.predict(bins)
+    for found in (inside, made.predict(bins)):
+        torch.testing.assert_close(
+            found.score, transformed.predict(bins).score, rtol=1e-5, atol=1e-5
+        )
+
+
+@pytest.mark.parametrize("is_loaded", [False, True])
+def test_gradients_are_open_after_a_first_use_under_inference_mode(is_loaded, tmp_path):
+    transformed = with_gaussians(seed=SEED)
+    transformed.save(tmp_path / "transformed.pt")
+    with torch.inference_mode():
+        if is_loaded:
+            transformed = SlipDetector.load(tmp_path / "transformed.pt")
+        transformed.predict(broken_bins(transformed))
+    assert gradient_of(transformed, broken_bins(transformed)).isfinite().all()

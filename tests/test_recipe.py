@@ -1,5 +1,6 @@
 """Recipes, plans and passes: what is chosen, and that neither order nor workers matter."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,25 +8,50 @@ import pytest
 import torch
 from scipy.stats import ttest_ind
 from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
+from test_commands import TINY, composed
+from torch.nn.functional import binary_cross_entropy_with_logits
 
+from tactslip_torch import SlipDetector
 from tactslip_torch.analysis.pareto import ParetoSearch
+from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.splits import unseen4
+from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.groups import matching
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
-from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.calibration import Platt, calibration_from_dict, fit_platt
+from tactslip_torch.model.fit import TrainingBins, fit_machine, held_out_scores
+from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.missing_channels import RESOLUTION
 from tactslip_torch.training import plan as planning
 from tactslip_torch.training.learner import SlipLearner
-from tactslip_torch.training.plan import TrainingPass, plan_detector
+from tactslip_torch.training.plan import (
+    TrainingPass,
+    candidates,
+    choose_model,
+    fitted_selection,
+    plan_detector,
+)
 from tactslip_torch.training.recipe import (
+    FREE_CONSTANT,
     Recipe,
     balanced_accuracy,
     class_fractions,
     sample_weight,
+    scene_weights,
     select_features,
+)
+from tactslip_torch.training.tuning import (
+    SETTINGS,
+    GridPoint,
+    LearnedSettings,
+    Tuning,
+    grid_points,
+    grouped_loss,
+    least_loss,
+    tuning_bins,
 )
 
 NUM = 30
@@ -314,17 +340,6 @@ def test_only_what_matches_is_ranked_and_in_the_order_of_the_whole_ranking(most_
     assert plan.feature_filter == {"wanted": {"domain": ["freq"]}, **numbers}
 
 
-def test_more_features_than_match_are_cut_and_that_is_said(rng, caplog):
-    options = {"feature_filter": {"kind": "SG"}, "penalties": (0.1, 1.0)}
-    recipe, statistics = Recipe(num_features=[2, 60, 120], **options), told_apart(rng, SMALL_POOL)
-    plan = plan_detector(recipe, statistics, SMALL_POOL)
-    numbers = {"matching": 13, "num_features": [2, 13]}
-    assert plan.feature_filter == {"wanted": {"kind": ["SG"]}, **numbers}
-    assert [row["num_features"] for row in plan.validation] == [2, 2, 13, 13]
-    assert {SMALL_POOL.names[index].channel for index in plan.selection.selected} == {"SG1"}
-    assert "recipe.num_features=120 is cut to 13" in caplog.text
-
-
 def test_a_filter_is_never_silently_ignored(rng):
     recipe = Recipe(num_features=3, feature_filter={"kind": "SG"})
     with pytest.raises(ValueError, match=r"needs the names of features; hand over the pool"):
@@ -340,3 +355,324 @@ def test_a_filter_is_never_silently_ignored(rng):
         with pytest.raises(ValueError, match=f"^recipe.feature_filter: {message}") as caught:
             SlipLearner(maker.pool, maker.channel_filter, small_recipe(feature_filter=wanted))
         assert "\n" not in str(caught.value)
+
+
+HAND = HandLayout.from_rows(
+    {"name": f"PVDF{i}", "kind": "PVDF", "finger": f"f{i}", "segment": "distal"} for i in range(4)
+)
+FILM_POOL = FeaturePool(HAND, level=1)
+GROUPS = ("M1", "M2", "M3", "M4")
+
+
+def recipe(**changes):
+    base = {
+        "validation": "nested",
+        "use": ["channel", "pooled", "both"],
+        "pooling": ["mean", "std"],
+        "num_features": [None, 10],
+        "degree": [1, 2],
+        "ranking": "gd",
+        "compress": True,
+        "tail": 0.01,
+        "balance": "weights",
+        "tolerance": 0.005,
+        "penalties": [0.001, 0.1],
+    }
+    return Recipe(**base | changes)
+
+
+def sample_of(rng, groups=GROUPS, per=30):
+    """Slip is a louder channel, another one in each group: only pooling carries it over."""
+    bins, is_slip, group = [], [], []
+    for index in range(len(groups)):
+        for slip in (False, True):
+            x = rng.standard_normal((per, 4, 100)) * 10 ** rng.uniform(-0.3, 0.3, (per, 1, 1))
+            if slip:
+                x[:, index % 4] *= 30
+            bins.append(x)
+            is_slip += [slip] * per
+            group += [index] * per
+    features = FILM_POOL(torch.from_numpy(np.concatenate(bins))).float()
+    num = len(is_slip)
+    return SampledBins(
+        features,
+        torch.tensor(is_slip),
+        torch.tensor(group),
+        tuple(groups),
+        torch.arange(num) // 5,
+        tuple(f"r{i}" for i in range(num // 5)),
+        torch.arange(num),
+        torch.full((num,), 2.0, dtype=torch.float64),
+    )
+
+
+def chosen(sample, how):
+    return choose_model(how, FILM_POOL, sample)
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    sample = sample_of(np.random.default_rng(0))
+    return sample, chosen(sample, recipe())
+
+
+def test_pooled_features_win_where_another_channel_slips_in_each_group(drawn):
+    _, choice = drawn
+    assert choice.structure.use == "pooled"
+    assert choice.nested["mean"] > 0.95
+    best = max(row["mean"] for row in choice.rows)
+    of_channels = max(row["mean"] for row in choice.rows if row["use"] == "channel")
+    assert of_channels < best - 0.05
+    row = next(row for row in choice.rows if row.get("chosen"))
+    assert row["mean"] >= best - 0.005
+    assert set(row["balanced_accuracy"]) == set(GROUPS)
+    assert row["worst"]["at_best_threshold"] >= row["worst"]["balanced_accuracy"]
+
+
+def test_of_ties_the_simplest_with_the_strongest_penalty_is_taken(drawn):
+    everything = chosen(drawn[0], recipe(tolerance=0.99))
+    assert everything.structure == ("pooled", None, Polynomial(1, FREE_CONSTANT))
+    assert everything.penalty == min(row["penalty"] for row in everything.rows)
+
+
+def test_a_grid_that_ends_at_its_edge_is_extended_and_says_so(drawn):
+    few = recipe(use="pooled", num_features=None, degree=1, tolerance=0.2)
+    choice = chosen(drawn[0], few)
+    assert "ended at its edge and was extended by 0.0001" in choice.edge
+    assert min(row["penalty"] for row in choice.rows) < 0.001
+
+
+def test_what_is_done_to_a_group_does_not_reach_machines_without_it(drawn):
+    """Features and labels of a group change: its nested score alone does."""
+    sample, before = drawn
+    mine = sample.group == 2
+    flipped = torch.where(mine, ~sample.is_slip, sample.is_slip)
+    after = chosen(replace(sample, is_slip=flipped), recipe())
+    accuracy = before.nested["balanced_accuracy"]["M3"]
+    # the others' labels are as they were, so the machine is the same and every answer turns
+    assert after.nested["balanced_accuracy"]["M3"] == pytest.approx(1 - accuracy)
+    spoilt = sample.features.clone()
+    spoilt[mine] = 1e6 * torch.rand(spoilt[mine].shape)
+    single = recipe(use="both", num_features=10, degree=2, penalties=0.1)
+    rows = [chosen(replace(sample, features=x), single).rows[0] for x in (sample.features, spoilt)]
+    assert rows[0]["balanced_accuracy"]["M3"] != rows[1]["balanced_accuracy"]["M3"]
+
+
+def test_the_selection_of_a_choice_scales_what_it_names(drawn):
+    sample = drawn[0]
+    for structure in candidates(recipe(), 480):
+        found = fitted_selection(recipe(), FILM_POOL, sample, structure)
+        z = found(sample.features)
+        assert z.shape == (len(sample.features), found.size)
+        assert z.abs().max() <= 1
+        assert found.size == (structure.num_features or found.size)
+        assert (found.pooling is None) == (structure.use == "channel")
+
+
+def test_scenes_have_the_weight_that_is_asked_for(rng):
+    names = ("M1|arm_motion", "M1|paper", "M2|arm_motion", "M2|paper")
+    sample = sample_of(rng, names)
+    is_quiet = ~(sample.is_slip & torch.isin(sample.group, torch.tensor([0, 2])))
+    per_bin = ("features", "is_slip", "group", "recording", "bin_index", "sample_weight")
+    kept = {name: getattr(sample, name)[is_quiet] for name in per_bin}
+    quiet_arm = replace(sample, **kept)  # an arm that moves without slip
+    how = recipe(scene_weights={"arm_motion": 0.5})
+    weights = sample_weight(how, quiet_arm)
+    is_arm = torch.isin(quiet_arm.group, torch.tensor([0, 2]))
+    no_slip = ~quiet_arm.is_slip
+    assert float(weights[is_arm].sum() / weights[~is_arm & no_slip].sum()) == pytest.approx(0.5)
+    assert float(weights[no_slip].sum()) == pytest.approx(float(weights[~no_slip].sum()))
+    assert set(scene_weights(how, quiet_arm)) == {"arm_motion", "paper"}
+    with pytest.raises(ValueError, match="scene_weights names 'taps', of which there is no"):
+        sample_weight(recipe(scene_weights={"taps": 1.0}), quiet_arm)
+
+
+def test_one_group_cannot_be_left_out(rng):
+    with pytest.raises(ValueError, match="needs two with bins of both classes, got 1"):
+        chosen(sample_of(rng, ("M1",)), recipe())
+
+
+RECIPE = Recipe(
+    num_features=6, penalties=(0.01, 0.1, 1.0), compress=True, tail=0.01, balance="weights"
+)
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A maker, the sample and the plan of its training recordings, and their split."""
+    maker = small_maker(SmallSet(materials=("a", "b", "c", "d"), cycles=3))
+    split = unseen4(maker.source.ids, seen=["a", "b", "c"], unseen=["d"], train_fraction=0.7)[0]
+    statistics = TrainingStatistics(len(maker.pool.names), 60)
+    for recording in split.having("train"):
+        made = maker(recording, split)
+        statistics.update(str(recording), recording.material, made.features, made.is_slip)
+    return maker, statistics.sample.bins(), plan_detector(RECIPE, statistics), split
+
+
+@pytest.fixture(scope="module")
+def bins(small):
+    _, sample, plan, _ = small
+    return tuning_bins(sample, plan.selection.selected, sample_weight(RECIPE, sample), 12)
+
+
+@pytest.fixture
+def settings(small):
+    return LearnedSettings(SETTINGS, GridPoint(0.1, 0.5, 0.0, 0.0), small[2].selection.scaler)
+
+
+def tuned_by(small, sample, tuning):
+    maker, _, plan, _ = small
+    return tuning(plan, sample, [str(name) for name in maker.pool.names])
+
+
+def test_loss_is_the_mean_over_groups_and_classes_by_the_slope_of_least_loss(rng):
+    is_slip, groups = torch.arange(600) % 3 == 0, torch.arange(600) // 250
+    scores = torch.where(is_slip, 0.5, -0.5) + torch.from_numpy(rng.standard_normal(600)) + 0.3
+    found = grouped_loss(scores, is_slip, groups, Platt(1.7, -0.3))
+    losses, recalls = [], []
+    for group in range(3):
+        for kind in (True, False):
+            own = (groups == group) & (is_slip == kind)
+            truth = torch.full_like(scores[own], float(kind))
+            losses.append(binary_cross_entropy_with_logits(1.7 * scores[own] - 0.3, truth))
+            recalls.append(float(((scores[own] >= 0) == kind).double().mean()))
+    assert float(found.loss) == pytest.approx(float(torch.stack(losses).mean()), rel=1e-12)
+    assert found.balanced_accuracy == pytest.approx(sum(recalls) / 6)
+    fitted = grouped_loss(scores, is_slip, groups)
+    assert fitted.calibration.offset == 0
+    for factor in (0.9, 1.1):
+        other = Platt(factor * fitted.calibration.slope, 0.0)
+        assert grouped_loss(scores, is_slip, groups, other).loss > fitted.loss
+    assert grouped_loss(scores + 1.0, is_slip, groups).loss > fitted.loss + 0.05  # decides at 0
+
+
+def test_gradients_of_every_setting_are_those_of_differences(settings, bins):
+    with torch.no_grad():  # away from the start, where clipped values lie on the edge
+        settings.logs["scales"] -= 0.1
+
+    def loss(calibration=None):
+        z = settings.scaled(bins.features)
+        scores = held_out_scores(
+            z, bins.is_slip, bins.group, settings.penalty, settings.offset, bins.weights
+        )
+        return grouped_loss(scores, bins.is_slip, bins.group, calibration)
+
+    found = loss()
+    found.loss.backward()
+    checked = 0
+    for name, parameter in settings.named_parameters():
+        flat, slope = parameter.data.view(-1), parameter.grad.reshape(-1)
+        for place in {0, len(flat) // 2}:
+            kept, step, values = float(flat[place]), 1e-5, []
+            for sign in (1, -1):
+                flat[place] = kept + sign * step
+                with torch.no_grad():
+                    values.append(float(loss(found.calibration).loss))
+            flat[place] = kept
+            expected = (values[0] - values[1]) / (2 * step)
+            assert float(slope[place]) == pytest.approx(expected, rel=2e-3, abs=2e-6), name
+            checked += abs(expected) > 1e-5
+    assert checked >= 3
+
+
+def test_grid_is_of_refits_without_the_group(small, bins):
+    recipe = replace(RECIPE, penalties=(0.1, 1.0), offsets=(0.5, 2.0))
+    scaler = small[2].selection.scaler
+    points = grid_points(scaler, bins, recipe)
+    assert [point[:2] for point in points] == [(0.1, 0.5), (1.0, 0.5), (0.1, 2.0), (1.0, 2.0)]
+    z, scores = scaler(bins.features), torch.empty(len(bins.group), dtype=torch.float64)
+    for group in range(3):
+        own = bins.group == group
+        others = TrainingBins(z[~own], bins.is_slip[~own], bins.weights[~own])
+        scores[own] = fit_machine(others, 1.0, Polynomial(2, 2.0))(z[own])
+    expected = grouped_loss(scores, bins.is_slip, bins.group)
+    assert points[3].loss == pytest.approx(float(expected.loss), rel=1e-6)
+    assert least_loss(points).loss == min(point.loss for point in points)
+    two = bins.where(bins.group != 2)
+    backwards = two._replace(is_slip=two.is_slip ^ (two.group == 1))  # wrong of the other group
+    with pytest.raises(ValueError, match="tuning has no place to start: at every C and c"):
+        grid_points(scaler, backwards, recipe)
+
+
+def test_the_step_taken_is_that_of_least_mean_loss_of_held_out_groups(small):
+    tuned = tuned_by(small, small[1], Tuning(bins=10, steps=4, patience=2))
+    found = tuned.metadata
+    held = torch.tensor([[row["held_loss"] for row in group["history"]] for group in found["held"]])
+    assert found["steps"] == int(held.mean(0).argmin())
+    assert len(found["history"]) == held.shape[1]
+    for place, group in enumerate(found["held"]):
+        losses = [row["loss"] for row in group["history"]]
+        assert min(losses) < losses[0]
+        steps = int(torch.cat([held[:place], held[place + 1 :]]).mean(0).argmin())
+        assert group["tuned"]["steps"] == steps
+        assert group["tuned"]["loss"] == group["history"][steps]["held_loss"]
+        assert group["grid"]["loss"] == group["history"][0]["held_loss"]
+    assert {group["held"] for group in found["held"]} == {"a", "b", "c"}
+    assert (found["penalty"], found["offset"]) == (tuned.penalty, tuned.offset)
+
+
+def test_a_held_out_group_does_not_change_its_descent(small):
+    sample = small[1]
+    features = sample.features.clone()
+    features[sample.group == 2] *= 1.03
+    tuning = Tuning(learn=["penalty", "scales"], bins=8, steps=2, patience=3)
+    first, second = (
+        tuned_by(small, replace(sample, features=x), tuning).metadata["held"][2]
+        for x in (sample.features, features)
+    )
+    assert [row["loss"] for row in first["history"]] == [row["loss"] for row in second["history"]]
+    assert first["history"][0]["held_loss"] != second["history"][0]["held_loss"]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"learn": ["bias"]}, "tuning.learn must be a list of some of penalty, offset"),
+        ({"learn": []}, "tuning.learn must be a list"),
+        ({"learn": "penalty"}, "tuning.learn must be a list"),
+        ({"steps": 0}, "tuning.steps must be a positive whole number, got 0"),
+        ({"bins": "abc"}, "tuning.bins must be a positive whole number, got 'abc'"),
+        ({"rate": float("nan")}, "tuning.rate must be a positive finite number, got nan"),
+    ],
+)
+def test_bad_tuning_is_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        Tuning(**values)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"degree": 3}, "needs recipe.kernel=polynomial recipe.degree=2"),
+        ({"offsets": 0.0}, r"needs recipe\.offsets above 0"),
+        ({}, "needs three groups to hold some out, got a, b"),
+    ],
+    ids=str,
+)
+def test_what_could_not_be_tuned_is_refused_beforehand(small, changes, message):
+    split = small[3]
+    if not changes:
+        roles = {r: role for r, role in split.roles.items() if r.material != "c"}
+        split = replace(split, roles=roles)
+    with pytest.raises(ValueError, match=message):
+        Tuning().check(replace(RECIPE, **changes), split)
+    Tuning().check(replace(RECIPE, group_by="cycle"), small[3])
+
+
+@pytest.mark.slow
+def test_training_tunes_and_keeps_the_detectors_that_it_began_with(tmp_path):
+    options = ("recipe=robust", "recipe.num_features=6", "recipe.group_by=cycle", "data.seed=0")
+    quick = ("baselines=false", "export=false", "cache=off", "coverage=null")
+    tuning = ("tuning=gradient", "tuning.bins=6", "tuning.steps=2", "tuning.learn=[penalty]")
+    train(composed(*TINY, *options, *quick, *tuning), tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    found = metrics["tuning"]
+    assert found["learned"] == ["penalty"]
+    assert metrics["penalty"] == pytest.approx(found["penalty"])
+    assert set(found["splits"]) == {"recipe", "grid"}
+    for name, penalty in (("start", found["start"]["penalty"]), ("detector", found["penalty"])):
+        detector = SlipDetector.load(tmp_path / f"{name}.pt")
+        assert detector.info["penalty"] == pytest.approx(penalty)
+    assert detector.info["tuned"]["steps"] == found["steps"]
+    assert (tmp_path / "grid.pt").exists()
+    assert (tmp_path / "tuning.png").stat().st_size > 10_000

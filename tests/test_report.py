@@ -1,11 +1,16 @@
-"""Tables and figures of a run: what they say, of what, and that files are written whole."""
+"""Tables and figures: what they say, of what, and that files are written whole."""
 
+import csv
 import json
+import math
 
 import numpy as np
 import pytest
 import torch
 from drawing import assert_png, rows_of
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.colors import to_hex
 
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.events import (
@@ -17,6 +22,25 @@ from tactslip_torch.onset.events import (
 )
 from tactslip_torch.report import published
 from tactslip_torch.report.metrics import answer_metrics, bin_metrics, split_metrics
+from tactslip_torch.report.onset import (
+    ALARM,
+    REST,
+    SLIP,
+    Envelope,
+    Traces,
+    alarm_outcome,
+    onset_figure,
+    onsets_table,
+    view_of,
+)
+from tactslip_torch.report.recordings import (
+    DrawnRecording,
+    Trial,
+    dataset_figure,
+    ranges_table,
+    signals_figure,
+    trials_table,
+)
 from tactslip_torch.report.results import (
     PAPER_LINE,
     answers_figure,
@@ -31,11 +55,11 @@ from tactslip_torch.report.results import (
     selected_features_figure,
     splits_table,
     tuning_figure,
-    tuning_tables,
     validation_figure,
     write_results,
 )
 from tactslip_torch.report.style import table
+from tactslip_torch.report.sweep import sweep_table, write_sweep
 
 REASON = "nobody looked"
 
@@ -189,8 +213,8 @@ def test_published_numbers_agree_with_each_other():
 def test_the_papers_numbers_stand_beside_its_own_scenes_alone(drawn, tmp_path, scenes, is_papers):
     metrics = {"simulated": True, "splits": {"test": scores_of(scenes=scenes)}}
     elsewhere = metrics | {"is_papers_hand": False}
-    for given in (metrics, elsewhere):
-        confusion_figure(given, tmp_path / "confusion.png")
+    for each in (metrics, elsewhere):
+        confusion_figure(each, tmp_path / "confusion.png")
     own, other = (figure.axes[0].get_xlabel() for figure in drawn)
     assert ("paper: non-slip 93.8" in own) == is_papers
     assert other == "prediction\n\n"
@@ -205,15 +229,6 @@ def test_the_papers_numbers_stand_beside_its_own_scenes_alone(drawn, tmp_path, s
         )
         expected += [f"scene {scene}" for scene in scenes]
     assert sorted(rows_of(line)[0][-6] for line in lines[2:]) == sorted(expected)
-
-
-def test_tuning_says_what_was_learned():
-    metrics = metrics_of(tuning=tuning())
-    metrics["splits"] = {"test": metrics["splits"]["test"]}
-    (text,) = tuning_tables(metrics)
-    assert "tuned by gradient" in text
-    assert "1 steps from C=1, c=0.5 to C=2, c=0.25; learned: penalty, offset, scales" in text
-    assert tuning_tables(metrics_of()) == []
 
 
 def test_reliability_and_prediction_sets_have_a_row_for_each_role():
@@ -333,3 +348,379 @@ def test_results_have_a_table_and_a_figure_of_all_there_is(drawn, tmp_path, caps
     print_results(few, [])
     assert REASON in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "few").iterdir()} == {"metrics.json", "confusion.png"}
+
+
+RATE_HZ, HOP_S = 2000.0, 0.01
+seeds = st.integers(0, 2**32 - 1)
+
+
+def pieces(rng, total, most):
+    """Cuts of 0 to ``total`` into pieces of 0 to ``most``."""
+    at = 0
+    while at < total:
+        size = int(rng.integers(0, most + 1))
+        yield slice(at, at + size)
+        at += size
+
+
+# While a stream passes -------------------------------------------------------------------------
+
+
+@given(
+    num_samples=st.integers(0, 400),
+    num_segments=st.integers(1, 60),
+    seed=seeds,
+    lost=st.sampled_from([0.0, 0.3, 1.0]),
+)
+def test_an_envelope_of_pieces_has_every_extreme_in_order(num_samples, num_segments, seed, lost):
+    rng = np.random.default_rng(seed)
+    values = rng.standard_normal((3, num_samples))
+    values[rng.random(values.shape) < lost] = rng.choice([np.nan, np.inf, -np.inf])
+    kept = Envelope(3, num_samples, num_segments)
+    for piece in pieces(rng, num_samples, 50):
+        kept.add(values[:, piece])
+    numbers, seen = kept.points()
+    assert seen.shape == (3, len(numbers))
+    assert len(numbers) <= 2 * num_segments
+    assert (np.diff(numbers) >= 0).all()
+    finite = np.where(np.isfinite(values), values, np.nan)
+    if num_samples <= 2 * num_segments:
+        np.testing.assert_array_equal(seen, finite)
+        return
+    size = -(-num_samples // num_segments)
+    for start in range(0, num_samples, size):
+        part = finite[:, start : start + size]
+        expected = np.stack([np.fmin.reduce(part, 1), np.fmax.reduce(part, 1)], 1)
+        np.testing.assert_array_equal(seen[:, numbers == start], expected)
+
+
+@pytest.mark.parametrize("view", [(0.0, 1.2), (0.5, 0.8)])
+def test_traces_take_what_is_in_view_and_the_status_it_begins_with(rng, view):
+    """Of pieces of any length."""
+    samples, times = rng.standard_normal((3, 4000)), 0.065 + HOP_S * np.arange(190)
+    columns = np.stack([rng.random(190), *(rng.random((3, 190)) < 0.5), rng.random(190)])
+    traces = Traces("abc", RATE_HZ, HOP_S, view)
+    for piece in pieces(rng, 4000, 300):
+        traces.add_samples(samples[:, piece])
+    for piece in pieces(rng, 190, 9):
+        traces.add_decisions(times[piece], *columns[:, piece])
+    first, last = (round(edge * RATE_HZ) for edge in view)
+    np.testing.assert_allclose(traces.samples()[0], np.arange(first, last) / RATE_HZ)
+    np.testing.assert_array_equal(traces.samples()[1], samples[:, first:last])
+    seen = (times > view[0] - 0.006) & (times < view[1])
+    decided_s, decided = traces.decisions()
+    np.testing.assert_allclose(decided_s, times[seen])
+    np.testing.assert_array_equal(decided[[0, 1, 3, 4]], columns[[0, 1, 3, 4]][:, seen])
+    np.testing.assert_array_equal(decided[2], 1 - columns[2, seen])
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        (None, (0.0, 9.5)),
+        ([1, 2.5], (1.0, 2.5)),
+        ([-3, 99], (0.0, 9.5)),
+        *((given, r"view must be \[start, end\] in seconds") for given in
+          ("1", 3.0, [1], [1, 2, 3], ["a", "b"], [True, 2], [None, 1])),
+        *((given, r"shows nothing of 9\.5 s") for given in
+          ([2, 1], [3, 3], [10, 11], [-2, -1], [math.nan, 3.0])),
+    ],
+)  # fmt: skip
+def test_a_view_lies_within_the_recording_or_is_refused(given, wanted):
+    if isinstance(wanted, str):
+        with pytest.raises(ValueError, match=wanted):
+            view_of(given, 9.5)
+    else:
+        assert view_of(given, 9.5) == wanted
+
+
+# The figure ------------------------------------------------------------------------------------
+TRUTH = {"onsets": [{"onset_s": 0.42}], "sliding_s": [(0.42, 1.1)]}
+ALARMS = [{"alarm_s": 0.5, "onset_s": 0.43}, {"alarm_s": 1.25, "onset_s": 1.23}]
+
+
+def traces_of(films, view=(0.0, 1.4), num_decisions=130):
+    """Slip is decided from 0.5 to 1.2 s, 0.2 s of it not valid; from 0.9 to 1 s it abstains."""
+    times = np.round(0.07 + HOP_S * np.arange(num_decisions), 6)
+    slip = (times >= 0.5) & (times < 1.2)
+    valid, abstains = (times < 0.6) | (times >= 0.8), (times >= 0.9) & (times < 1.0)
+    names = [f"PVDF{i}" for i in range(1, 1 + len(films))]
+    traces = Traces(names, RATE_HZ, HOP_S, view)
+    traces.add_samples(films)
+    score = np.where(times < 0.2, math.nan, 2.0 * slip)  # not before there is a floor
+    traces.add_decisions(times - 1e-9, 0.9 * slip + 0.05, slip, valid, abstains, score)
+    return traces
+
+
+@pytest.fixture
+def films(rng):
+    return np.arange(3)[:, None] + rng.standard_normal((3, 2800))
+
+
+@pytest.fixture
+def draw(drawn, tmp_path, films):
+    """Draws traces; their figure."""
+
+    def drawing(traces=None, *, alarms=ALARMS, truth=TRUTH, title="", **options):
+        path, traces = tmp_path / "onsets.png", traces or traces_of(films)
+        entry = {"alarms": alarms, "truth": truth}
+        onset_figure(traces, entry, path, title=title, **options)
+        assert_png(path)
+        return drawn[-1]
+
+    return drawing
+
+
+def marks_of(figure):
+    """By panel and name, the times of lines and the ends of shaded segments."""
+    found = {}
+    for place, axes in enumerate(figure.axes):
+        for part in axes.collections:
+            boxes = [path.vertices[:, 0] for path in part.get_paths()]
+            ends = [(float(box.min()), float(box.max())) for box in boxes]
+            times = [low if low == high else (low, high) for low, high in ends]
+            found[place, part.get_gid()] = times
+    return found
+
+
+def legend_of(figure):
+    return {text.get_text() for text in figure.legends[0].get_texts()}
+
+
+def test_marks_stand_where_things_happened(draw):
+    figure = draw(title="SIMULATED recording a.npz")
+    films, _, chance = figure.axes
+    assert figure.get_suptitle() == "SIMULATED recording a.npz"
+    expected = {
+        **{(place, "invalid"): [(0.6, 0.8)] for place in range(3)},
+        (0, "slip"): [(0.5, 1.2)],
+        (0, "alarm"): [0.5, 1.25],
+        (0, "onset"): [0.42],
+        (1, f"decided {REST}"): [(0.07, 1.4)],
+        (1, f"decided {SLIP}"): [(0.5, 1.2)],
+        (1, f"truth {REST}"): [(0.0, 1.4)],
+        (1, f"truth {SLIP}"): [(0.42, 1.1)],
+        (2, "onset"): [0.42],
+        (2, "estimate"): [0.43, 1.23],
+        (2, "abstains"): [(0.9, 1.0)],
+    }
+    assert marks_of(figure) == {key: list(map(pytest.approx, of)) for key, of in expected.items()}
+    (markers,) = [line for line in films.lines if line.get_marker() == "v"]
+    assert list(markers.get_xdata()) == [0.5, 1.25]
+    assert to_hex(markers.get_color()) == ALARM.lower()
+    np.testing.assert_allclose(chance.lines[0].get_ydata().max(), 0.95)
+    assert chance.lines[0].get_drawstyle() == "steps-post"  # a decision holds until the next
+    assert legend_of(figure) >= {"decided: slip", "onset, true", "not valid", "abstains"}
+
+
+def test_an_onset_classifier_has_a_panel_with_its_threshold(draw):
+    score, threshold = draw(onset_threshold=1.5).axes[3].lines
+    times, values = (np.asarray(x) for x in (score.get_xdata(), score.get_ydata()))
+    assert np.nanmin(times[np.isfinite(values)]) == pytest.approx(0.2, abs=HOP_S)
+    assert (np.nanmax(values), list(threshold.get_ydata())) == (2.0, [1.5, 1.5])
+
+
+@pytest.mark.parametrize("level", [np.nan, 0.0, 3e38])
+@pytest.mark.parametrize("num_decisions", [0, 1])
+def test_dead_films_and_few_decisions_are_drawn_without_a_warning(draw, level, num_decisions):
+    films = np.stack([np.full(200, level), np.zeros(200)])
+    draw(traces_of(films, (0.0, 0.1), num_decisions), alarms=[])
+
+
+# Tables ----------------------------------------------------------------------------------------
+
+
+def entry(name="a.npz", *, truth=True, **changes):
+    onsets = [
+        {"onset_s": 1.0, "outcome": "found", "delay_s": 0.05},
+        {"onset_s": 3.0, "outcome": "early", "delay_s": None},
+        {"onset_s": 5.0, "outcome": "missed", "delay_s": None},
+    ]
+    known = {"onsets": onsets, "false_alarms_s": [0.3], "early_s": 0.2}
+    alarms = [
+        {"alarm_s": t, "onset_s": t - 0.01, "end_s": t + 0.1, "score": 1.0}
+        | {"probability": 0.9, "statistic": 2.0, "is_valid": t != 1.5, "raised_by": "onset"}
+        for t in (0.3, 1.05, 1.5, 2.9, 5.7)
+    ]
+    if truth:
+        alarms = [alarm | alarm_outcome(alarm["alarm_s"], known) for alarm in alarms]
+    values = {
+        "file": name,
+        "material": "M1",
+        "simulated": truth,
+        "duration_s": 6.0,
+        "decisions": {"number": 600, "invalid": 3},
+        "alarms": alarms,
+        "truth": known if truth else None,
+    }
+    return values | changes
+
+
+def content(*entries, **changes):
+    found = {"recordings": list(entries), "events": None, "simulated": True}
+    return found | changes
+
+
+def test_every_alarm_has_its_outcome():
+    outcomes = [(a["outcome"], a["true_onset_s"], a["delay_s"]) for a in entry()["alarms"]]
+    assert outcomes == [
+        ("false", None, None),
+        ("found", 1.0, pytest.approx(0.05)),
+        ("repeated", 1.0, pytest.approx(0.5)),
+        ("early", 3.0, pytest.approx(-0.1)),
+        ("late", 5.0, pytest.approx(0.7)),
+    ]
+
+
+def test_the_table_says_what_is_simulated_what_is_wrong_and_what_it_leaves_out():
+    lines = onsets_table(content(entry())).splitlines()
+    assert lines[0].startswith("SIMULATED")
+    assert lines[2].split() == ["a.npz", "0.300", "0.290", "0.90", "onset", "yes", *"--", "false"]
+    assert lines[3].split() == ["1.050", "1.040", "0.90", "onset", "yes", "1.000", "0.050", "found"]
+    assert lines[4].split()[4] == "NO"
+    assert lines[6].split() == [*"-----", "5.000", "-", "missed"]
+    many = onsets_table(content(*[entry()] * 20, simulated=False)).splitlines()
+    assert many[-1] == "and 80 more, see onsets.csv"
+    assert "SIMULATED" not in many[0]
+    assert onsets_table(content(simulated=False)) == "no alarm, and no slip missed"
+
+
+RUNS = [
+    ("seed=0", {"test/accuracy": 0.9, "test/balanced_accuracy": 0.8}),
+    ("seed=1", {"test/accuracy": 0.7, "test/balanced_accuracy": 0.6}),
+]
+
+
+def test_runs_stand_beside_each_other_with_mean_and_deviation(tmp_path):
+    lines = sweep_table(RUNS, simulated=True).splitlines()
+    assert "SIMULATED" in lines[0]
+    assert lines[2].split() == ["seed=0", "90.00", "80.00"]
+    assert lines[4].split() == ["mean", "80.00", "70.00"]
+    assert lines[5].split() == ["standard", "deviation", "10.00", "10.00"]
+    write_sweep(RUNS, tmp_path, simulated=True)
+    assert (tmp_path / "runs.png").read_bytes().startswith(b"\x89PNG")
+    with (tmp_path / "runs.csv").open() as file:
+        assert list(csv.reader(file))[2] == ["seed=1", "0.7", "0.6"]
+
+
+HAND = HandLayout.paper24()
+CHANNELS = HAND.to_rows()
+SIGNAL_HZ = 2000.0
+GAUGES, FILMS = HAND.names[:14], HAND.names[14:]
+STROKES = {"onsets_s": (2.0, 5.0), "slip_s": ((2.0, 4.0), (5.0, 6.5)), "non_slip_s": ((6.75, 7.5),)}
+
+
+def row(title="M1", num_samples=16000, seed=0, **truth):
+    """Noise around an offset per channel, with a burst of one sample in each."""
+    rng = np.random.default_rng(seed)
+    volts = 0.01 * rng.standard_normal((24, num_samples)) + np.linspace(-1, 2, 24)[:, None]
+    volts[np.arange(24), rng.integers(0, num_samples, 24)] += 0.7
+    return DrawnRecording(title, torch.from_numpy(volts), SIGNAL_HZ, **truth)
+
+
+@pytest.fixture
+def draw_signals(drawn, tmp_path):
+    """Draws recordings; their figure."""
+
+    def drawing(*rows, channels=CHANNELS, views=None):
+        signals_figure(rows, channels, tmp_path / "a.png", title="SIMULATED", views=views)
+        assert_png(tmp_path / "a.png")
+        return drawn[-1]
+
+    return drawing
+
+
+def lines_of(axes):
+    """Lines of channels: those with a channel's name."""
+    return {line.get_label(): line for line in axes.lines if line.get_label() in HAND.names}
+
+
+def test_gauges_stand_left_films_right_one_recording_a_row_with_every_extreme(draw_signals):
+    recording = row()
+    figure = draw_signals(recording, row("M6", seed=1))
+    panels = np.array(figure.axes).reshape(2, 3)
+    for (measured, gauges, films), name in zip(panels, ("M1", "M6"), strict=True):
+        assert measured.get_ylabel() == f"{name}\nvolts"
+        assert tuple(lines_of(measured)) == tuple(lines_of(gauges)) == GAUGES
+        assert tuple(lines_of(films)) == FILMS
+        assert [label.get_text() for label in films.get_yticklabels()] == list(FILMS)
+        assert (np.diff(films.get_yticks()) == -1).all()  # the first lane on top
+    assert figure.get_suptitle() == "SIMULATED"
+    scales = {}
+    for own, name in zip(recording.samples.numpy(), HAND.names, strict=True):
+        if name in GAUGES:
+            line = lines_of(panels[0, 0])[name]
+            assert np.isin(line.get_ydata(), own).all()
+        panel = panels[0, 1 if name in GAUGES else 2]
+        lane = lines_of(panel)[name].get_ydata()
+        scale = np.ptp(own) / np.ptp(lane)  # the burst is there, all lanes on one scale
+        assert scale == pytest.approx(scales.setdefault(panel, scale), rel=1e-9)
+        assert panel.get_title(loc="right") == f"lanes {scale:.2g} V apart"
+        assert len(lane) < len(own) / 5
+
+
+@pytest.mark.parametrize(
+    ("view", "onsets", "spans"),
+    [(None, [2.0, 5.0], [(2.0, 4.0), (5.0, 6.5), (6.75, 7.5)]), ((3.0, 4.5), [], [(3.0, 4.0)])],
+)
+def test_onsets_are_marked_and_slides_and_handling_shaded_as_far_as_in_view(
+    draw_signals, view, onsets, spans
+):
+    figure = draw_signals(row(**STROKES), views=view and [view])
+    for axes in figure.axes:
+        marks = [line for line in axes.lines if line.get_linestyle() == "-."]
+        assert [line.get_xdata()[0] for line in marks] == onsets
+        ends = [(p.get_x(), p.get_x() + p.get_width()) for p in axes.patches]
+        assert ends == [pytest.approx(span) for span in spans]
+        assert axes.get_xlim() == (view or (0.0, 8.0))
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert words[:5] == ["little", "ring", "middle", "index", "thumb"]
+    assert words[-3:] == ["onset of slip", "slip", "non-slip"]
+
+
+@pytest.mark.parametrize(
+    ("truth", "stroke", "view"),
+    [
+        ({"onsets_s": (2.5, 5.0)}, 1, (0.5, 5.5)),
+        ({"onsets_s": (2.5, 5.0)}, 7, (3.0, 8.0)),
+        ({"onsets_s": (1.0, 7.0)}, 1, (0.0, 4.0)),
+        ({"onsets_s": (4.0,), "non_slip_s": ((1.0, 2.0),)}, 1, (2.0, 7.0)),
+        ({"non_slip_s": ((2.5, 3.0), (4.5, 5.0))}, 2, (2.5, 7.5)),
+        ({}, 1, (0.0, 8.0)),
+    ],
+)
+def test_five_seconds_around_a_stroke(truth, stroke, view):
+    assert row(**truth).around(stroke, 2.0, 3.0) == view
+
+
+# What a set holds --------------------------------------------------------------------------------
+TRIALS = [Trial("wood", "paper", 8.0, 3.5, 0.75, 2), Trial("iron", "paper", 9.0, 10.0, 0.0, 1)]
+
+
+@pytest.mark.parametrize("level", [1.0, np.nan])
+def test_a_set_is_drawn_by_material_above_the_traces_of_a_recording(drawn, tmp_path, level):
+    recording = row(**STROKES)
+    recording.samples[:] *= level
+    names = [f"E{i}" for i in range(40)]
+    wide = DrawnRecording("w/0", torch.cat([recording.samples] * 2)[:40], SIGNAL_HZ, **STROKES)
+    for example, of in ((recording, HAND.names), (wide, names)):
+        dataset_figure(TRIALS, example, of, tmp_path / "a.png", title="a set")
+    bars, traces = drawn[0].axes
+    assert [label.get_text() for label in bars.get_yticklabels()] == ["wood", "iron"]
+    widths = [patch.get_width() for patch in bars.patches]
+    assert widths == pytest.approx([3.5, 0.75, 3.75, 10.0, 0.0, 0.0])  # labelled more than there is
+    assert len(traces.get_yticklabels()) == 24
+    assert "24 of 40 channels" in drawn[1].axes[1].get_title("left")
+
+
+def test_tables_of_a_set():
+    both = trials_table([*TRIALS, Trial("wood", "taps", 4.0, 0.0, 0.0, 0)], simulated=True)
+    assert both.startswith("SIMULATED")
+    rows = [line.split() for line in both.splitlines()]
+    assert ["wood", "2", "4.00", "8.00", "12.0", "2", "3.5", "0.8"] in rows
+    assert ["taps", "1", "4.00", "4.00", "4.0", "0", "0.0", "0.0"] in rows
+    assert len(trials_table(TRIALS[:1], simulated=False).splitlines()) == 2  # no sum of one row
+    ranges = np.stack([np.full(24, -1.5), np.arange(24.0)], 1)
+    ranges[14:] = np.nan
+    rows = [line.split() for line in ranges_table(CHANNELS, ranges, "V").splitlines()]
+    assert rows[1:] == [["SG", "14", "-1.5", "13"], ["PVDF", "10", "nan", "nan"]]

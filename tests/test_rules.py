@@ -1,4 +1,4 @@
-"""Sequential rules and the latch against plain loops: any cut, gradients, extremes."""
+"""Sequential rules, the latch, rates with intervals and the threshold for a target."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from oracles import assert_manners
+from scipy.stats import beta, chi2
 from torch import Tensor
 
+from tactslip_torch.onset import thresholds
 from tactslip_torch.onset.rules import (
     NOTHING_YET,
     RULES,
@@ -25,6 +26,13 @@ from tactslip_torch.onset.rules import (
     Rule,
     latch,
     rule_from_dict,
+)
+from tactslip_torch.onset.thresholds import (
+    Budget,
+    alarm_rate,
+    false_alarms,
+    lowest_threshold,
+    poisson_interval,
 )
 
 LIST = (
@@ -88,13 +96,6 @@ def test_equals_the_definition(rule: Rule, dtype, tol, num, rng: np.random.Gener
 
 
 @RULE
-def test_manners(rule: Rule, rng: np.random.Generator, device: torch.device) -> None:
-    llr = torch.from_numpy(3 * rng.standard_normal((4, 30))).to(device)
-    assert_manners(lambda x: scan(rule, x), llr)
-    assert_manners(lambda x: scan(rule, x), llr.float(), rtol=1e-5)
-
-
-@RULE
 @DTYPE
 @given(data=st.data())
 def test_any_cut_gives_the_same_bits(rule: Rule, dtype: torch.dtype, data: st.DataObject) -> None:
@@ -115,15 +116,6 @@ def test_any_cut_gives_the_same_bits(rule: Rule, dtype: torch.dtype, data: st.Da
     if not shape:
         start = rule.start(llr[0]).tolist()
         assert rule.scan_row(llr.tolist(), start, llr.numpy().dtype.type)[0] == whole.tolist()
-
-
-@RULE
-def test_a_state_holds_nothing_but_itself(rule: Rule) -> None:
-    # a view would keep the whole of every piece alive
-    llr = torch.randn(2, 500, generator=torch.Generator().manual_seed(0))
-    _, state = rule.scan(llr, rule.start(llr[:, 0]))
-    if state.numel():
-        assert state.untyped_storage().nbytes() == state.numel() * state.element_size()
 
 
 # ------------------------------------------------------------------------------------- gradients
@@ -190,15 +182,6 @@ def test_no_such_rule(plain: dict, said: str) -> None:
     assert "\n" not in str(error.value)
 
 
-@RULE
-def test_a_state_of_other_streams_is_refused(rule: Rule) -> None:
-    state = rule.start(torch.zeros(3))
-    with pytest.raises(ValueError, match=r"expected llr \[\*, T\].*got \(2, 7\)"):
-        rule.scan(torch.zeros(2, 7), state)
-    with pytest.raises(ValueError, match="expected llr"):
-        rule.scan(torch.tensor(1.0), state)
-
-
 # ===================================================================================== the latch
 
 
@@ -259,3 +242,178 @@ def test_what_is_no_number_is_neither_above_nor_below() -> None:
     assert np.flatnonzero(alarms).tolist() == [0, 7]
     values = [-math.inf, math.inf, -math.inf, math.inf]
     assert latch(values, math.inf, rearm=1, refractory=0)[0] == [False, True] * 2
+
+
+# ---------------------------------------------------------------------------- the Poisson interval
+@pytest.mark.parametrize("count", [0, 1, 37, 100_000])
+@pytest.mark.parametrize("level", [0.5, 0.999])
+def test_poisson_interval_is_that_of_chi_square(count: int, level: float) -> None:
+    tail = (1 - level) / 2
+    low = chi2.ppf(tail, 2 * count) / 2 if count else 0.0
+    high = chi2.isf(tail, 2 * count + 2) / 2
+    assert poisson_interval(count, level) == pytest.approx((low, high), rel=1e-9, abs=1e-300)
+
+
+# ------------------------------------------------------------------------------------ the rate
+
+
+def bootstrap(counts: np.ndarray, hours: np.ndarray, level: float) -> np.ndarray:
+    source = np.random.default_rng(5)
+    drawn = source.integers(len(counts), size=(20_000, len(counts)))
+    return np.quantile(
+        counts[drawn].sum(1) / hours[drawn].sum(1), [(1 - level) / 2, (1 + level) / 2]
+    )
+
+
+def test_interval_holds_the_bootstrap_and_that_of_clusters() -> None:
+    # in ten recordings all alarms, in ninety none
+    counts = np.array([12, 9, 1, 30, 5, 8, 14, 3, 2, 6] + [0] * 90)
+    hours = np.linspace(0.5, 1.5, 100)
+    found = alarm_rate(counts.tolist(), hours.tolist(), level=0.9)
+    drawn = bootstrap(counts, hours, 0.9)
+    total = counts.sum()
+    expected = total * hours / hours.sum()
+    size = ((counts - expected) ** 2).sum() / total * 100 / 99
+    low, high = chi2.ppf(0.05, 2 * total / size) / 2, chi2.isf(0.05, 2 * total / size + 2) / 2
+    assert found.low == pytest.approx(min(drawn[0], low * size / hours.sum()), rel=0.05)
+    assert found.high == pytest.approx(max(drawn[1], high * size / hours.sum()), rel=0.05)
+    assert found.high > 1.3 * poisson_interval(int(total), 0.9)[1] / hours.sum()
+
+
+@pytest.mark.parametrize(
+    ("counts", "hours", "said"),
+    [
+        ([1, 2], [1.0], r"one count and one number of hours .* got \(2,\) and \(1,\)"),
+        ([[1]], [[1.0]], "one count and one number of hours"),
+        ([], [], "some time must have been watched, got 0 alarms in 0 h"),
+        ([0], [0.0], "some time must have been watched"),
+        ([-1, 3], [1.0, 1.0], "must not be negative"),
+        ([1, 3], [-1.0, 2.0], "must not be negative"),
+        ([1], [math.nan], "some time must have been watched"),
+    ],
+)
+def test_rate_of_nonsense(counts, hours, said: str) -> None:
+    with pytest.raises(ValueError, match=said) as error:
+        alarm_rate(counts, hours)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
+def test_bounds_are_those_of_garwood_and_of_clopper_and_pearson(confidence: float) -> None:
+    rate, share = Budget("held", 1.0, False, confidence), Budget("taps", 0.1, True, confidence)
+    for alarms in (0, 1, 7, 199):
+        upper = chi2.isf(1 - confidence, 2 * alarms + 2) / 2
+        assert rate.bound(alarms, 2.5) == pytest.approx(upper / 2.5, rel=1e-9)
+        upper = beta.isf(1 - confidence, alarms + 1, 200 - alarms)
+        assert share.bound(alarms, 200) == pytest.approx(upper, rel=1e-9)
+    assert rate.bound(0, 0.0) == share.bound(0, 0) == math.inf
+    assert share.bound(200, 200) == share.bound(300, 200) == 1  # several alarms a knock
+
+
+@pytest.mark.parametrize(
+    ("budget", "amount", "match"),
+    [
+        (
+            Budget("machine", 10.0),
+            0.29,
+            r"0\.29 h of machine cannot show a rate of at most 10 .* 0\.3 h",
+        ),
+        (
+            Budget("held", 1.0, confidence=0.9),
+            0.0,
+            r"0 h of held .* give at least 2\.303 h, or a la",
+        ),
+        (Budget("taps", 0.01, True), 298, r"298 knocks of taps cannot show a share .* 299 knocks"),
+    ],
+)
+def test_too_little_to_show_a_budget_is_refused_with_what_would_do(budget, amount, match) -> None:
+    with pytest.raises(ValueError, match=match) as error:
+        budget.allowed(amount)
+    assert "\n" not in str(error.value)
+    least = float(str(error.value).split("at least ")[1].split()[0])
+    assert budget.allowed(least) == 0
+
+
+@pytest.mark.parametrize(
+    ("numbers", "match"),
+    [
+        ({"limit": 0.0}, "onset.budget of held must be positive, got 0"),
+        ({"limit": math.inf}, "onset.budget of held must be positive, got inf"),
+        ({"limit": 1.0, "is_share": True}, "onset.budget of held must be between 0 and 1, got 1"),
+        ({"limit": 1.0, "confidence": 1.0}, "onset.confidence must lie between 0 and 1, got 1"),
+    ],
+)
+def test_what_is_no_budget(numbers, match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        Budget("held", **numbers)
+
+
+def by_latch(scores, quiet, raised, threshold: float, how: dict[str, int]) -> int:
+    """False alarms of all recordings, one decision after the other."""
+    rows = zip(scores, quiet, raised, strict=True)
+    return sum(
+        is_alarm and is_quiet
+        for row, of_quiet, other in rows
+        for is_alarm, is_quiet in zip(
+            latch(
+                [float(x >= threshold or o) for x, o in zip(row, other, strict=True)], 1.0, **how
+            )[0],
+            of_quiet,
+            strict=True,
+        )
+    )
+
+
+@given(
+    recordings=st.lists(drawn_values, min_size=1, max_size=4),
+    allowed=st.integers(0, 6),
+    how=drawn_times,
+    seed=st.integers(0, 2**20),
+    has_other=st.booleans(),
+    most=st.sampled_from([5, 200_000]),
+    least_quiet=st.sampled_from([1, 4]),
+    one_by_one=st.sampled_from([500, 2]),
+)
+def test_the_lowest_threshold_is_that_of_trying_every_value(
+    recordings,
+    allowed: int,
+    how,
+    seed: int,
+    has_other: bool,
+    most: int,
+    least_quiet: int,
+    one_by_one: int,
+) -> None:
+    source = np.random.default_rng(seed)
+    fine = source.random() < 0.5  # else many values are equal
+    scores = [(np.array(row) + fine * source.random(len(row))).astype("f4") for row in recordings]
+    quiet = [source.random(len(row)) < 0.8 for row in scores]
+    raised = [source.random(len(row)) < 0.1 * has_other for row in scores]
+    given_ = {**how, "is_raised": raised} if has_other else how
+    ranked = np.sort(np.concatenate([row[q] for row, q in zip(scores, quiet, strict=True)]))[::-1]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(thresholds, "_MOST_TRIED", most)
+        patch.setattr(thresholds, "_LEAST_QUIET", least_quiet)
+        patch.setattr(thresholds, "_TRIED_ONE_BY_ONE", one_by_one)
+        if not len(ranked):
+            with pytest.raises(ValueError, match="no decision to count alarms in"):
+                lowest_threshold(scores, quiet, allowed, **given_)
+            return
+        found = lowest_threshold(scores, quiet, allowed, **given_)
+    above = float(np.nextafter(ranked[0], np.float32(np.inf)))
+    if found < above or by_latch(scores, quiet, raised, above, how) <= allowed:
+        assert by_latch(scores, quiet, raised, found, how) <= allowed
+    expected = above
+    tried = max(1, min(most, len(ranked) // least_quiet))
+    for value in dict.fromkeys(ranked[:tried].tolist()):
+        if by_latch(scores, quiet, raised, value, how) > allowed:
+            break
+        expected = value
+    assert found == expected if one_by_one == 500 else found in {above, *ranked.tolist()}
+
+
+@given(values=drawn_values, how=drawn_times, seed=st.integers(0, 2**20))
+def test_false_alarms_are_those_of_the_latch_in_quiet(values, how, seed: int) -> None:
+    quiet = np.random.default_rng(seed).random(len(values)) < 0.5
+    expected = by_latch([values], [quiet], [[False] * len(values)], 1, how)
+    assert false_alarms(np.array(values) >= 1, quiet, **how) == expected

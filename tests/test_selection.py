@@ -1,3 +1,5 @@
+"""Moments of the classes, and rankings of features against plain loops over NumPy's numbers."""
+
 import itertools
 import math
 
@@ -8,7 +10,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactslip_torch.features.selection import ClassMoments, rank_distinct, rank_features, t_scores
+from tactslip_torch.features.selection import (
+    ClassMoments,
+    rank_distinct,
+    rank_features,
+    rank_per_cost,
+    rank_weighted,
+    t_scores,
+)
 
 VARIANCES = ["pooled", "welch"]
 
@@ -37,19 +46,6 @@ def assert_same(actual, expected):
     assert torch.equal(actual.count, expected.count)
     torch.testing.assert_close(actual.mean, expected.mean, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(actual.sum_sq_dev, expected.sum_sq_dev, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("as_type", [torch.long, torch.bool, torch.float64])
-def test_moments_equal_numpy(as_type, rng):
-    features, labels = draw(rng)
-    moments = moments_of(features, torch.from_numpy(labels).to(as_type))
-    for label in (0, 1):
-        of_class = double(features)[labels == label]
-        assert moments.count[label] == len(of_class)
-        np.testing.assert_allclose(moments.mean[label], of_class.mean(0), rtol=1e-12, atol=1e-12)
-        expected = of_class.var(0) * len(of_class)
-        np.testing.assert_allclose(moments.sum_sq_dev[label], expected, rtol=1e-12)
-    assert moments.mean.dtype == moments.sum_sq_dev.dtype == torch.float64
 
 
 @pytest.mark.parametrize("variance", VARIANCES)
@@ -82,13 +78,6 @@ def test_merged_parts_equal_the_whole_in_any_split_and_order(cuts, order, seed, 
     for a, b in itertools.pairwise(edges):
         updated.update(torch.from_numpy(features[a:b]), torch.from_numpy(labels[a:b]))
         assert_same(updated, moments_of(features[:b], labels[:b]))  # also between updates
-
-
-def test_moments_do_not_cancel_on_a_large_offset(rng):
-    features = double(1e6 + rng.standard_normal((50, 3)))
-    labels = np.arange(50) % 2
-    expected = oracles.t_scores(features - 1e6, labels)
-    np.testing.assert_allclose(t_scores(moments_of(features, labels)), expected, rtol=1e-8)
 
 
 @pytest.mark.parametrize("variance", VARIANCES)
@@ -171,14 +160,6 @@ def test_distinct_features_equal_the_definition(most_correlation, num, rng):
     assert actual.tolist() == distinct(scores, features, is_slip, num, most_correlation)
 
 
-@pytest.mark.parametrize("level", [0.0, 0.1, 1e30, 1e-45])
-def test_a_constant_repeats_nothing(level, rng):
-    features = torch.from_numpy(rng.standard_normal((31, 4))).float()
-    features[:, 1:3] = level
-    ranked = rank_distinct(torch.tensor([1.0, 4, 3, 2]), features, torch.arange(31) % 2, 4, 0.0)
-    assert ranked[:2].tolist() == [1, 2]
-
-
 @pytest.mark.parametrize("size", [1e-30, 1.0, 1e30])
 @pytest.mark.parametrize("repeats", [(2.0, 0.0), (-1.0, 3.0)])
 def test_a_repeat_is_found_at_any_size_and_offset(size, repeats, rng):
@@ -196,12 +177,6 @@ def test_a_repeat_is_found_at_any_size_and_offset(size, repeats, rng):
         1 - 1e-6,
     )
     assert ranked.tolist() == [0, 2]
-
-
-def test_without_bins_and_with_nan_scores_the_ranking_stands():
-    scores = torch.tensor([1.0, math.nan, 3.0, math.inf])
-    empty = torch.zeros(0, 4), torch.zeros(0)
-    assert rank_distinct(scores, *empty, 4, 0.5).tolist() == [3, 2, 0, 1]
 
 
 def test_errors():
@@ -239,3 +214,89 @@ def test_errors_of_distinct_features():
         rank_distinct(torch.zeros(4), *given[1:], 2, 0.9)
     with pytest.raises(ValueError, match=r"\[6, 3\], got \(5, 3\)"):
         rank_distinct(*given[:2], torch.zeros(6), 2, 0.9)
+
+
+def related(rng, num_bins=80, num_features=30):
+    """Features of a few causes, some constant, some the same up to sign and gain."""
+    causes = rng.standard_normal((num_bins, 5))
+    features = causes @ rng.standard_normal((5, num_features))
+    features += 0.5 * rng.standard_normal((num_bins, num_features))
+    features[:, 3] = 7.0
+    features[:, 8] = -2 * features[:, 9] + 1
+    features[:, 11] = 1e6 + 1e-2 * features[:, 11]
+    return features.astype(np.float32)
+
+
+def weighted(scores, features, num, alpha):
+    """MATLAB's rule, by numpy.corrcoef; a constant correlates with nothing."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rho = np.nan_to_num(np.abs(np.corrcoef(features.astype(np.float64).T)))
+    taken = [int(np.argmax(scores))]
+    while len(taken) < num:
+        value = scores * (1 - alpha * rho[:, taken].mean(1))
+        value[taken] = -np.inf
+        taken.append(int(np.argmax(value)))
+    return taken
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 0.7, 1.0])
+def test_weighted_is_matlabs_rule(alpha, rng):
+    scores, features = rng.uniform(0, 9, 30), related(rng)
+    found = rank_weighted(torch.from_numpy(scores), torch.from_numpy(features), 30, alpha)
+    assert found.tolist() == weighted(scores, features, 30, alpha)
+    if alpha == 0:
+        assert torch.equal(found, rank_features(torch.from_numpy(scores), 30))
+
+
+def per_cost(scores, needs, prices, num, power):
+    taken, paid = [], set()
+    for _ in range(num):
+        best, best_value = None, None
+        for i in range(len(scores)):
+            if i in taken:
+                continue
+            price = sum(int(prices[p]) for p in np.flatnonzero(needs[i]) if p not in paid)
+            rank = (price == 0, scores[i] if price == 0 else scores[i] / price**power)
+            if power == 0:
+                rank = (False, scores[i])
+            if best is None or rank > best_value:
+                best, best_value = i, rank
+        taken.append(best)
+        paid |= set(np.flatnonzero(needs[best]).tolist())
+    return taken
+
+
+@pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 2.0])
+def test_per_cost_is_the_greedy_rule(power, rng):
+    scores = rng.uniform(0.1, 9, 40)
+    needs = rng.random((40, 12)) < 0.3
+    needs[5] = False  # needs nothing: free
+    prices = rng.integers(1, 10_000, 12)
+    found = rank_per_cost(
+        torch.from_numpy(scores), torch.from_numpy(needs), torch.from_numpy(prices), 40, power
+    )
+    assert found.tolist() == per_cost(scores, needs, prices, 40, power)
+    assert sorted(found.tolist()) == list(range(40))
+
+
+def test_errors_name_the_value():
+    scores, features = torch.ones(3), torch.ones(5, 3)
+    needs, prices = torch.ones(3, 2, dtype=torch.bool), torch.tensor([1, 2])
+    with pytest.raises(ValueError, match=r"alpha must lie in 0\.\.1, got 1\.5"):
+        rank_weighted(scores, features, 2, 1.5)
+    with pytest.raises(ValueError, match=r"expected features \[n, 3\], got \(5, 4\)"):
+        rank_weighted(scores, torch.ones(5, 4), 2)
+    with pytest.raises(ValueError, match=r"num must lie in 1\.\.3, got 4"):
+        rank_weighted(scores, features, 4)
+    with pytest.raises(ValueError, match=r"num must lie in 1\.\.3, got 0"):
+        rank_per_cost(scores, needs, prices, 0)
+    with pytest.raises(ValueError, match=r"needs \[3, 2\] of bool, got \(3, 2\) of torch.float32"):
+        rank_per_cost(scores, needs.float(), prices, 2)
+    with pytest.raises(ValueError, match="prices must be whole numbers"):
+        rank_per_cost(scores, needs, -prices, 2)
+    with pytest.raises(ValueError, match="prices must be whole numbers"):
+        rank_per_cost(scores, needs, prices.double(), 2)
+    with pytest.raises(ValueError, match=r"more than 2\^50"):
+        rank_per_cost(scores, needs, prices * 2**50, 2)
+    with pytest.raises(ValueError, match="power must not be negative, got -1"):
+        rank_per_cost(scores, needs, prices, 2, -1)

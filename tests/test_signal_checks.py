@@ -11,9 +11,7 @@ import pytest
 from scipy.signal import savgol_filter
 
 from tactslip_torch.analysis.signal_checks import (
-    QUIET,
     SIGNAL_CHECKS,
-    SUSTAINED,
     Signals,
     check_signals,
     filtered,
@@ -66,14 +64,6 @@ def test_a_check_holds_on_recordings_and_fails_on_shuffled_ones(recordings, name
     assert not any(map(check.allows, spoilt.values())), spoilt
 
 
-def test_rough_and_tacky_materials_are_the_loudest(recordings):
-    level_v = {
-        material: np.median([np.std(s.slide(s.pvdf, 1), axis=-1) for s in seen])
-        for material, seen in recordings.items()
-    }
-    assert min(level_v[m] for m in SUSTAINED) > 3 * max(level_v[m] for m in QUIET)
-
-
 def test_checking_says_what_was_found(recordings):
     some = {material: recordings[material] for material in ("M1", "M2")}
     results = {check["name"]: check for check in check_signals(some)}
@@ -90,13 +80,6 @@ def test_checks_of_materials_that_are_not_there_are_left_out(recordings):
     names = {check["name"] for check in check_signals({"M1": recordings["M1"]})}
     gone = {"pvdf_abrupt", "pvdf_abrupt_contrast", "barely"}
     assert names == set(BY_NAME) - gone
-
-
-def test_one_material_outside_the_range_is_enough_to_fail(recordings):
-    quiet = changed({"M3": recordings["M3"]}, shuffled)
-    results = {check["name"]: check for check in check_signals(recordings | quiet)}
-    assert not results["pvdf_slide_over_rest"]["holds"]
-    assert results["pvdf_sustained"]["holds"]
 
 
 # --- statistics on signals made by hand ---------------------------------------------------------
@@ -139,16 +122,6 @@ def test_signals_are_filtered_as_the_paper_does():
     np.testing.assert_allclose(signals.pvdf, savgol_filter(samples[14:], 11, 1), atol=1e-12)
     assert signals.onsets_s == recording.onsets_s
     assert signals.sliding_s == recording.sliding_s
-
-
-def test_kinds_are_told_by_the_hand_not_by_place():
-    rows = HAND.to_rows()
-    turned = HandLayout.from_rows(rows[::-1])
-    recording = simulate(Scene("M2"))
-    other = replace(recording, samples=recording.samples.flip(0))
-    np.testing.assert_array_equal(
-        filtered(other, turned).pvdf, filtered(recording, HAND).pvdf[::-1]
-    )
 
 
 def test_a_hand_or_protocol_that_cannot_be_checked_is_refused():

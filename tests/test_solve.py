@@ -8,9 +8,11 @@ import mpmath
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.kernels import PAPER_KERNEL, RadialBasis
+from tactslip_torch.model import fit
+from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine, held_out_scores
+from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, RadialBasis
 from tactslip_torch.model.solve import solve_symmetric
 
 EPS = 2.0**-52
@@ -60,15 +62,6 @@ def test_a_well_posed_system_is_solved_to_the_stated_error(num, decades, weighte
     assert report.condition <= report.condition_bound
 
 
-def test_units_of_the_unknowns_cost_nothing(rng):
-    """Twelve decades of them: the condition is that of the matrix scaled to ones."""
-    matrix, units = with_spectrum(rng, np.geomspace(0.01, 1, 30)), 10.0 ** rng.uniform(-6, 6, 30)
-    graded, right = matrix * units * units[:, None], units * rng.standard_normal(30)
-    x, report, *_ = solve_symmetric(*tensors(graded, right), 1e30)
-    assert (report.method, report.condition < 1e4) == ("cholesky", True)
-    close(x * torch.from_numpy(units), np.linalg.solve(matrix, right / units), 1e-12)
-
-
 # Eigenvectors ---------------------------------------------------------------------------------
 
 
@@ -93,17 +86,6 @@ def test_what_is_null_is_left_out(num, weighted, penalty, rng, caplog):
         assert str(report) in caplog.messages[-1]
 
 
-def test_the_ridge_stays_where_components_are_left_out(rng):
-    """With eigenvalues near 1 / C, those that are not null shrink as they should."""
-    values = np.r_[np.zeros(6), np.geomspace(1e-10, 100, 6)]
-    matrix, right = with_spectrum(rng, values), rng.choice([-1.0, 1.0], 12)
-    x, report, *_ = solve_symmetric(*tensors(matrix, right), 1e11)
-    assert (report.method, report.rank) == ("eigen", 6)
-    eigenvalues, vectors = np.linalg.eigh(matrix)
-    shares = np.where(eigenvalues > 1e-11, eigenvalues / (eigenvalues + 1e-11), 0)
-    close(torch.from_numpy(matrix) @ x, vectors @ (shares * (vectors.T @ right)), 1e-4)
-
-
 def test_what_is_left_out_is_stated(rng):
     """An eigenvalue a of rounding's size adds a C / (1 + a C) of its share; null ones say so."""
     values = np.r_[2e-16, np.geomspace(0.1, 1, 7)]
@@ -113,16 +95,6 @@ def test_what_is_left_out_is_stated(rng):
     assert abs(share) * 4e-3 / 1.004 / np.sqrt(8) <= report.left_out <= 0.1
     assert report.error == report.left_out
     assert "unless what is left out is null" in str(report)
-
-
-@pytest.mark.parametrize("penalty", [1e-12, 1.0, 1e12, np.inf])
-def test_nothing_in_is_nothing_out(penalty):
-    zeros, ones = torch.zeros(5, 5, dtype=torch.float64), torch.ones(5, dtype=torch.float64)
-    x, report, *_ = solve_symmetric(zeros, ones, penalty)
-    close(x, np.full(5, 0.0 if np.isinf(penalty) else penalty), 1e-12)
-    assert solve_symmetric(torch.eye(5).double(), 0 * ones, penalty).x.tolist() == [0.0] * 5
-    assert solve_symmetric(ones.expand(5, 5), 0 * ones, 1e20).x.tolist() == [0.0] * 5
-    json.dumps(report.facts(), allow_nan=False)
 
 
 # 80 digits ------------------------------------------------------------------------------------
@@ -213,15 +185,6 @@ def test_the_stated_errors_are_true_or_the_system_refused(kind, spread, penalty)
         json.dumps(report.facts(), allow_nan=False)
 
 
-@pytest.mark.parametrize("kernel", [PAPER_KERNEL, RadialBasis(0.5)], ids=str)
-@pytest.mark.parametrize("penalty", [1e14, np.inf])
-def test_each_bin_thrice_with_two_labels_scores_a_third(kernel, penalty):
-    z = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (6, 8))).repeat(3, 1)
-    machine = fit_machine(TrainingBins(z, torch.arange(18) < 12), penalty, kernel)
-    assert machine.solved.method == "eigen"
-    torch.testing.assert_close(machine(z), torch.full((18,), 1 / 3).double(), rtol=0, atol=1e-7)
-
-
 # Refusals -------------------------------------------------------------------------------------
 
 
@@ -279,3 +242,137 @@ def test_what_leaves_float64_or_is_none_is_refused():
         solve_symmetric(1e-307 * torch.eye(2).double(), right, np.inf, name="gram")
     with pytest.raises(ValueError, match=r"expected gram in float64, got torch.float32"):
         solve_symmetric(torch.eye(2), right, 1.0, name="gram")
+
+
+CUBIC, RADIAL, LINE = Polynomial(3), RadialBasis(0.4), Polynomial(1, 0.7)
+GROUPS = ("bins", "cycles", "materials", "mixed")
+
+
+def draw(
+    rng: np.random.Generator, num_bins: int, num_features: int = 3, weighted: bool = False
+) -> TrainingBins:
+    """Noisy labels of both classes everywhere, so that no fold loses one."""
+    z = rng.uniform(-1, 1, (num_bins, num_features))
+    is_slip = (z[:, 0] - z[:, 1] ** 2 + 0.3 * rng.normal(size=num_bins) > -0.2).copy()
+    first = min(8, num_bins)
+    is_slip[:first] = np.arange(first) // 2 % 2 == 0
+    weights = torch.from_numpy(rng.uniform(0.2, 3, num_bins)) if weighted else None
+    return TrainingBins(torch.from_numpy(z), torch.from_numpy(is_slip), weights)
+
+
+def grouped(rng: np.random.Generator, num_bins: int, kind: str) -> Tensor:
+    """Groups in no order, with names that are not 0, 1, 2, ..."""
+    if kind == "bins":
+        groups = np.arange(num_bins)
+    elif kind == "cycles":
+        groups = rng.integers(0, num_bins // 6, num_bins)
+    elif kind == "materials":
+        groups = rng.integers(0, 4, num_bins)
+    else:  # one of half the bins, some of a few, many of one
+        groups = np.where(np.arange(num_bins) % 2 == 0, 0, np.arange(num_bins) // 2)
+        groups[: num_bins // 5] = 5
+    return torch.from_numpy(rng.permutation(7 * groups - 20))
+
+
+def gram(kernel: Kernel, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    if isinstance(kernel, RadialBasis):
+        return np.exp(-kernel.gamma * ((a[:, None] - b[None]) ** 2).sum(-1))
+    return (a @ b.T + kernel.offset) ** kernel.degree
+
+
+def refitted(bins: TrainingBins, groups: Tensor, penalty: float, kernel: Kernel) -> np.ndarray:
+    """Delete the group, solve, predict."""
+    z, t, g = bins.features.numpy(), np.where(bins.is_slip, 1.0, -1.0), groups.numpy()
+    w = np.ones(len(z)) if bins.weights is None else bins.weights.numpy()
+    scores = np.full(len(z), np.nan)
+    for name in np.unique(g):
+        out, own = g != name, g == name
+        system = gram(kernel, z[out], z[out]) + np.diag(1 / (penalty * w[out]))
+        scores[own] = gram(kernel, z[own], z[out]) @ np.linalg.solve(system, t[out])
+    return scores
+
+
+def assert_refits(
+    bins: TrainingBins, groups: Tensor, penalty: float, kernel: Kernel = PAPER_KERNEL
+) -> None:
+    fit = HeldOut(bins, groups, kernel).at(penalty)
+    expected = refitted(bins, groups, penalty, kernel)
+    scale = max(1.0, np.abs(expected).max())
+    np.testing.assert_allclose(fit.scores.numpy(), expected, rtol=0, atol=1e-8 * scale)
+
+
+# Scores ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chunk", [256, 11])
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("kind", GROUPS)
+@pytest.mark.parametrize(
+    ("kernel", "num_bins", "num_features"),
+    [
+        (PAPER_KERNEL, 60, 12),  # the dual: 91 monomials
+        (LINE, 40, 41),
+        (CUBIC, 60, 12),
+        (RADIAL, 60, 12),
+        (Polynomial(2, 1.5), 80, 4),  # the primal: 15 monomials, groups of more and of fewer bins
+        (LINE, 80, 4),
+    ],
+)
+def test_scores_are_those_of_refits(
+    kernel, num_bins, num_features, kind, weighted, chunk, rng, monkeypatch
+):
+    monkeypatch.setattr(fit, "_CHUNK", chunk)
+    bins = draw(rng, num_bins, num_features, weighted)
+    assert_refits(bins, grouped(rng, num_bins, kind), 1e3, kernel)
+
+
+# Refusals -------------------------------------------------------------------------------------
+
+
+def held_out(bins, groups, *numbers, **more):
+    return held_out_scores(bins.features, bins.is_slip, groups, *numbers, **more)
+
+
+def with_all_of(value, bins):
+    """Groups of which number 9 has all bins of a class."""
+    return torch.where(bins.is_slip == value, 9, torch.arange(len(bins.is_slip)) % 3)
+
+
+def twice(bins):
+    return TrainingBins(bins.features.repeat(2, 1), bins.is_slip.repeat(2))
+
+
+@pytest.mark.parametrize(
+    ("fit", "message"),
+    [
+        *(
+            (lambda b, g, f=f, c=c: f(b, g, c), r"positive and finite penalty .*, got")
+            for f in (held_out, lambda b, g, c: HeldOut(b, g).at(c))
+            for c in (0.0, -1.0, float("inf"), float("nan"))
+        ),
+        (lambda b, g: held_out(b, g[:19], 1.0), r"each of 20 bins, got \(19,\)"),
+        (lambda b, g: HeldOut(b, g[:19]), r"each of 20 bins, got \(19,\)"),
+        (lambda b, g: HeldOut(b, g.float()), r"whole number .*, got \(20,\) torch.float32"),
+        (lambda b, g: HeldOut(b, 0 * g + 7), r"at least two groups, all 20 bins are in \[7\]"),
+        (lambda b, g: HeldOut(b, with_all_of(True, b)), "without group 9 no slip bin is left"),
+        (lambda b, g: HeldOut(b, with_all_of(False, b)), "without group 9 no non-slip bin is left"),
+        (lambda b, g: HeldOut(b, g, RADIAL, "primal"), r"RadialBasis.* has no primal"),
+        (lambda b, g: held_out(b, g, 1.0, -0.5), r"offset .* at least 0, got -0.5"),
+        (lambda b, g: held_out(b, g, 1.0, weights=torch.zeros(20)), "weights must be positive"),
+        (lambda b, g: held_out(twice(b), g.repeat(2), 1e12), r"condition .*, wanted up to 1e\+10"),
+    ],
+)
+def test_what_has_no_held_out_scores_is_refused(fit, message, rng):
+    with pytest.raises(ValueError, match=message):
+        fit(draw(rng, 20), torch.arange(20) % 4)
+
+
+@pytest.mark.parametrize("penalty", [1e7, 1e8])
+def test_a_bin_alone_in_a_feature_is_refused_by_name_where_float64_ends(penalty, rng):
+    """Only bin 25 has the last feature: its leverage is 1 but for about 1 / penalty."""
+    bins, groups = draw(rng, 80, 4), torch.arange(80) + 100
+    bins.features[:, -1] = 0
+    bins.features[25, -1] = 1
+    assert_refits(bins, groups, 1e3)
+    with pytest.raises(ValueError, match="the machine without group 125 is too"):
+        HeldOut(bins, groups).at(penalty)

@@ -98,21 +98,6 @@ def confounded(**changes):
     return confound(**(whole | {"trained_scenes": ["carried"]} | changes))
 
 
-def test_the_folds_of_confound_differ_in_the_scenes_trained_on_alone():
-    protocol, with_scenes = confounded()
-    assert [protocol.name, with_scenes.name] == ["protocol", "with_scenes"]
-    for role in ("test", "unseen"):
-        own = of_role(protocol, role)
-        assert own == of_role(with_scenes, role) == of_role(drawn(with_others()), role)
-        assert {r.scene for r in own} == {"paper", "taps", "carried"}
-    trained, more = of_role(protocol, "train"), of_role(with_scenes, "train")
-    assert {r.scene for r in trained} == {"paper"}
-    assert {r for r in more if r.scene == "paper"} == trained
-    cycles = {(r.material, r.cycle) for r in trained}
-    assert {(r.material, r.cycle) for r in more} == cycles
-    assert not cycles & {(r.material, r.cycle) for r in with_scenes.having("test", "unseen")}
-
-
 # By bin --------------------------------------------------------------------------------------
 
 

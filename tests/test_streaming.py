@@ -1,7 +1,8 @@
-"""A stream watched in pieces against the same recording scored and decided whole."""
+"""A stream in pieces, and the alarm of evidence and bins, against the whole and plain loops."""
 
 import copy
 import logging
+import math
 import pickle
 from dataclasses import replace
 from itertools import pairwise
@@ -12,6 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from streams import detector_of, onset_of, signal
+from test_rules import by_hand
 
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import (
@@ -20,10 +22,10 @@ from tactslip_torch.onset.decisions import (
     Decisions,
     is_usable,
     score_stream,
+    stream_statistic,
 )
 from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.signals.filtering import ChannelFilter
 
 HOP = 20
 RATE = 2000.0
@@ -99,19 +101,6 @@ def test_any_cut_gives_what_the_whole_recording_gives(
     found = in_pieces(stream_of(detector, settings, dtype), samples, cuts)
     assert found.score.dtype == dtype
     assert_same(found, offline(detector, settings, samples))
-
-
-@pytest.mark.parametrize("start_s", [None, 7.0])
-def test_bins_shorter_than_a_frame_wait_for_the_first_frame(start_s):
-    detector = copy.deepcopy(DETECTORS["all", "causal"])
-    detector.channel_filter = ChannelFilter([151, 51, 11, 11], align="causal")
-    stream, came, said = stream_of(detector), [], []
-    for num, sample in enumerate(signal(200, 4).T, 1):
-        found = stream.push(sample[None], None if start_s is None else start_s + (num - 1) / RATE)
-        came += [num] * len(found.number)
-        said += found.available_s.tolist()
-    assert came == [151, 151, 151, 160, 180, 200]
-    assert said == pytest.approx([(start_s or 0.0) + num / RATE for num in came], abs=1e-12)
 
 
 # Fast evidence ---------------------------------------------------------------------------------
@@ -316,18 +305,6 @@ def test_a_clock_of_its_own_and_jitter_make_no_gaps(rng):
     assert len(found.number) == 600
 
 
-def test_time_without_stamps_is_counted_not_added_up():
-    """After 1000 s a decision is where arithmetic of whole numbers has it."""
-    stream = stream_of(settings=settings_of(hop=1999))
-    last = None
-    for _ in range(40):
-        found = stream.push(signal(50_000)[:, :50_000].T)
-        last = found if len(found.number) else last
-    number = int(last.number[-1])
-    assert float(last.available_s[-1]) == (number * 1999 + 125) / RATE
-    assert number == (2_000_000 - 125) // 1999
-
-
 # What goes in, and a stream's life ---------------------------------------------------------------
 
 
@@ -359,18 +336,6 @@ def test_samples_may_come_in_any_form(form):
     found = joined([stream.push(FORMS[form](samples.T)), stream.flush()])
     assert_same(found, expected)
     assert not found.score.requires_grad
-
-
-@pytest.mark.parametrize("as_array", [False, True])
-@pytest.mark.parametrize("size", [1, 10, 200])
-def test_what_was_pushed_may_be_overwritten(as_array, size):
-    samples = signal(1000, 6)
-    stream, buffer, parts = stream_of(), torch.empty(size, 4, dtype=torch.float64), []
-    for part in samples.split(size, -1):
-        buffer.copy_(part.T)
-        parts.append(stream.push(buffer.numpy() if as_array else buffer))
-        buffer.fill_(torch.nan)
-    assert_same(joined([*parts, stream.flush()]), in_pieces(stream_of(), samples))
 
 
 def test_what_cannot_be_set_is_refused():
@@ -422,11 +387,83 @@ def test_an_hour_needs_no_more_memory_than_a_second():
     assert int(found.number[-1]) == 3599
 
 
-def test_single_samples_are_not_hoarded():
-    stream = stream_of()
-    most = 0
-    for _ in range(1000):
-        stream.push(np.zeros((0, 4)))
-        stream.push(np.zeros((1, 4)))
-        most = max(most, stream.state_bytes)
-    assert most <= 4 * 8 * (51 + 2 * 125)
+# Gradients -------------------------------------------------------------------------------------
+
+
+def test_gradients_of_a_stream_are_slopes(rng):
+    """Along random directions of some volts each, against a central difference."""
+    samples = signal(300, 5).requires_grad_()
+
+    def statistic(samples):
+        return stream_statistic(DETECTOR, settings_of(Cusum(-0.5, 0.4)), samples).statistic[-1]
+
+    (pull,) = torch.autograd.grad(statistic(samples), samples)
+    for _ in range(3):
+        way = torch.from_numpy(rng.standard_normal(samples.shape))
+        step = 1e-7
+        with torch.no_grad():
+            slope = (statistic(samples + step * way) - statistic(samples - step * way)) / (2 * step)
+        torch.testing.assert_close((pull * way).sum(), slope, rtol=1e-4, atol=1e-6)
+
+
+def test_what_is_no_recording_is_refused():
+    with pytest.raises(ValueError, match=r"at least 100 samples.*got 99"):
+        stream_statistic(DETECTOR, settings_of(), signal(99))
+    with pytest.raises(ValueError, match=r"expected samples \[\*, 4, T\]"):
+        stream_statistic(DETECTOR, settings_of(), signal(300)[:3])
+
+
+# Decider.join ----------------------------------------------------------------------------------
+
+
+def joint_settings(rule, bin_hop, hop):
+    onset = replace(onset_of(signal(6000, 9), hop=hop), lead_s=0.012)
+    return replace(settings_of(rule, bin_hop), onset=onset)
+
+
+def drawn_scores(seed, settings):
+    """Both reach their thresholds now and then."""
+    rng = np.random.default_rng(seed)
+    scores = MIDDLE - 8 + 10 * rng.standard_normal(500).repeat(8)
+    onset = settings.onset.threshold - 2 + rng.standard_normal(4000)
+    return torch.from_numpy(scores), torch.from_numpy(onset)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
+@pytest.mark.parametrize(
+    ("bin_hop", "hop", "frame"), [(50, 10, 0), (7, 10, 0), (10, 10, 0), (130, 3, 400)]
+)
+def test_joined_decisions_by_a_plain_loop(rule, bin_hop, hop, frame):
+    settings = joint_settings(rule, bin_hop, hop)
+    scores, onset = drawn_scores(3, settings)
+    scores = scores[: (4000 - 125) // bin_hop + 1]
+    decider = Decider(settings, RATE, 100, 25, frame)
+    found = decider.join(decider.decide(scores, scores.isfinite()), onset[: 4000 // hop])
+    bins = Decider(settings, RATE, 100, 25).decide(scores, scores.isfinite())
+    high, by_onset = [], []
+    for i in range(4000 // hop):
+        end = (i + 1) * hop
+        known = [n for n in range(len(scores)) if n * bin_hop + 125 <= end and end >= frame]
+        by_onset.append(float(onset[i]) >= settings.onset.threshold)
+        high.append(by_onset[i] or bool(known and bins.statistic[known[-1]] >= settings.threshold))
+        assert float(found.available_s[i]) == end / RATE
+        if not known:
+            expected = 0.0, 0.5, False
+        else:
+            expected = tuple(
+                float(x[known[-1]]) for x in (bins.score, bins.probability, bins.is_valid)
+            )
+        assert (found.score[i], found.probability[i], found.is_valid[i]) == expected
+        began_s = end / RATE - (0.012 if by_onset[i] else 0.0)
+        if known and not by_onset[i]:
+            began_s = min(float(bins.onset_s[known[-1]]), end / RATE)
+        assert float(found.onset_s[i]) == began_s
+    seconds = {"rearm": 0.02, "refractory": 0.05}
+    times = {name: math.ceil(s * RATE / hop) for name, s in seconds.items()}
+    alarms, standing = by_hand(high, 1, **times)
+    assert found.number.tolist() == list(range(4000 // hop))
+    assert found.by_onset.tolist() == by_onset
+    assert (found.is_alarm.tolist(), found.is_on.tolist()) == (alarms, standing)
+    raised = [("onset" if by_onset[i] else "status") for i in np.flatnonzero(alarms)]
+    assert [alarm.raised_by for alarm in found.alarms] == raised
+    assert set(raised) == {"onset", "status"}

@@ -1,20 +1,26 @@
-"""Wavelet branches against PyWavelets, of named wavelets and of filters without a name."""
+"""Wavelet branches, spectra and resampling against PyWavelets, NumPy and SciPy."""
 
 import json
+import math
 
 import numpy as np
 import oracles
 import pytest
 import pywt
+import scipy.signal
 import torch
 from small_detector import HAND
 
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.signals.resampling import resample
 from tactslip_torch.signals.wavelet import (
     WaveletFilters,
+    amplitude_spectrum,
     as_wavelet,
     branch_matrix,
+    frequency_axis_hz,
     highest_level,
+    spectrum_matrix,
     wavelet_branches,
 )
 
@@ -36,19 +42,6 @@ def test_every_option_equals_pywavelets(wavelet, mode, level, num_samples, rng):
     matrix = branch_matrix(num_samples, **options)
     assert matrix.dtype == torch.float64
     assert_branches_close(matrix @ torch.from_numpy(x[0]), expected[0])
-
-
-@pytest.mark.parametrize("num_samples", [80, 101])
-@pytest.mark.parametrize("make", [oracles.random_bins, oracles.integer_bins])
-def test_the_papers_branches_equal_pywavelets_and_add_up(num_samples, make, rng):
-    x = make(rng, 3, num_samples)
-    branches = wavelet_branches(torch.from_numpy(x))
-    assert_branches_close(branches, np.stack([oracles.wavelet_branches(one) for one in x]))
-    parent = torch.from_numpy(x)
-    for m in range(4):
-        a, d = branches[:, 2 * m], branches[:, 2 * m + 1]
-        torch.testing.assert_close(a + d, parent, rtol=0, atol=1e-13 * float(parent.abs().max()))
-        parent = a
 
 
 def test_a_constant_has_no_detail_and_a_nan_stays_where_its_filters_reach():
@@ -146,3 +139,149 @@ def test_what_is_no_wavelet_is_refused_in_one_line(values, message):
         assert "\n" not in str(error.value)
     with pytest.raises(ValueError, match=r"as dmey do not reconstruct: off by"):
         filters_of("dmey")  # an approximation of PyWavelets
+
+
+METHODS = ["reference", "clean"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("num_samples", [2, 3, 64, 65, 100, 130])
+def test_spectrum_matrix_and_axis_equal_numpys(method, num_samples, rng):
+    for make in (oracles.random_bins, oracles.integer_bins):
+        x = make(rng, 5, num_samples)
+        expected = np.stack([oracles.amplitude_spectrum(one, method) for one in x])
+        oracles.assert_columns_close(amplitude_spectrum(torch.from_numpy(x), method), expected)
+        matrix = spectrum_matrix(num_samples, method)
+        lines = matrix @ torch.from_numpy(x).to(torch.complex128).T
+        oracles.assert_columns_close(lines.abs().T, expected)
+    axis = frequency_axis_hz(num_samples, 2000.0, method)
+    exact = oracles.frequency_axis_hz(num_samples, 2000.0, method)
+    np.testing.assert_allclose(axis.numpy(), exact, rtol=1e-15)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_spectrum_manners(method, rng, device):
+    x = torch.from_numpy(oracles.random_bins(rng, 4, 100)).to(device)
+    oracles.assert_manners(lambda x: amplitude_spectrum(x, method), x)
+    single = amplitude_spectrum(x.float(), method).double()
+    torch.testing.assert_close(single, amplitude_spectrum(x, method), rtol=1e-5, atol=1e-6)
+    for num_samples in (9, 10):
+        small = torch.from_numpy(rng.standard_normal((2, num_samples))).requires_grad_()
+        assert torch.autograd.gradcheck(lambda x: amplitude_spectrum(x, method), small)
+    silence = torch.zeros(100, dtype=torch.float64, requires_grad=True)
+    amplitude_spectrum(silence, method).sum().backward()
+    assert silence.grad.isfinite().all()
+
+
+def test_a_clean_tone_has_its_amplitude_at_its_line_and_the_reference_at_that_of_256_points():
+    t = torch.arange(100, dtype=torch.float64) / 2000.0
+    for line in (1, 7, 49):
+        hertz = frequency_axis_hz(100, 2000.0, method="clean")[line]
+        spectrum = amplitude_spectrum(0.7 * torch.cos(2 * torch.pi * hertz * t + 1), "clean")
+        assert spectrum[line].item() == pytest.approx(0.7, rel=1e-12)
+        assert spectrum[torch.arange(51) != line].max() < 1e-13
+    ends = amplitude_spectrum(0.3 + 0.2 * torch.cos(2000 * torch.pi * t), "clean")
+    torch.testing.assert_close(ends[[0, 50]], torch.tensor([0.3, 0.2], dtype=torch.float64))
+    assert frequency_axis_hz(100, 2000.0)[1] == 20  # 2.56 times the true one, 7.8125 Hz
+    for hertz in (125.0, 250.0, 500.0):
+        spectrum = amplitude_spectrum(torch.sin(2 * torch.pi * hertz * t))
+        assert spectrum.argmax() == round(hertz / 7.8125)
+
+
+def test_spectrum_errors_name_the_value():
+    with pytest.raises(ValueError, match="at least two samples, got 1"):
+        amplitude_spectrum(torch.zeros(3, 1))
+    with pytest.raises(ValueError, match="'reference' or 'clean', got 'welch'"):
+        amplitude_spectrum(torch.zeros(100), "welch")
+
+
+# --- another rate -------------------------------------------------------------------------------
+
+RATES = [(2000.0, 1000.0), (1000.0, 2000.0), (2000.0, 48.0), (92.3, 100.0), (2000.0, 2048.0)]
+
+
+def tone(hz, rate_hz, num, phase=0.7, offset=0.0):
+    times_s = torch.arange(num, dtype=torch.float64) / rate_hz
+    return (offset + torch.sin(2 * math.pi * hz * times_s + phase))[None]
+
+
+def middle(x, margin):
+    return x[..., margin:-margin]
+
+
+@pytest.mark.parametrize(("from_hz", "to_hz"), RATES)
+@pytest.mark.parametrize("part", [0.03, 0.8])
+def test_a_tone_below_half_the_lower_rate_keeps_amplitude_and_phase(from_hz, to_hz, part):
+    hz, low = part * min(from_hz, to_hz) / 2, min(from_hz, to_hz)
+    found = resample(tone(hz, from_hz, round(200 * from_hz / low), offset=3.0), from_hz, to_hz)
+    expected = tone(hz, to_hz, found.shape[-1], offset=3.0)
+    assert middle(found - expected, math.ceil(10 * to_hz / low) + 1).abs().max() < 5e-3
+
+
+@pytest.mark.parametrize(("from_hz", "to_hz"), [(2000.0, 100.0), (100.0, 61.0)])
+@pytest.mark.parametrize("part", [1.2])
+def test_a_tone_above_half_the_new_rate_does_not_fold_back(from_hz, to_hz, part):
+    hz = part * to_hz / 2
+    found = resample(tone(hz, from_hz, round(200 * from_hz / to_hz)), from_hz, to_hz)
+    assert middle(found, 11).abs().max() < 5e-3
+    every = tone(hz, from_hz, 4000)[:, :: round(from_hz / to_hz)]
+    assert every.abs().max() > 0.5  # left out samples alone would have folded it
+
+
+@pytest.mark.parametrize(("from_hz", "to_hz"), RATES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_constant_stays_one_to_its_ends(from_hz, to_hz, dtype):
+    x = torch.tensor([[1.7], [-1e6], [0.0]], dtype=dtype).expand(3, 50).contiguous()
+    before = x.clone()
+    found = resample(x, from_hz, to_hz)
+    assert (found.dtype, found.shape) == (dtype, (3, math.ceil(50 * to_hz / from_hz)))
+    torch.testing.assert_close(found, x[:, :1].expand_as(found), rtol=1e-6, atol=0)
+    assert torch.equal(x, before)
+
+
+def test_away_from_the_ends_it_is_scipys_and_the_same_rate_is_a_copy(rng):
+    x = torch.from_numpy(rng.standard_normal((3, 400)))
+    x -= x.mean(-1, keepdim=True)
+    expected = scipy.signal.resample_poly(x.numpy(), 3, 5, axis=-1)
+    ours = middle(resample(x, 500.0, 300.0), 10)
+    np.testing.assert_allclose(ours, expected[:, 10:-10], rtol=0, atol=1e-13)
+    same = resample(x, 92.3, 92.3)
+    assert torch.equal(same, x)
+    assert same.data_ptr() != x.data_ptr()
+
+
+@pytest.mark.parametrize(("from_hz", "to_hz"), RATES)
+@pytest.mark.parametrize("place", [0, 577])
+def test_what_is_not_finite_spoils_what_reaches_it_and_nothing_else(from_hz, to_hz, place, rng):
+    x = torch.from_numpy(rng.standard_normal((2, 1200)))
+    whole = resample(x, from_hz, to_hz)
+    x[1, place] = 0.0
+    expected = resample(x, from_hz, to_hz)
+    away_s = (torch.arange(whole.shape[1]) / to_hz - place / from_hz).abs()
+    reach_s = 10 / min(from_hz, to_hz)
+    far = away_s > 1.001 * reach_s
+    assert far.any()
+    for bad in (math.nan, -math.inf):
+        x[1, place] = bad
+        found = resample(x, from_hz, to_hz)
+        assert torch.equal(found[0], whole[0])
+        assert found[1, away_s < 0.999 * reach_s].isnan().all()
+        torch.testing.assert_close(found[1, far], expected[1, far], rtol=0, atol=1e-3)
+    assert resample(torch.full((1, 30), torch.nan), 100.0, 150.0).isnan().all()
+
+
+@pytest.mark.parametrize(
+    ("samples", "from_hz", "to_hz", "message"),
+    [
+        (torch.ones(5), 1.0, 2.0, r"samples \[C, T\] to resample, got torch.float32 \(5,\)"),
+        (torch.ones(1, 5).int(), 1.0, 2.0, "got torch.int32"),
+        (torch.ones(1, 5), 0.0, 2.0, "rate must be positive to resample, got 0 Hz"),
+        (torch.ones(1, 5), 1.0, math.inf, "got inf Hz"),
+        (torch.ones(1, 5), 2000.0, 2000.008, "from 2000 to 2000.008 Hz is no ratio of whole"),
+        (torch.ones(1, 5), 1e6, 1.0, "from 1000000 to 1 Hz is no ratio"),
+    ],
+)
+def test_what_cannot_be_resampled_is_refused_in_one_line(samples, from_hz, to_hz, message):
+    with pytest.raises(ValueError, match=message) as refused:
+        resample(samples, from_hz, to_hz)
+    assert "\n" not in str(refused.value)

@@ -1,0 +1,788 @@
+"""The graph of bins beside the pool and the detector it was made of, in torch and float64."""
+
+import copy
+import operator
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from contract.names import STREAM_OUTPUTS
+from engine_bins import some_hand
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from small_detector import HAND, alarming_detector, raw_bins, small_detector
+from streams import detector_of, onset_of, signal
+from test_dead_streams import alarming_with_gaussians
+from test_detector import VARIANTS, noise, random_detector
+from test_predictions import with_gaussians
+from torch.nn.functional import pad
+
+from tactslip_torch.deploy.bins import RawBin, Timing, bin_graph, described
+from tactslip_torch.deploy.check import (
+    DEGENERATE,
+    check_bins,
+    check_model,
+    check_stream,
+    runner,
+    session_of,
+    simulated_stream,
+)
+from tactslip_torch.deploy.stream import onset_memory, onset_scores, stream_graph
+from tactslip_torch.deploy.value import BOOL, F32, F64, I64, Graph
+from tactslip_torch.features.ops import ascending, counted, looked_up, root, taken
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.model.calibration import LARGEST_LLR, Isotonic, Platt, probability, widened_llr
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.kernels import QuadraticForm
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.onset.decisions import KEY, AlarmSettings, score_stream
+from tactslip_torch.onset.evidence import OnsetStream
+from tactslip_torch.onset.rules import Cusum, KOfN
+from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.signals.filtering import ChannelFilter
+
+pytestmark = pytest.mark.onnx
+PRECISIONS = ("float32", "float64")
+CLOSE = {"float32": 1e-4, "float64": 1e-9}  # of scores, in standard deviations
+NAN, INF = float("nan"), float("inf")
+
+
+def cut(detector, samples):
+    """What of raw bins with the detector's full context the graph takes."""
+    raw = RawBin.of(detector)
+    start = detector.context_before - raw.before
+    return samples[..., start : start + raw.length].contiguous()
+
+
+def run_on(detector, precision, samples, mask=None):
+    """Outputs of onnxruntime for bins with full context."""
+    feeds = {"samples": cut(detector, samples).to(getattr(torch, precision)).numpy()}
+    if mask is not None:
+        feeds["samples"][..., mask.numpy(), :] = np.nan
+    return runner(session_of(bin_graph(detector, precision).model()))(feeds)
+
+
+def assert_scores(detector, precision, samples, mask=None, spread=None):
+    """Scores are those of torch in float64, flags those of torch in the graph's precision."""
+    given = samples.to(getattr(torch, precision))
+    expected = detector.predict_raw(given.double(), masked_channels=mask)
+    got = run_on(detector, precision, given, mask)
+    assert got["score"].dtype == precision
+    spread = float(expected.score.std()) if spread is None else spread
+    error = np.abs(got["score"] - expected.score.numpy())
+    assert error.max(initial=0.0) <= CLOSE[precision] * spread
+    is_valid = detector.predict_raw(given, masked_channels=mask).is_valid
+    np.testing.assert_array_equal(got["valid"], is_valid)
+    return got
+
+
+# Features --------------------------------------------------------------------------------------
+
+
+def whole_pool(align="centred", spectrum="reference", bin_samples=100, level=4):
+    """A detector of every feature there is; its head is never used."""
+    pool = FeaturePool(HAND, bin_samples=bin_samples, level=level, spectrum=spectrum)
+    ones = torch.ones(len(pool.names), dtype=torch.float64)
+    flat = torch.zeros(len(ones), len(ones), dtype=torch.float64)
+    head = QuadraticForm(flat, flat[0], flat[0, 0])
+    channel_filter = ChannelFilter((51, 51, 11, 11), 1, align)
+    return SlipDetector(pool, channel_filter, range(len(ones)), FeatureScaler(-ones, ones), head)
+
+
+def off(detector, precision, samples):
+    """Largest error of each feature, by its root mean square over the bins."""
+    given = samples.to(getattr(torch, precision))
+    expected = detector.pool(detector.channel_filter.valid(given.double())).numpy()
+    graph, shape = Graph(), ("batch", len(HAND), RawBin.of(detector).length)
+    made = described(graph.input("samples", np.dtype(precision), shape), detector)[0]
+    graph.output("features", made, ("batch", len(detector.selected)))
+    got = runner(session_of(graph.model()))({"samples": cut(detector, given).numpy()})["features"]
+    size = np.sqrt((expected**2).mean(0))
+    error = np.abs(got - expected).max(0) / np.where(size > 0, size, 1)
+    return dict(zip(map(str, detector.pool.names), error, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("precision", "case"),
+    [
+        ("float32", {}),
+        ("float64", {"align": "causal"}),
+        ("float64", {"bin_samples": 75, "level": 3, "spectrum": "clean"}),
+        ("float64", {"bin_samples": 101, "align": "trailing"}),
+    ],
+    ids=str,
+)
+def test_every_feature_of_the_pool_is_that_of_torch(precision, case):
+    detector = whole_pool(**case)
+    extra = torch.from_numpy(np.random.default_rng(1).standard_normal((20, 4, 1)))
+    samples = torch.cat([raw_bins(20), extra], -1)[..., : detector.pool.bin_samples + 50]
+    error = off(detector, precision, samples)
+    worst = max(error, key=error.get)
+    assert error[worst] < {"float32": 2e-4, "float64": 1e-9}[precision], worst
+
+
+# Scores ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_head_and_scaler_comes_through(variant, precision):
+    detector = random_detector(**VARIANTS[variant])
+    assert_scores(detector, precision, noise(24))
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_a_sensor_that_fails_is_replaced_as_in_torch(precision):
+    detector = small_detector()
+    imputation = torch.linspace(-0.9, 0.9, 12, dtype=torch.float64)
+    of_signal = (detector.pool, detector.channel_filter, detector.selected, detector.scaler)
+    detector = SlipDetector(*of_signal, detector.head, imputation=imputation)
+    samples = raw_bins(40)
+    for row, value in enumerate([NAN, INF, -INF] * 4):
+        samples[row, row % 4, 30 + 7 * row] = value
+    samples[20:28, 2] = 1.0  # dead
+    samples[28] = NAN
+    valid = assert_scores(detector, precision, samples)["valid"]
+    assert 0 < valid.sum() < len(valid)
+
+
+# Missing channels and probabilities ------------------------------------------------------------
+
+
+def broken_bins():
+    """Bins some of which miss one or two sensors, or all, neighbours the same or others."""
+    samples = raw_bins(24)
+    samples[3, 2, 60] = samples[4, 2, 80] = NAN
+    samples[5, 0, 60] = samples[5, 3, 90] = INF
+    samples[9] = NAN
+    samples[10, 2, 70] = -INF
+    return samples
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("lost", [None, [2], [0, 3], [0, 1, 2, 3]], ids=str)
+def test_expected_scores_are_those_of_torch(precision, lost):
+    detector = with_gaussians()
+    mask = None if lost is None else torch.zeros(4).bool().index_fill(0, torch.tensor(lost), True)
+    spread = float(detector.predict_raw(raw_bins(24)).score.std())
+    got = assert_scores(detector, precision, broken_bins(), mask, spread)
+    if lost is not None and len(lost) == 4:
+        assert not got["valid"].any()
+        assert np.ptp(got["score"]) == 0  # nothing is known of any bin
+
+
+@pytest.mark.parametrize(
+    "calibration", [Platt(0.4, -0.2), Isotonic((-3.0, 0.0, 4), (-4.0, 0.5, 3))]
+)
+def test_probabilities_are_as_wide_as_the_scores_are_uncertain(calibration):
+    detector = with_gaussians()
+    detector.info["calibration"] = calibration.to_dict()
+    samples = broken_bins()
+    found = detector.predict_raw(samples)
+    wide = torch.sigmoid(widened_llr(calibration, found.score, found.variance)).numpy()
+    got = run_on(detector, "float64", samples)["probability"]
+    np.testing.assert_allclose(got, wide, atol=1e-9)
+    certain = torch.sigmoid(calibration.llr(found.score)).numpy()
+    assert (np.abs(got - 0.5) < np.abs(certain - 0.5) - 1e-6)[found.variance.numpy() > 0].any()
+
+
+# The file --------------------------------------------------------------------------------------
+
+SLOW = {"DFT", "Conv", "AveragePool", "Einsum", "Det", "Unique", "Loop", "LayerNormalization"}
+"""Slow or imprecise in onnxruntime, or missing there in float64."""
+
+
+def operators(graph):
+    for node in graph.node:
+        yield node.op_type
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                yield from operators(attribute.g)
+
+
+def test_a_file_has_operators_of_onnx_alone_and_one_input(capfd):
+    model = bin_graph(with_gaussians()).model()
+    assert [each.domain for each in model.opset_import] == [""]
+    assert not SLOW.intersection(operators(model.graph))
+    session = session_of(model)
+    assert not session.get_overridable_initializers()
+    assert capfd.readouterr().err == ""  # no warning
+    assert [each.name for each in session.get_inputs()] == ["samples"]
+    assert session.get_inputs()[0].shape[0] == session.get_outputs()[0].shape[0] == "batch"
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return alarming_detector()
+
+
+# Bins ------------------------------------------------------------------------------------------
+
+
+def bin_run(detector, change=lambda samples, out: out):
+    """What a right bin graph in float32 gives, changed; ``change`` sees the samples."""
+    single = copy.deepcopy(detector).float()
+    raw, settings = RawBin.of(detector), AlarmSettings.of(detector)
+    context = detector.context_before - raw.before, detector.context_after - raw.after
+
+    def run(inputs):
+        samples = torch.tensor(inputs["samples"])
+        with torch.no_grad():
+            score, is_valid, *_ = single.predict_raw(pad(samples, context))
+        stated = probability(settings.calibration.llr(score), settings.slip_share)
+        out = {"score": score.numpy(), "probability": stated.numpy(), "valid": is_valid.numpy()}
+        return change(samples, out)
+
+    return run
+
+
+def at(is_there, **values):
+    """Other outputs on bins that a predicate ``[B]`` of their samples picks."""
+
+    def change(samples, out):
+        mask = is_there(samples).numpy()
+        for name, value in values.items():
+            out = out | {name: np.where(mask, np.array(value, out[name].dtype), out[name])}
+        return out
+
+    return change
+
+
+def one_bin(samples):
+    return torch.arange(len(samples)) == 3
+
+
+def constant(samples):
+    return (samples == samples[..., :1]).flatten(1).all(1)
+
+
+def holds_nan(samples):
+    return samples.isnan().flatten(1).any(1)
+
+
+def behind_nan(samples):
+    """Whole bins in one batch with broken ones."""
+    return ~holds_nan(samples) & holds_nan(samples).any()
+
+
+WRONG_BINS = {
+    "another name": (
+        lambda samples, out: {n.replace("score", "scores"): x for n, x in out.items()},
+        r"it gives .*scores float32\[256\], expected score float32\[256\], scores missing",
+    ),
+    "rows mixed up": (
+        lambda samples, out: out | {"score": out["score"][::-1]},
+        "score differs from torch by",
+    ),
+    "one flag wrong": (
+        at(one_bin, valid=False),
+        "valid differs from torch at 1 of 256, the first is number 3",
+    ),
+    "trusts the dead": (at(constant, valid=True), r"\(constant\): valid differs from torch at 16"),
+    "trusts the torn": (at(holds_nan, valid=True), r"\(nan\): valid differs"),
+    "one breaks others": (at(behind_nan, score=0.123), "simulated bins behind a degenerate one"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_BINS)
+def test_a_wrong_bin_graph_is_refused(detector, name):
+    change, message = WRONG_BINS[name]
+    with pytest.raises(ValueError, match=message) as caught:
+        check_bins(bin_run(detector, change), detector, "float32")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_right_bin_graph_passes_and_is_measured(detector):
+    found = check_bins(bin_run(detector), detector, "float32")
+    assert found["bins"] == 320
+    assert 0 < found["worst_sd"] < 1e-3
+    assert set(found["degenerate_worst_sd"]) == set(DEGENERATE)
+    assert list(found["missing_worst_sd"]) == ["the first", "every other", "all"]
+
+
+def test_rounding_is_no_error_where_it_decides_a_score():
+    """Of a vibration of 1e-12 of its offset few digits are left: levels of entropy change."""
+    pool, channel_filter = FeaturePool(HAND), ChannelFilter([51, 51, 11, 11])
+    place = [str(name) for name in pool.names].index("PVDF1 D3 time entropy")
+    scaler = FeatureScaler.fit(pool(channel_filter.valid(raw_bins(64)))[:, [place]])
+    one, zero = torch.ones(1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    head = QuadraticForm(zero, one, zero[0, 0])
+    of_entropy = SlipDetector(pool, channel_filter, [place], scaler, head, {"simulated": True})
+    found = check_model(bin_graph(of_entropy, "float64").model(), of_entropy, "bin", "float64")
+    assert found["worst_sd"] < 1e-9
+
+
+# Streams ---------------------------------------------------------------------------------------
+
+
+class StreamRun:
+    """A right stream graph: its memory hides in a ``StreamingDetector``, the state is a counter."""
+
+    def __init__(self, detector, change=lambda out: out, remembers=True):
+        self.detector, self.change, self.remembers = detector, change, remembers
+        self.timing = Timing.of(detector, AlarmSettings.of(detector))
+
+    def __call__(self, inputs):
+        if not inputs["tail"].size or not self.remembers:
+            settings = AlarmSettings.of(self.detector)
+            settings = replace(settings, threshold=float(inputs["threshold"][0]))
+            self.stream = StreamingDetector(self.detector, settings, dtype=torch.float32)
+        made = self.stream.push(inputs["samples"])
+        out = {name: getattr(made, field).numpy() for name, field in STREAM_OUTPUTS.items()}
+        out["next_tail"] = np.zeros((self.timing.tail, 4), np.float32)
+        out["next_state"] = np.zeros(self.timing.state_size)
+        return self.change(out)
+
+
+def changed(name, by):
+    return lambda out: out | {name: by(out[name])}
+
+
+def never_early(alarms):
+    """No alarm by the first decision of a push: one that forgets its latch."""
+    return np.where(np.arange(len(alarms)) == 0, False, alarms)
+
+
+WRONG_STREAMS = {
+    "no column": (
+        lambda out: {n: x for n, x in out.items() if n != "on"},
+        "it gives on missing, expected on bool",
+    ),
+    "drops an alarm": (changed("alarm", never_early), "alarm differs from torch at .*, the first"),
+    "trusts all": (changed("valid", np.ones_like), "broken channels: valid differs from torch"),
+    "onset": (changed("onset_s", lambda x: x - 0.01), "onset_s differs from torch by 1.0e-02 s"),
+    "score": (changed("score", lambda x: x * np.float32(1.01)), "score differs from torch"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_STREAMS)
+def test_a_wrong_stream_graph_is_refused(detector, name):
+    change, message = WRONG_STREAMS[name]
+    with pytest.raises(ValueError, match=message) as caught:
+        check_stream(StreamRun(detector, change), detector, "float32")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        (None, None, None),
+        ("onset_score", lambda x: x + 1e-8, "onset_score differs from torch by 1.0e-08"),
+        ("by_onset", np.zeros_like, "another threshold: by_onset differs"),
+        ("onset_score", np.float32, "gives onset_score float32"),
+    ],
+)
+def test_onset_scores_are_checked(detector, name, change, message):
+    joint, samples = copy.deepcopy(detector), simulated_stream(HAND, 2000.0, torch.float64)
+    onset = onset_of(torch.cat([samples] * 2, 1), quantile=0.999)
+    settings = replace(AlarmSettings.of(detector), onset=replace(onset, threshold=1e9))
+    joint.info[KEY] = settings.to_dict()
+    run = runner(session_of(stream_graph(joint, settings).model()))
+    if name is None:
+        found = check_stream(run, joint, "float32")
+        assert found["decisions"] > 400
+        return
+    with pytest.raises(ValueError, match=message):
+        check_stream(lambda x: changed(name, change)(run(x)), joint, "float32")
+
+
+@pytest.mark.parametrize("hop", [20, 70, 3000])
+def test_a_right_stream_graph_of_any_hop_passes_and_is_measured(detector, hop):
+    """The last samples are of no whole hop, or the hop is longer than the simulated slip."""
+    other = copy.deepcopy(detector)
+    settings = replace(AlarmSettings.of(detector), hop_samples=hop)
+    other.info[KEY] = settings.to_dict()
+    found = check_stream(StreamRun(other), other, "float32")
+    assert found["decisions"] >= 12
+    assert 0 <= found["worst_sd"] < 1e-3
+    if hop == 20:
+        assert found["alarms"] > 0
+
+
+# Models ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["bin", "stream"])
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
+def test_a_model_of_other_gaussians_is_refused(kind, precision):
+    detector, other = alarming_with_gaussians(), alarming_with_gaussians()
+    other.gaussians.mean += 0.5
+    for made_of in (detector, other):
+        if kind == "bin":
+            model = bin_graph(made_of, precision).model()
+        else:
+            model = stream_graph(made_of, AlarmSettings.of(made_of), precision).model()
+        if made_of is detector:
+            assert check_model(model, detector, kind, precision)["simulated"] is True
+        else:
+            with pytest.raises(ValueError, match=r"differ.* from torch"):
+                check_model(model, detector, kind, precision)
+
+
+def test_a_model_that_cannot_be_run_is_told_in_one_line():
+    graph = Graph()
+    graph.output("score", graph.input("samples", F64, ("batch", 8)).sum(1), ("batch",))
+    with pytest.raises(ValueError, match=r"cannot run it on samples \[3, 7\]: .*") as one:
+        runner(session_of(graph.model()))({"samples": np.ones((3, 7))})
+    assert "\n" not in str(one.value)
+    broken = graph.model()
+    broken.graph.node[0].input[0] = "nowhere"
+    with pytest.raises(ValueError, match=r"onnxruntime cannot load it: .*nowhere"):
+        session_of(broken)
+
+
+KINDS = ("all", "PVDF", "long")  # long: a frame that a causal bin does not hold
+ALIGNMENTS = ("centred", "causal", "trailing")
+RULES = {rule.name: rule for rule in (KOfN(2, 3), Cusum(0.5, 0.5, 2))}
+ONSET = onset_of(signal(6000, 5))
+EXACT = {"valid": "is_valid", "alarm": "is_alarm", "on": "is_on", "time_s": "available_s"}
+STREAM_CLOSE = {"float64": 1e-9, "float32": 1e-3}  # of scores, in standard deviations
+
+
+@cache
+def watching(
+    kind="all", align="centred", rule="k_of_n", hop=20, threshold=1.0, isotonic=False, onset=None
+):
+    """A detector, and settings by which about half of its decisions speak for slip."""
+    detector = detector_of("all" if kind == "long" else kind, align)
+    if kind == "long":
+        detector.channel_filter = ChannelFilter([151, 51, 11, 3], align=align)
+    scores = score_stream(detector, signal(900, 99), 20).score  # of no stream below
+    middle, spread = float(scores.median()), float(scores.std())
+    calibration = Platt(2 / spread, -2 * middle / spread)
+    if isotonic:
+        knots = tuple(middle + spread * x for x in (-2.0, -0.5, 0.0, 0.5, 1.0))
+        calibration = Isotonic(knots, (-3.0, -2.0, -0.5, 1.0, 2.5))
+    settings = AlarmSettings(
+        hop,
+        calibration,
+        RULES[rule],
+        threshold,
+        target_per_hour=1.0,
+        slip_share=0.3,
+        rearm_s=0.02,
+        refractory_s=0.05,
+        lead_s=0.03,
+        onset=onset,
+    )
+    return detector, settings, spread
+
+
+@cache
+def graph_of(precision, **options):
+    detector, settings, _ = watching(**options)
+    return runner(session_of(stream_graph(detector, settings, precision).model()))
+
+
+class Host:
+    """What a program around the graph does: it keeps tail and state, and nothing else."""
+
+    def __init__(self, precision="float64", **options):
+        self.run, self.dtype = graph_of(precision, **options), np.dtype(precision)
+        self.tail, self.state = np.zeros((0, 4), self.dtype), np.zeros(0)
+
+    def push(self, samples, threshold=()):
+        found = self.run(
+            {
+                "samples": np.ascontiguousarray(samples, self.dtype),
+                "tail": self.tail,
+                "state": self.state,
+                "threshold": np.array(threshold, np.float64),
+            }
+        )
+        self.tail, self.state = found.pop("next_tail"), found.pop("next_state")
+        return found
+
+
+def assert_same_stream(samples, cuts=(), precision="float64", **options):
+    """Push pieces to both; returns how many alarms there were."""
+    detector, settings, spread = watching(**options)
+    dtype, host = getattr(torch, precision), Host(precision, **options)
+    stream = StreamingDetector(detector, settings, dtype=dtype)
+    timing, num, close = Timing.of(detector, settings), 0, STREAM_CLOSE[precision]
+    raised = set[str]()
+    places = [0, *sorted(min(cut, samples.shape[-1]) for cut in cuts), samples.shape[-1]]
+    for start, stop in pairwise(places):
+        piece = samples[:, start:stop].T.to(dtype)
+        expected, found = stream.push(piece), host.push(piece.numpy())
+        joined = {"by_onset": "by_onset"} if settings.onset else {}
+        for name, attribute in (EXACT | joined).items():
+            wanted = getattr(expected, attribute).numpy()
+            np.testing.assert_array_equal(found[name], wanted, err_msg=name)
+        np.testing.assert_allclose(found["onset_s"], expected.onset_s, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found["score"], expected.score, rtol=0, atol=close * spread)
+        for name in ("probability", "statistic"):
+            wanted = getattr(expected, name)
+            np.testing.assert_allclose(found[name], wanted, rtol=close, atol=9 * close)
+            assert found[name].dtype == host.dtype
+        if settings.onset:
+            np.testing.assert_allclose(found["onset_score"], expected.onset_score, atol=1e-9)
+            assert found["onset_score"].dtype == np.float64
+        assert (host.tail.shape, host.state.shape) == ((timing.tail, 4), (timing.state_size,))
+        assert (host.tail.dtype, host.state.dtype) == (host.dtype, np.float64)
+        num += len(expected.alarms)
+        raised.update(alarm.raised_by for alarm in expected.alarms)
+    if settings.onset and len(places) > 100:
+        assert len(raised) == 2
+    return num
+
+
+@given(
+    num_samples=st.integers(0, 900),
+    cuts=st.lists(st.integers(0, 900), max_size=30),
+    kind=st.sampled_from(KINDS),
+    align=st.sampled_from(ALIGNMENTS),
+    rule=st.sampled_from(list(RULES)),
+    isotonic=st.booleans(),
+    hop=st.sampled_from([7, 20, 120]),
+    seed=st.integers(0, 20),
+    bad=st.lists(st.tuples(st.integers(0, 899), st.sampled_from([np.nan, np.inf])), max_size=3),
+)
+def test_any_cut_gives_what_the_detector_gives(
+    num_samples, cuts, kind, align, rule, isotonic, hop, seed, bad
+):
+    samples = signal(900, seed)
+    for place, value in bad:
+        samples[place % 4, place] = value
+    options = {"kind": kind, "align": align, "rule": rule, "isotonic": isotonic, "hop": hop}
+    assert_same_stream(samples[:, :num_samples], cuts, **options)
+
+
+@given(
+    num_samples=st.integers(0, 4000),
+    cuts=st.lists(st.integers(0, 4000), max_size=30),
+    kind=st.sampled_from(KINDS),
+    rule=st.sampled_from(list(RULES)),
+    hop=st.sampled_from([7, 20, 120]),
+    precision=st.sampled_from(list(STREAM_CLOSE)),
+    bad=st.lists(st.tuples(st.integers(0, 3999), st.sampled_from([np.nan, np.inf])), max_size=2),
+)
+@settings(max_examples=20)
+def test_fast_evidence_in_any_cut_is_that_of_the_detector(
+    num_samples, cuts, kind, rule, hop, precision, bad
+):
+    samples = signal(4000, 6)
+    for place, value in bad:
+        samples[place % 4, place] = value
+    options = {"kind": kind, "rule": rule, "hop": hop, "onset": ONSET}
+    assert_same_stream(samples[:, :num_samples], cuts, precision, **options)
+
+
+@pytest.mark.parametrize("kinds", ["F", "FF", "GF", "GGF"])
+def test_onset_scores_of_any_hand_with_channels_missing(kinds):
+    hand = some_hand(kinds)
+    names = [{"G": 0, "F": 2}[kind] + i % 2 for i, kind in enumerate(kinds)]
+    samples = signal(4000, 6)[names]
+    samples[-1, 3500:] = samples[-1, 3500]  # stuck
+    classifier = onset_of(samples[:, :3400], hand)
+    for masked in ([False] * len(hand), [False, *[True] * (len(hand) - 1)]):
+        graph = Graph()
+        x, memory = graph.input("x", F64, ("n", len(hand))), graph.input("memory", F64, ("m",))
+        places = graph.input("places", I64, ("k",))
+        known = onset_memory(memory, 0, classifier.evidence)
+        score, after = onset_scores(x, places, known, classifier)
+        for name, value in zip("sm", (score, graph.concat(*after, axis=0)), strict=True):
+            graph.output(name, value, ("j",))
+        run, evidence = runner(session_of(graph.model())), classifier.evidence
+        memory = np.empty(0)
+        before = np.full((evidence.context, len(hand)), np.nan)
+        held, found = np.concatenate([before, samples.T.numpy()]), []
+        held[:, masked] = np.nan
+        for start, stop in pairwise([0, 1, 2, 100, 350, 398, 400]):
+            piece = held[10 * start : 10 * stop + evidence.context]
+            made = run({"x": piece, "places": np.arange(stop - start), "memory": memory})
+            found.append(made["s"])
+            memory = made["m"]
+        expected = OnsetStream(classifier).push(samples, torch.tensor(masked))
+        np.testing.assert_allclose(np.concatenate(found), expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("onset", [None, ONSET])
+@pytest.mark.parametrize("rule", RULES)
+def test_a_stream_that_ran_for_years_goes_on(rule, onset):
+    young, old = Host(rule=rule, onset=onset), Host(rule=rule, onset=onset)
+    samples = signal(3500, 5).T.numpy()
+    young.push(samples[:700])
+    num = 10**12  # decisions
+    old.tail, old.state = young.tail, young.state.copy()
+    old.state[[0, 1, 2]] += [num * 20, num, num]
+    expected, found = young.push(samples[700:]), old.push(samples[700:])
+    for name in ("score", "statistic", "valid", "alarm", "on"):
+        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
+    assert expected["alarm"].any()
+    by_then = np.rint(expected["time_s"] * 2000.0) + num * 20
+    np.testing.assert_array_equal(found["time_s"], by_then / 2000.0)
+
+
+# Calibration -----------------------------------------------------------------------------------
+
+CALIBRATIONS = (
+    Platt(2.0, -0.7),
+    Platt(0.0, 0.3),
+    Platt(1 + 1e-9, 0.0),
+    Platt(1e12, -3.0),
+    Isotonic((-1.0, -0.25, 0.0, 0.1, 3.0), (-4.0, -4.0, -0.5, 0.0, 5.0)),
+    Isotonic((-1e300, 1e300), (-1e30, 1e30)),
+    Isotonic((0.5,), (0.0,)),
+)
+
+
+def scores_of(dtype):
+    """Any finite score, and often one of a few."""
+    largest, width = float(np.finfo(dtype).max), dtype.itemsize * 8
+    usual = st.floats(-4, 4, width=width) | st.sampled_from([0.0, -0.25, 0.1, 3.0])
+    any_ = st.floats(-largest, largest, width=width, allow_nan=False)
+    return arrays(dtype, st.integers(1, 30), elements=usual | any_)
+
+
+@cache
+def calibrating(calibration, dtype, slip_share):
+    graph = Graph()
+    llr = calibration.llr(graph.input("score", dtype, ("k",)))
+    graph.output("llr", llr, ("k",))
+    graph.output("probability", probability(llr, slip_share), ("k",))
+    return runner(session_of(graph.model()))
+
+
+@pytest.mark.parametrize("dtype", [F32, F64], ids=str)
+@pytest.mark.parametrize("calibration", CALIBRATIONS)
+@settings(max_examples=12)
+@given(data=st.data(), slip_share=st.sampled_from([0.5, 0.02]))
+def test_scores_become_the_same_ratios_and_probabilities(calibration, dtype, data, slip_share):
+    ends = np.array([np.finfo(dtype).min, np.finfo(dtype).max, 0.0], dtype)
+    knots = np.array(getattr(calibration, "scores", ())).clip(*ends[:2]).astype(dtype)
+    score = np.concatenate([data.draw(scores_of(dtype)), ends, knots])
+    expected = calibration.llr(torch.from_numpy(score))
+    found = calibrating(calibration, dtype, slip_share)({"score": score})
+    assert found["llr"].dtype == found["probability"].dtype == dtype
+    assert np.abs(found["llr"]).max() <= LARGEST_LLR
+    tiny = 4 * np.finfo(dtype).eps
+    largest = max(1.0, *map(abs, (*getattr(calibration, "llrs", ()), 0.0)))
+    np.testing.assert_allclose(found["llr"], expected, rtol=tiny, atol=tiny * largest)
+    close = 1e-12 if dtype == F64 else 2e-7
+    stated = probability(expected, slip_share)
+    np.testing.assert_allclose(found["probability"], stated, rtol=0, atol=close)
+
+
+X = np.array([-2.5, -1.0, 0.0, 0.5, 1.0, 3.0])
+
+
+def run(graph, **inputs):
+    """What onnxruntime makes of a graph, with its usual optimisations."""
+    content = graph.model().SerializeToString()
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    return dict(
+        zip([out.name for out in session.get_outputs()], session.run(None, inputs), strict=True)
+    )
+
+
+def applied(function, *arrays, num_axes=1):
+    """A function of values, run on arrays."""
+    graph = Graph()
+    values = [
+        graph.input(f"x{i}", array.dtype, [None] * array.ndim) for i, array in enumerate(arrays)
+    ]
+    graph.output("y", function(*values), [None] * num_axes)
+    return run(graph, **{f"x{i}": array for i, array in enumerate(arrays)})["y"]
+
+
+# Arithmetic ------------------------------------------------------------------------------------
+
+
+CUBE = np.random.default_rng(0).integers(-3, 4, (2, 3, 8)) / 4.0
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: x.clamp(-0.5, 0.25),
+        lambda x: x.clamp(min=0.25),
+        lambda x: x.clamp(max=0.25),
+        lambda x: torch.minimum(x, x * x),
+        lambda x: torch.maximum(x, x * x),
+        lambda x: torch.where(x > 0.0, x, -1.0),
+        lambda x: torch.cat([x, x * 2.0], dim=-2),
+        lambda x: x.abs().sqrt(),
+        lambda x: (x.abs() + 1.0).log(),
+        lambda x: x.exp().floor(),
+        lambda x: x.sigmoid(),
+        lambda x: x.eq(0.5),
+        lambda x: (1.0 / x).isfinite(),
+        lambda x: x.float() if isinstance(x, torch.Tensor) else x.to(torch.float32),
+        lambda x: (x > 0.0).double(),
+        lambda x: (x > 0.0).type_as(x),
+        lambda x: x.detach().sum(0, keepdim=True),
+        lambda x: x.mean(-1),
+        lambda x: x.amax(-1),
+        lambda x: x.amin(-1, keepdim=True),
+        lambda x: x[..., 1:],
+        lambda x: x[..., :-1],
+        lambda x: x[..., 2],
+        lambda x: x[..., -1],
+        lambda x: x[..., None].squeeze(-1),
+        lambda x: x.unsqueeze(0).squeeze(0),
+        lambda x: x.flatten(-2),
+        lambda x: (x > 0.0).long().cumsum(-1),
+        lambda x: x.argmax(-1, keepdim=True),
+        lambda x: x.gather(-1, x.argmax(-1, keepdim=True)),
+        lambda x: counted((x * x).floor().long(), 4),
+        lambda x: x @ torch.eye(8).double()[:, :3],
+        lambda x: ascending(x, 8),
+        lambda x: root(x * x),
+        lambda x: taken(x, torch.tensor([4, 0, 2]), -1),
+        lambda x: taken(x, torch.tensor([1, 2]), -2),
+        lambda x: looked_up(torch.arange(9).double(), (x > 0.0).long()),
+    ],
+)
+def test_values_mean_what_tensors_mean(function):
+    expected = function(torch.from_numpy(CUBE)).numpy()
+    found = applied(function, CUBE, num_axes=expected.ndim)
+    assert found.dtype == expected.dtype
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+
+
+def test_what_values_do_not_know_is_refused():
+    value = Graph().input("x", F64, (2, 2))
+    with pytest.raises(TypeError, match="median of torch is not known to values of a graph"):
+        torch.median(value)
+
+
+@pytest.mark.parametrize("number", [1 + 1e-9, 1 - 1e-9, 1.0, 2.0])
+@pytest.mark.parametrize("function", [operator.mul, operator.truediv], ids=["times", "over"])
+def test_a_factor_next_to_one_is_not_dropped(function, number):
+    # onnxruntime takes it for 1 where the node is neither the first nor the last
+    x = np.abs(X)
+    found = applied(lambda value: function(value.abs(), number).maximum(-1.0), x)
+    np.testing.assert_allclose(found, function(x, number), rtol=1e-15)
+
+
+@pytest.mark.parametrize("function", [operator.add, operator.le, operator.matmul])
+def test_values_of_two_dtypes_do_not_meet(function):
+    graph = Graph()
+    x, y = graph.input("x", F32, (2, 2)), graph.input("y", F64, (2, 2))
+    with pytest.raises(TypeError, match="float32 meets float64; cast one of them"):
+        function(x, y)
+
+
+# Bodies ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_if_makes_values_one_way_or_the_other(wanted):
+    graph = Graph()
+    x, flag = graph.input("x", F64, ("k",)), graph.input("flag", BOOL, (1,))
+    made = graph.if_(
+        flag,
+        lambda: [x + 1.0, x > 0.0],
+        lambda: [x, graph.constant([True], BOOL)],  # made outside, or by no node
+    )
+    graph.output("y", made[0], ("k",))
+    graph.output("z", made[1], ("m",))
+    found = run(graph, x=X, flag=np.array([wanted]))
+    np.testing.assert_array_equal(found["y"], X + 1 if wanted else X)
+    np.testing.assert_array_equal(found["z"], X > 0 if wanted else [True])
