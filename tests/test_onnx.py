@@ -14,7 +14,6 @@ from contract.names import STREAM_OUTPUTS
 from engine_bins import some_hand
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from small_detector import HAND, alarming_detector, raw_bins, small_detector
 from streams import detector_of, onset_of, signal
 from test_dead_streams import alarming_with_gaussians
@@ -33,10 +32,9 @@ from tactslip_torch.deploy.check import (
     simulated_stream,
 )
 from tactslip_torch.deploy.stream import onset_memory, onset_scores, stream_graph
-from tactslip_torch.deploy.value import BOOL, F32, F64, I64, Graph
-from tactslip_torch.features.ops import ascending, counted, looked_up, root, taken
+from tactslip_torch.deploy.value import F32, F64, I64, Graph
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.calibration import LARGEST_LLR, Isotonic, Platt, probability, widened_llr
+from tactslip_torch.model.calibration import Isotonic, Platt, probability, widened_llr
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
@@ -621,54 +619,6 @@ def test_a_stream_that_ran_for_years_goes_on(rule, onset):
 
 # Calibration -----------------------------------------------------------------------------------
 
-CALIBRATIONS = (
-    Platt(2.0, -0.7),
-    Platt(0.0, 0.3),
-    Platt(1 + 1e-9, 0.0),
-    Platt(1e12, -3.0),
-    Isotonic((-1.0, -0.25, 0.0, 0.1, 3.0), (-4.0, -4.0, -0.5, 0.0, 5.0)),
-    Isotonic((-1e300, 1e300), (-1e30, 1e30)),
-    Isotonic((0.5,), (0.0,)),
-)
-
-
-def scores_of(dtype):
-    """Any finite score, and often one of a few."""
-    largest, width = float(np.finfo(dtype).max), dtype.itemsize * 8
-    usual = st.floats(-4, 4, width=width) | st.sampled_from([0.0, -0.25, 0.1, 3.0])
-    any_ = st.floats(-largest, largest, width=width, allow_nan=False)
-    return arrays(dtype, st.integers(1, 30), elements=usual | any_)
-
-
-@cache
-def calibrating(calibration, dtype, slip_share):
-    graph = Graph()
-    llr = calibration.llr(graph.input("score", dtype, ("k",)))
-    graph.output("llr", llr, ("k",))
-    graph.output("probability", probability(llr, slip_share), ("k",))
-    return runner(session_of(graph.model()))
-
-
-@pytest.mark.parametrize("dtype", [F32, F64], ids=str)
-@pytest.mark.parametrize("calibration", CALIBRATIONS)
-@settings(max_examples=12)
-@given(data=st.data(), slip_share=st.sampled_from([0.5, 0.02]))
-def test_scores_become_the_same_ratios_and_probabilities(calibration, dtype, data, slip_share):
-    ends = np.array([np.finfo(dtype).min, np.finfo(dtype).max, 0.0], dtype)
-    knots = np.array(getattr(calibration, "scores", ())).clip(*ends[:2]).astype(dtype)
-    score = np.concatenate([data.draw(scores_of(dtype)), ends, knots])
-    expected = calibration.llr(torch.from_numpy(score))
-    found = calibrating(calibration, dtype, slip_share)({"score": score})
-    assert found["llr"].dtype == found["probability"].dtype == dtype
-    assert np.abs(found["llr"]).max() <= LARGEST_LLR
-    tiny = 4 * np.finfo(dtype).eps
-    largest = max(1.0, *map(abs, (*getattr(calibration, "llrs", ()), 0.0)))
-    np.testing.assert_allclose(found["llr"], expected, rtol=tiny, atol=tiny * largest)
-    close = 1e-12 if dtype == F64 else 2e-7
-    stated = probability(expected, slip_share)
-    np.testing.assert_allclose(found["probability"], stated, rtol=0, atol=close)
-
-
 X = np.array([-2.5, -1.0, 0.0, 0.5, 1.0, 3.0])
 
 
@@ -694,58 +644,6 @@ def applied(function, *arrays, num_axes=1):
 # Arithmetic ------------------------------------------------------------------------------------
 
 
-CUBE = np.random.default_rng(0).integers(-3, 4, (2, 3, 8)) / 4.0
-
-
-@pytest.mark.parametrize(
-    "function",
-    [
-        lambda x: x.clamp(-0.5, 0.25),
-        lambda x: x.clamp(min=0.25),
-        lambda x: x.clamp(max=0.25),
-        lambda x: torch.minimum(x, x * x),
-        lambda x: torch.maximum(x, x * x),
-        lambda x: torch.where(x > 0.0, x, -1.0),
-        lambda x: torch.cat([x, x * 2.0], dim=-2),
-        lambda x: x.abs().sqrt(),
-        lambda x: (x.abs() + 1.0).log(),
-        lambda x: x.exp().floor(),
-        lambda x: x.sigmoid(),
-        lambda x: x.eq(0.5),
-        lambda x: (1.0 / x).isfinite(),
-        lambda x: x.float() if isinstance(x, torch.Tensor) else x.to(torch.float32),
-        lambda x: (x > 0.0).double(),
-        lambda x: (x > 0.0).type_as(x),
-        lambda x: x.detach().sum(0, keepdim=True),
-        lambda x: x.mean(-1),
-        lambda x: x.amax(-1),
-        lambda x: x.amin(-1, keepdim=True),
-        lambda x: x[..., 1:],
-        lambda x: x[..., :-1],
-        lambda x: x[..., 2],
-        lambda x: x[..., -1],
-        lambda x: x[..., None].squeeze(-1),
-        lambda x: x.unsqueeze(0).squeeze(0),
-        lambda x: x.flatten(-2),
-        lambda x: (x > 0.0).long().cumsum(-1),
-        lambda x: x.argmax(-1, keepdim=True),
-        lambda x: x.gather(-1, x.argmax(-1, keepdim=True)),
-        lambda x: counted((x * x).floor().long(), 4),
-        lambda x: x @ torch.eye(8).double()[:, :3],
-        lambda x: ascending(x, 8),
-        lambda x: root(x * x),
-        lambda x: taken(x, torch.tensor([4, 0, 2]), -1),
-        lambda x: taken(x, torch.tensor([1, 2]), -2),
-        lambda x: looked_up(torch.arange(9).double(), (x > 0.0).long()),
-    ],
-)
-def test_values_mean_what_tensors_mean(function):
-    expected = function(torch.from_numpy(CUBE)).numpy()
-    found = applied(function, CUBE, num_axes=expected.ndim)
-    assert found.dtype == expected.dtype
-    np.testing.assert_allclose(found, expected, rtol=1e-14)
-
-
 def test_what_values_do_not_know_is_refused():
     value = Graph().input("x", F64, (2, 2))
     with pytest.raises(TypeError, match="median of torch is not known to values of a graph"):
@@ -767,22 +665,3 @@ def test_values_of_two_dtypes_do_not_meet(function):
     x, y = graph.input("x", F32, (2, 2)), graph.input("y", F64, (2, 2))
     with pytest.raises(TypeError, match="float32 meets float64; cast one of them"):
         function(x, y)
-
-
-# Bodies ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("wanted", [True, False])
-def test_if_makes_values_one_way_or_the_other(wanted):
-    graph = Graph()
-    x, flag = graph.input("x", F64, ("k",)), graph.input("flag", BOOL, (1,))
-    made = graph.if_(
-        flag,
-        lambda: [x + 1.0, x > 0.0],
-        lambda: [x, graph.constant([True], BOOL)],  # made outside, or by no node
-    )
-    graph.output("y", made[0], ("k",))
-    graph.output("z", made[1], ("m",))
-    found = run(graph, x=X, flag=np.array([wanted]))
-    np.testing.assert_array_equal(found["y"], X + 1 if wanted else X)
-    np.testing.assert_array_equal(found["z"], X > 0 if wanted else [True])

@@ -27,13 +27,7 @@ from tactslip_torch.analysis.latency import (
     parts_of,
     time_calls,
 )
-from tactslip_torch.analysis.pareto import (
-    Candidate,
-    Group,
-    ParetoSearch,
-    Search,
-    nondominated,
-)
+from tactslip_torch.analysis.pareto import Candidate, Group, ParetoSearch, Search, nondominated
 from tactslip_torch.commands.entry import one_line
 from tactslip_torch.data.splits import seen6, unseen4
 from tactslip_torch.features.bank import make_plan, pool_names
@@ -436,21 +430,6 @@ def test_what_is_missed_is_named():
         "compute 5000 us not below the hop 5 ms"
     ]
     assert Latency(0.0, 50.0, 5.0, 1000.0).load == pytest.approx(0.2)
-
-
-def test_the_hop_leaves_head_room_where_one_does():
-    limits = Limits(80.0, 500.0, [5.0, 10.0, 25.0])
-    parts = Latency(4.6, 50.0, 5.0, 1.0)
-    assert limits.latency(parts, 380.0).hop_ms == 25  # 79.98 ms
-    roomy = limits.latency(parts, 380.0, headroom=1.25)
-    assert (roomy.hop_ms, roomy.compute_us) == (10, 380)  # 25 ms with 475 us are 80.075 ms
-    assert limits.latency(parts, 390.0, headroom=1.5).hop_ms == 25  # 585 us are none: without
-    assert Limits(60.0, 5000.0, [5.0]).headroom(Latency(2.0, 50.0, 5.0, 400.0)) == pytest.approx(
-        7.5
-    )
-    assert Limits(900.0, 500.0, [5.0]).headroom(Latency(2.0, 50.0, 5.0, 400.0)) == 1.25
-    for us, hop_ms in ((12_000.0, 25), (60_000.0, 25), (5_000.0, 10)):
-        assert Latency(0.0, 50.0, 5.0, us).with_shortest_hop(limits.hops_ms).hop_ms == hop_ms
 
 
 # Costs -------------------------------------------------------------------------------------------

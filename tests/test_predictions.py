@@ -217,21 +217,21 @@ def test_what_is_no_channel_of_the_hand_is_refused_in_one_line(masked, said, sma
         small.predict_raw(raw_bins(1), masked_channels=masked)
 
 
-SEED = 4  # of a transformed that needs no SG1
+SEED = 4  # of a detector that needs no SG1
 
 
 @pytest.fixture(scope="module", params=["imputation", "gaussians"])
-def transformed(request):
+def either(request):
     return {"imputation": small_detector, "gaussians": with_gaussians}[request.param](seed=SEED)
 
 
-def healthy_bins(transformed):
-    return transformed.channel_filter.valid(raw_bins(6))
+def healthy_bins(either):
+    return either.channel_filter.valid(raw_bins(6))
 
 
-def broken_bins(transformed):
+def broken_bins(either):
     """Bins that miss nothing, what no feature needs, a sensor, two (twice), and all."""
-    bins = healthy_bins(transformed)
+    bins = healthy_bins(either)
     bins[1, 0, 50] = bins[2, 2, 50] = torch.nan
     bins[3:5, 1:3, 50] = torch.inf
     bins[5] = torch.nan
@@ -246,61 +246,59 @@ def assert_same(found, expected, most=1e-9):
         torch.testing.assert_close(each, wanted, rtol=most, atol=most)
 
 
-def gradient_of(transformed, bins):
+def gradient_of(either, bins):
     """Of the sum of the scores; the patterns are looked at here, and bins go by them."""
     bins = bins.clone().requires_grad_()
-    transformed.predict(bins).score.sum().backward()
+    either.predict(bins).score.sum().backward()
     return bins.grad
 
 
 @BINS
-def test_mapped_over_bins(bins_of, transformed):
-    bins = bins_of(transformed)
-    assert_same(torch.vmap(transformed.predict)(bins), transformed.predict(bins))
+def test_mapped_over_bins(bins_of, either):
+    bins = bins_of(either)
+    assert_same(torch.vmap(either.predict)(bins), either.predict(bins))
     dead = ["SG2", "PVDF2"]
-    mapped = torch.vmap(lambda part: transformed.predict(part, masked_channels=dead))(bins)
-    assert_same(mapped, transformed.predict(bins, masked_channels=dead))
+    mapped = torch.vmap(lambda part: either.predict(part, masked_channels=dead))(bins)
+    assert_same(mapped, either.predict(bins, masked_channels=dead))
 
 
 @BINS
-def test_gradients_are_those_of_backward(bins_of, transformed):
-    bins = bins_of(transformed)
-    expected = gradient_of(transformed, bins)
+def test_gradients_are_those_of_backward(bins_of, either):
+    bins = bins_of(either)
+    expected = gradient_of(either, bins)
     assert expected.isfinite().all()
     assert expected[0].abs().max() > 0
 
     def score(part):
-        return transformed.predict(part).score.sum()
+        return either.predict(part).score.sum()
 
     for take in (torch.func.grad(score), torch.vmap(torch.func.grad(score))):
         torch.testing.assert_close(take(bins), expected, rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.slow
-def test_compiled_it_holds_for_other_bins(transformed, monkeypatch):
+def test_compiled_it_holds_for_other_bins(either, monkeypatch):
     """With samples for features, as capturing the descriptors takes half a minute."""
 
     def samples(bins):
-        return bins.index_select(-2, transformed.channel_index)[..., 7]
+        return bins.index_select(-2, either.channel_index)[..., 7]
 
-    monkeypatch.setattr(transformed, "_features", samples)
-    monkeypatch.setattr(transformed.extractor, "backend", "torch")  # the engine would ask for none
+    monkeypatch.setattr(either, "_features", samples)
+    monkeypatch.setattr(either.extractor, "backend", "torch")  # the engine would ask for none
     torch.compiler.reset()
-    compiled = torch.compile(
-        transformed.predict, backend="eager"
-    )  # capture alone, without a compiler
-    for bins in (healthy_bins(transformed), broken_bins(transformed)):
-        assert_same(compiled(bins), transformed.predict(bins))
+    compiled = torch.compile(either.predict, backend="eager")  # capture alone, without a compiler
+    for bins in (healthy_bins(either), broken_bins(either)):
+        assert_same(compiled(bins), either.predict(bins))
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
 def test_a_detector_compiles():
-    transformed = with_gaussians(seed=SEED)
+    either = with_gaussians(seed=SEED)
     torch.compiler.reset()
-    compiled = torch.compile(transformed, backend="eager")
-    for bins in (healthy_bins(transformed), healthy_bins(transformed).float()):
-        assert_same([compiled(bins)], [transformed(bins)])
+    compiled = torch.compile(either, backend="eager")
+    for bins in (healthy_bins(either), healthy_bins(either).float()):
+        assert_same([compiled(bins)], [either(bins)])
 
 
 # Autocast and other kinds of numbers -------------------------------------------------------------
@@ -309,16 +307,16 @@ def test_a_detector_compiles():
 @pytest.mark.parametrize("backend", ["native", "torch"])
 def test_autocast_changes_nothing(backend):
     """Not even in a head of float32, whose products it would make in bfloat16."""
-    transformed = small_detector(backend=backend).float()
+    either = small_detector(backend=backend).float()
     samples = raw_bins(20).float()
-    bins = transformed.channel_filter.valid(samples)
-    features = transformed.extractor(bins)
+    bins = either.channel_filter.valid(samples)
+    features = either.extractor(bins)
     calls = (
-        (transformed.predict_raw, samples),
-        (transformed.score_raw, samples.clone().requires_grad_()),
-        (transformed, bins),
-        (transformed.pool, bins.clone().requires_grad_()),
-        (transformed.score_features, features),
+        (either.predict_raw, samples),
+        (either.score_raw, samples.clone().requires_grad_()),
+        (either, bins),
+        (either.pool, bins.clone().requires_grad_()),
+        (either.score_features, features),
     )
     for call, x in calls:
         plain = call(x)
@@ -338,11 +336,11 @@ def test_autocast_changes_nothing(backend):
     ],
 )
 def test_what_is_no_tensor_of_volts_is_refused(convert, message):
-    transformed, samples = small_detector(), raw_bins(2)
-    for call in (transformed.predict_raw, transformed.score_raw):
+    either, samples = small_detector(), raw_bins(2)
+    for call in (either.predict_raw, either.score_raw):
         with pytest.raises((TypeError, ValueError), match=message):
             call(convert(samples))
-    for call in (transformed.predict, transformed, transformed.pool):
+    for call in (either.predict, either, either.pool):
         with pytest.raises((TypeError, ValueError), match=message):
             call(convert(samples[..., 25:125]))
 
@@ -351,27 +349,25 @@ def test_what_is_no_tensor_of_volts_is_refused(convert, message):
 
 
 @pytest.mark.parametrize("how", ["loaded", "moved"])
-def test_what_is_made_under_inference_mode_judges_what_is_missing(how, transformed, tmp_path):
+def test_what_is_made_under_inference_mode_judges_what_is_missing(how, either, tmp_path):
     """Once refused by torch: tensors of that mode do not count how often they are changed."""
-    bins = broken_bins(transformed)
-    transformed.save(tmp_path / "transformed.pt")
+    bins = broken_bins(either)
+    either.save(tmp_path / "detector.pt")
     with torch.inference_mode():
-        made = SlipDetector.load(tmp_path / "transformed.pt")
+        made = SlipDetector.load(tmp_path / "detector.pt")
         if how == "moved":
             made = made.float().double()
         inside = made.predict(bins)
     for found in (inside, made.predict(bins)):
-        torch.testing.assert_close(
-            found.score, transformed.predict(bins).score, rtol=1e-5, atol=1e-5
-        )
+        torch.testing.assert_close(found.score, either.predict(bins).score, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("is_loaded", [False, True])
 def test_gradients_are_open_after_a_first_use_under_inference_mode(is_loaded, tmp_path):
-    transformed = with_gaussians(seed=SEED)
-    transformed.save(tmp_path / "transformed.pt")
+    either = with_gaussians(seed=SEED)
+    either.save(tmp_path / "detector.pt")
     with torch.inference_mode():
         if is_loaded:
-            transformed = SlipDetector.load(tmp_path / "transformed.pt")
-        transformed.predict(broken_bins(transformed))
-    assert gradient_of(transformed, broken_bins(transformed)).isfinite().all()
+            either = SlipDetector.load(tmp_path / "detector.pt")
+        either.predict(broken_bins(either))
+    assert gradient_of(either, broken_bins(either)).isfinite().all()

@@ -33,13 +33,6 @@ def assert_none(wrong, batch, what):
     assert not found, f"{what}: {found}"
 
 
-def scattered(wrong, where):
-    """Flags of some columns, among all columns."""
-    whole = torch.zeros(len(wrong), len(NAMES), dtype=torch.bool)
-    whole[:, where] = wrong
-    return whole
-
-
 def batches(num, dtype):
     return generated.batches(num, dtype, len(HAND), NUM)
 
@@ -47,56 +40,17 @@ def batches(num, dtype):
 # Values --------------------------------------------------------------------------------------
 
 SLACK = 16 * NUM  # eps that sums of 100 may cost a bound
-SKEWNESS, KURTOSIS = 98 / math.sqrt(99), 98 + 1 / 99
-
-
-def bounds_of(features, dtype):
-    """Name, columns and what must not exceed 0, for bounds that need the features alone."""
-    slack = SLACK * torch.finfo(dtype).eps
-    f = features.double()
-    for name, low, high in (
-        ("skewness", -SKEWNESS, SKEWNESS),
-        ("kurtosis", 1, KURTOSIS),
-        ("peak_factor", -10, 10),
-        ("entropy", 0, math.log2(NUM)),
-        ("correlation", -1, 1),
-        ("band_energy_ratio", 0, 1),
-        ("spectral_centroid", 0, 1980),
-        ("spectral_spread", 0, 990),
-        ("cv", -1e6 * math.sqrt(100 / 99), 1e6 * math.sqrt(100 / 99)),
-    ):
-        here = columns(name)
-        excess = torch.maximum(low - f[:, here], f[:, here] - high)
-        yield name, here, excess - slack * max(abs(low), abs(high))
-    for domain in ("time", "freq"):
-        span, std = f[:, columns("range", domain)], f[:, columns("std", domain)]
-        least = slack * span + torch.finfo(dtype).tiny  # below it there are no digits
-        for name, excess in {
-            "range": -span,
-            "iqr": f[:, columns("iqr", domain)] - span,
-            "mean_deviation": f[:, columns("mean_deviation", domain)] - std,
-            "std": torch.maximum(
-                std - span * 0.5 * math.sqrt(100 / 99), span / math.sqrt(198) - std
-            ),
-            "energy": -f[:, columns("energy", domain)],
-            "kurtosis": f[:, columns("skewness", domain)] ** 2
-            + 1
-            - f[:, columns("kurtosis", domain)] * (1 + slack),  # Pearson's inequality
-        }.items():
-            yield name, columns(name, domain), excess - (slack if name == "kurtosis" else least)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("dtype", DTYPES)
 @settings(max_examples=15)
 @given(data=st.data())
-def test_every_value_is_finite_and_within_its_bounds(dtype, backend, data):
+def test_every_value_is_finite_and_ratios_of_energies_add_up_to_one(dtype, backend, data):
     batch = data.draw(batches(32, dtype))
     features = BACKENDS[backend](batch.bins)
     assert features.dtype == dtype
     assert_none(~features.isfinite(), batch, "not finite")
-    for name, where, excess in bounds_of(features, dtype):
-        assert_none(scattered(excess > 0, where), batch, f"beyond the bounds of {name}")
     ratios = features[:, columns("band_energy_ratio")].double().unflatten(-1, (10, 8)).sum(-1)
     is_zero = (batch.bins[:, 14:] == 0).all(-1)
     slack = SLACK * torch.finfo(dtype).eps

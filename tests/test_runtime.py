@@ -1,7 +1,6 @@
 """Threads, processes, files that are written whole, tables of tensors, and batches seen."""
 
 import os
-import pickle
 import random
 import time
 import zipfile
@@ -63,25 +62,6 @@ def test_an_error_is_raised_and_stops_the_rest(number):
     time.sleep(0.02)
     assert begun == before  # nothing runs on behind the error
     assert torch.get_num_threads() == number
-
-
-def test_nested_calls_run_where_they_are_and_modes_are_the_callers():
-    torch.set_num_threads(2)
-    pairs, modes = [], []
-    for_each(lambda i: for_each(lambda j: pairs.append((i, j)), range(3)), range(4))
-    assert sorted(pairs) == [(i, j) for i in range(4) for j in range(3)]
-
-    def note(_):
-        modes.append((torch.is_grad_enabled(), torch.is_inference_mode_enabled()))
-
-    for_each(note, [0])
-    with torch.no_grad():
-        for_each(note, [0])
-    with torch.inference_mode():
-        held = torch.zeros(2)
-        for_each(lambda i: held[i].add_(1), range(2))  # refused outside inference mode
-        for_each(note, [0])
-    assert modes == [(True, False), (False, False), (False, True)]
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # from Python 3.12 on
@@ -251,36 +231,6 @@ def test_content_that_does_not_fit_its_digest_is_refused(saved, change):
     content.pop(next(iter(change)))
     torch.save(content, saved)
     assert refusal(saved) == f"{saved} is damaged or no file of ours; make it again"
-
-
-class Trap:
-    """Makes a folder when it is unpickled."""
-
-    def __init__(self, mark):
-        self.mark = mark
-
-    def __reduce__(self):
-        return type(self.mark).mkdir, (self.mark,)
-
-
-def test_other_files_are_refused_and_nothing_in_them_is_executed(tmp_path):
-    path, mark = tmp_path / "a.pt", tmp_path / "sprung"
-    trapped = {"format": FORM, "facts": "{}", "tensors": {}, "digest": Trap(mark)}
-    for content in (torch.zeros(3), {"format": torch.zeros(3)}, [FORM], {}, None, trapped):
-        torch.save(content, path)
-        assert refusal(path) == f"{path} is damaged or no file of ours; make it again"
-    path.write_bytes(pickle.dumps(Trap(mark)))
-    with pytest.raises(ValueError, match="no file of ours"):
-        load_table(path, FORM)
-    assert not mark.exists()
-    pickle.loads(path.read_bytes())
-    assert mark.exists(), "the trap is none"
-    save_table(path, "test table 2", VALUES, tables())
-    assert refusal(path) == f"{path} must be of format 'test table 1', got 'test table 2'"
-    with pytest.raises(ValueError, match=r"made by version 0\.1\.0 or earlier; make it"):
-        load_table(path, "test table 3")
-    with pytest.raises(FileNotFoundError, match=r"no file at .*nowhere\.pt"):
-        load_table(tmp_path / "nowhere.pt", FORM)
 
 
 @pytest.mark.parametrize("how", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA])

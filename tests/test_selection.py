@@ -160,25 +160,6 @@ def test_distinct_features_equal_the_definition(most_correlation, num, rng):
     assert actual.tolist() == distinct(scores, features, is_slip, num, most_correlation)
 
 
-@pytest.mark.parametrize("size", [1e-30, 1.0, 1e30])
-@pytest.mark.parametrize("repeats", [(2.0, 0.0), (-1.0, 3.0)])
-def test_a_repeat_is_found_at_any_size_and_offset(size, repeats, rng):
-    source = torch.from_numpy(rng.integers(-99, 99, 40)).double()
-    factor, offset = repeats
-    features = torch.stack([source, factor * source + offset], dim=1) * size
-    ranked = rank_distinct(torch.tensor([2.0, 1.0]), features.float(), torch.zeros(40), 1, 1 - 1e-6)
-    assert ranked.tolist() == [0]
-    other = torch.from_numpy(rng.standard_normal((40, 1)))
-    ranked = rank_distinct(
-        torch.tensor([3.0, 2.0, 1.0]),
-        torch.cat([features, other * size], dim=1).float(),
-        torch.zeros(40),
-        2,
-        1 - 1e-6,
-    )
-    assert ranked.tolist() == [0, 2]
-
-
 def test_errors():
     one_class = moments_of(torch.randn(5, 3), torch.ones(5, dtype=torch.long))
     with pytest.raises(ValueError, match="no non-slip bin"):

@@ -441,7 +441,7 @@ def test_provenance_and_keys_name_the_backend_of_bristles(monkeypatch):
     assert simulate(scene, windows=[]).provenance["integrator"] == by_engine
     for fidelity, backends in (
         ("kinematic", [None, None]),
-        ("bristle_recordings", ["native", "torch"]),
+        ("bristles", ["native", "torch"]),
     ):
         source = SimulatedRecordings(
             cycles=1, materials=["M2"], fidelity=fidelity, scene={"strokes": strokes}
