@@ -203,13 +203,15 @@ def statistics_of(recordings, sample_bins=3):
 
 def bits_of(statistics):
     """All of a statistics but its moments, as bytes and text, so that 0 and -0 differ."""
-    sample = statistics.sample.state_dict()
-    tensors = {**sample["tensors"], "minimum": statistics.minimum, "maximum": statistics.maximum}
+    sample = vars(statistics.sample.bins())
+    tensors = {name: x for name, x in sample.items() if isinstance(x, torch.Tensor)}
+    tensors |= {"minimum": statistics.minimum, "maximum": statistics.maximum}
     bits = {
         name: (str(tensor.dtype), tuple(tensor.shape), tensor.numpy().tobytes())
         for name, tensor in tensors.items()
     }
-    return sorted(statistics.seen_batches.items()), sample["facts"], bits
+    names = sample["group_names"], sample["recording_names"]
+    return sorted(statistics.seen_batches.items()), names, bits
 
 
 @given(

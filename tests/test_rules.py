@@ -29,10 +29,8 @@ from tactslip_torch.onset.rules import (
 )
 from tactslip_torch.onset.thresholds import (
     Budget,
-    alarm_rate,
     false_alarms,
     lowest_threshold,
-    poisson_interval,
 )
 
 LIST = (
@@ -226,57 +224,7 @@ def test_what_is_no_number_is_neither_above_nor_below() -> None:
 
 
 # ---------------------------------------------------------------------------- the Poisson interval
-@pytest.mark.parametrize("count", [0, 1, 37, 100_000])
-@pytest.mark.parametrize("level", [0.5, 0.999])
-def test_poisson_interval_is_that_of_chi_square(count: int, level: float) -> None:
-    tail = (1 - level) / 2
-    low = chi2.ppf(tail, 2 * count) / 2 if count else 0.0
-    high = chi2.isf(tail, 2 * count + 2) / 2
-    assert poisson_interval(count, level) == pytest.approx((low, high), rel=1e-9, abs=1e-300)
-
-
 # ------------------------------------------------------------------------------------ the rate
-
-
-def bootstrap(counts: np.ndarray, hours: np.ndarray, level: float) -> np.ndarray:
-    source = np.random.default_rng(5)
-    drawn = source.integers(len(counts), size=(20_000, len(counts)))
-    return np.quantile(
-        counts[drawn].sum(1) / hours[drawn].sum(1), [(1 - level) / 2, (1 + level) / 2]
-    )
-
-
-def test_interval_holds_the_bootstrap_and_that_of_clusters() -> None:
-    # in ten recordings all alarms, in ninety none
-    counts = np.array([12, 9, 1, 30, 5, 8, 14, 3, 2, 6] + [0] * 90)
-    hours = np.linspace(0.5, 1.5, 100)
-    found = alarm_rate(counts.tolist(), hours.tolist(), level=0.9)
-    drawn = bootstrap(counts, hours, 0.9)
-    total = counts.sum()
-    expected = total * hours / hours.sum()
-    size = ((counts - expected) ** 2).sum() / total * 100 / 99
-    low, high = chi2.ppf(0.05, 2 * total / size) / 2, chi2.isf(0.05, 2 * total / size + 2) / 2
-    assert found.low == pytest.approx(min(drawn[0], low * size / hours.sum()), rel=0.05)
-    assert found.high == pytest.approx(max(drawn[1], high * size / hours.sum()), rel=0.05)
-    assert found.high > 1.3 * poisson_interval(int(total), 0.9)[1] / hours.sum()
-
-
-@pytest.mark.parametrize(
-    ("counts", "hours", "said"),
-    [
-        ([1, 2], [1.0], r"one count and one number of hours .* got \(2,\) and \(1,\)"),
-        ([[1]], [[1.0]], "one count and one number of hours"),
-        ([], [], "some time must have been watched, got 0 alarms in 0 h"),
-        ([0], [0.0], "some time must have been watched"),
-        ([-1, 3], [1.0, 1.0], "must not be negative"),
-        ([1, 3], [-1.0, 2.0], "must not be negative"),
-        ([1], [math.nan], "some time must have been watched"),
-    ],
-)
-def test_rate_of_nonsense(counts, hours, said: str) -> None:
-    with pytest.raises(ValueError, match=said) as error:
-        alarm_rate(counts, hours)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
