@@ -242,6 +242,19 @@ def test_lines_of_text_are_read_with_their_faults(rng):
     assert events == []
 
 
+def test_garbage_without_end_is_told_ever_less_often():
+    now = [0.0]
+    frames = Frames("binary", header=HEADER)
+    reader = frames.reader(NAMES, RATE, now=lambda: now[0])
+    told = []
+    for second in range(300):
+        now[0] = float(second)
+        told += [second for _ in reader.feed((START + bytes(20)) * 50)]
+    assert 3 <= len(told) <= 12
+    (event,) = reader.end()
+    assert "10 bytes that begins with aa 55 (two such headers are 22 apart)" in event.text
+
+
 @pytest.mark.parametrize(
     ("how", "words"),
     [

@@ -199,6 +199,28 @@ def test_leading_axes_strides_copies_and_modes(backend):
 # Built and found ---------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"selected": []}, "empty selection"),
+        ({"selected": [len(NAMES)]}, rf"must lie in 0..{len(NAMES) - 1}, the pool's {len(NAMES)}"),
+        ({"backend": "fast"}, "backend must be one of auto, native, torch, got 'fast'"),
+    ],
+)
+def test_what_is_refused_is_one_line(arguments, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        made(POOL, **arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_gradient_asked_for_after_use_is_given():
+    detector, bins = small_detector(), raw_bins(2)
+    detector.score_raw(bins)
+    detector.head.linear.requires_grad_()
+    detector.score_raw(bins).sum().backward()
+    assert detector.head.linear.grad.abs().max() > 0
+
+
 @pytest.fixture
 def anew(monkeypatch):
     """The library is looked for again, here and afterwards."""

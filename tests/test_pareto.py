@@ -3,6 +3,7 @@
 import itertools
 import json
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -27,7 +28,16 @@ from tactslip_torch.analysis.latency import (
     parts_of,
     time_calls,
 )
-from tactslip_torch.analysis.pareto import Candidate, Group, ParetoSearch, Search, nondominated
+from tactslip_torch.analysis.pareto import (
+    Candidate,
+    Group,
+    ParetoSearch,
+    Search,
+    landmarks,
+    nondominated,
+    worth_naming,
+    worth_timing,
+)
 from tactslip_torch.commands.entry import one_line
 from tactslip_torch.data.splits import seen6, unseen4
 from tactslip_torch.features.bank import make_plan, pool_names
@@ -240,6 +250,61 @@ def test_a_pooled_score_is_that_of_everything_learned_without_the_material(searc
 
 
 # The front ---------------------------------------------------------------------------------------
+def test_each_finger_goes_that_is_missed_least(monkeypatch):
+    made = searching(rankings=["t"], components=["all"])
+    made.pool = FeaturePool(HAND)
+    made._channel_of = [HAND.names.index(name.channel) for name in made.pool.names]
+    worth = {"little": 0.01, "ring": 0.3, "middle": 0.02, "index": 0.2, "thumb": 0.1}
+
+    def played(group, ranking, degrees):
+        gone = group.channels.split(" without ")[1].split(" and ")
+        names = zip(made.pool.names, group.mask, strict=True)
+        assert {HAND.channel(n.channel).finger for n, m in names if m} == set(worth) - set(gone)
+        return [at(60.0, 100.0, 0.9 - sum(worth[finger] for finger in gone))]
+
+    monkeypatch.setattr(made, "_of_channels", played)
+    one_of_each = tuple(made._channel_of.index(channel) for channel in (0, 3, 6, 9, 12))
+    best = at(60.0, 100.0, 0.9, 5)
+    best = replace(best, selection=replace(best.selection, selected=one_of_each))
+    found = made.without_fingers(best)
+    kept = [max(c.balanced_accuracy for c in part) for part in (found[:5], found[5:9], found[9:12])]
+    assert kept == pytest.approx([0.89, 0.87, 0.77])  # little, then middle, then the thumb
+    assert len(found) == 5 + 4 + 3 + 2
+
+
+def test_landmarks_are_the_best_the_cheap_and_the_small():
+    def found(*rows):
+        return list(landmarks(rows).values())
+
+    best, third, poor, few, fewer, quick = (
+        at(60.0, us, accuracy, size)
+        for accuracy, us, size in (
+            *((0.99, 300.0, 100), (0.981, 100.0, 60), (0.979, 10.0, 30)),
+            *((0.95, 200.0, 20), (0.94, 90.0, 8), (0.99, 200.0, 100)),
+        )
+    )
+    assert found(poor, few, third, best, fewer) == [best, third, few]
+    assert found(best, third, poor) == [best, third, None]
+    assert found(best, quick, third) == [quick, None, None]  # as accurate: the quickest
+    assert found() == [None, None, None]
+    made = [at(60.0, 100.0, accuracy) for accuracy in (0.8, 0.9, 0.7)]
+    pooled = [replace(each, columns="pooled mean") for each in made]
+    small = [at(60.0, 100.0, accuracy, 20) for accuracy in (0.4, 0.5)]
+    assert set(worth_naming([*made, *pooled, *small])) == {made[1], pooled[1], small[1]}
+
+
+def test_what_is_close_to_the_limits_is_timed(rng):
+    """Two filters: the quick one waits longer, so accuracy does not rise with compute."""
+    line = [at(61.0, 100.0 + 10 * i, 0.8 - 0.001 * (39 - i)) for i in range(40)]
+    line += [at(59.0, 500.0 + 10 * i, 0.6 + 0.001 * i) for i in range(40)]
+    timed = worth_timing([line[i] for i in rng.permutation(80)], 10, Limits(80.0, 300.0, [5.0]))
+    # 450 us and 300 us at most, then 200 us, best first: the model may err either way
+    compute = [each.latency.compute_us for each in timed]
+    assert compute[:5] == [490.0, 450.0, 300.0, 200.0, 440.0]
+    assert {100.0, 890.0} < set(compute)  # the cheapest and the dearest
+    assert len(set(compute)) == 10
+
+
 def test_the_front_is_what_nothing_beats(rng):
     points = rng.integers(0, 6, (80, 3)).tolist()
 
@@ -434,6 +499,23 @@ def test_what_is_missed_is_named():
 
 # Costs -------------------------------------------------------------------------------------------
 POOL = FeaturePool(FOUR_CHANNELS)
+
+
+def test_the_hop_leaves_head_room_where_one_does():
+    limits = Limits(80.0, 500.0, [5.0, 10.0, 25.0])
+    parts = Latency(4.6, 50.0, 5.0, 1.0)
+    assert limits.latency(parts, 380.0).hop_ms == 25  # 79.98 ms
+    roomy = limits.latency(parts, 380.0, headroom=1.25)
+    assert (roomy.hop_ms, roomy.compute_us) == (10, 380)  # 25 ms with 475 us are 80.075 ms
+    assert limits.latency(parts, 390.0, headroom=1.5).hop_ms == 25  # 585 us are none: without
+    assert Limits(60.0, 5000.0, [5.0]).headroom(Latency(2.0, 50.0, 5.0, 400.0)) == pytest.approx(
+        7.5
+    )
+    assert Limits(900.0, 500.0, [5.0]).headroom(Latency(2.0, 50.0, 5.0, 400.0)) == 1.25
+    for us, hop_ms in ((12_000.0, 25), (60_000.0, 25), (5_000.0, 10)):
+        assert Latency(0.0, 50.0, 5.0, us).with_shortest_hop(limits.hops_ms).hop_ms == hop_ms
+
+
 PRIMES = dict(zip(GROUPS, (2.0, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37), strict=True))
 MODEL = CostModel(0.5, {name: 1000 * price for name, price in PRIMES.items()}, PRIMES, tail=2.0)
 

@@ -340,6 +340,17 @@ def test_only_what_matches_is_ranked_and_in_the_order_of_the_whole_ranking(most_
     assert plan.feature_filter == {"wanted": {"domain": ["freq"]}, **numbers}
 
 
+def test_more_features_than_match_are_cut_and_that_is_said(rng, caplog):
+    options = {"feature_filter": {"kind": "SG"}, "penalties": (0.1, 1.0)}
+    recipe, statistics = Recipe(num_features=[2, 60, 120], **options), told_apart(rng, SMALL_POOL)
+    plan = plan_detector(recipe, statistics, SMALL_POOL)
+    numbers = {"matching": 13, "num_features": [2, 13]}
+    assert plan.feature_filter == {"wanted": {"kind": ["SG"]}, **numbers}
+    assert [row["num_features"] for row in plan.validation] == [2, 2, 13, 13]
+    assert {SMALL_POOL.names[index].channel for index in plan.selection.selected} == {"SG1"}
+    assert "recipe.num_features=120 is cut to 13" in caplog.text
+
+
 def test_a_filter_is_never_silently_ignored(rng):
     recipe = Recipe(num_features=3, feature_filter={"kind": "SG"})
     with pytest.raises(ValueError, match=r"needs the names of features; hand over the pool"):

@@ -51,6 +51,7 @@ from tactslip_torch.report.results import (
     selected_features_figure,
     splits_table,
     tuning_figure,
+    tuning_tables,
     validation_figure,
     write_results,
 )
@@ -212,6 +213,15 @@ def test_the_papers_numbers_stand_beside_its_own_scenes_alone(drawn, tmp_path, s
         )
         expected += [f"scene {scene}" for scene in scenes]
     assert sorted(rows_of(line)[0][-6] for line in lines[2:]) == sorted(expected)
+
+
+def test_tuning_says_what_was_learned():
+    metrics = metrics_of(tuning=tuning())
+    metrics["splits"] = {"test": metrics["splits"]["test"]}
+    (text,) = tuning_tables(metrics)
+    assert "tuned by gradient" in text
+    assert "1 steps from C=1, c=0.5 to C=2, c=0.25; learned: penalty, offset, scales" in text
+    assert tuning_tables(metrics_of()) == []
 
 
 def test_reliability_and_prediction_sets_have_a_row_for_each_role():

@@ -552,6 +552,22 @@ def test_mains_bursts_are_mains_and_only_in_their_intervals():
 
 # --- faults -------------------------------------------------------------------------------------
 
+
+def test_warming_is_slow_and_each_channels_own():
+    moved = added("drift", "M3", "warming_mv", sg_drift_mv=0.0, pvdf_drift_mv=0.0)
+    duration_s = timeline(scene_of("drift", "M3")).duration_s
+    np.testing.assert_allclose(moved[:, 0], 0.0, atol=1e-7)
+    steps = np.diff(moved[:, ::200]) * np.sign(moved[:, -1:])  # every tenth of a second
+    assert np.all(steps > 0)  # one way
+    assert np.all(np.diff(steps)[:, :-1] < 1e-7)  # slower and slower
+    assert np.abs(np.diff(moved)).max() < 2.5 * np.abs(moved).max() / (duration_s * RATE_HZ)
+    far_mv = 1e3 * np.abs(moved[:, -1])
+    assert 400 / 2 < np.median(far_mv[SLOW]) < 400 * 2  # 14 draws of spread .5
+    assert 8 / 2 < np.median(far_mv[FAST]) < 8 * 2
+    assert len(set(np.sign(moved[SLOW, -1]))) == 2
+    assert np.ptp(np.log(far_mv[SLOW])) > 0.5
+
+
 NO_FAULTS = {"dead": [], "saturated": [], "swapped": [], "drops_per_s": 0.0}
 
 
