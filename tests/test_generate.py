@@ -168,7 +168,6 @@ def test_a_file_that_is_not_ours_is_never_replaced(tmp_path, content):
         (["scene=paper", "scene.name=a/b", "materials=[M1]"], "cannot name a file; give the scene"),
         (["format=xls"], "format must be one of npz, text, "),
         (["num_workers=-1"], "num_workers must be null or a number from 0, got -1"),
-        (["num_workers=many"], "num_workers must be null or a number from 0, got 'many'"),
         (["figure=true", "cycle=3"], r"cycle must lie in 0\.\.2 to be drawn, got 3"),
         (["figure=true", "stroke=0"], "stroke counts from 1, got 0"),
         (["~features.frames.PVDF"], "features.frames has no frame for PVDF channels"),

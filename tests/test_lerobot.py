@@ -158,7 +158,6 @@ WRONG = {
     "several": (edited(), {"samples": "x"}, "are observation.state, observation.tactile"),
     "frames": (edited(fps="fast"), {}, "fast frames a second"),
     "outside": (edited(data_path="../{episode_index}"), {}, "data_path is '../"),
-    "attribute": (edited(data_path="{chunk_index.real}"), {}, "data_path is '{chunk_index.real"),
     "damaged": (emptied, {}, "info.json is damaged"),
     "no table": (without("data/*/*"), {}, "is not there; download it whole"),
     "unlisted": (without("meta/episodes/*/*"), {}, "listed in no file of meta/episodes"),

@@ -90,7 +90,6 @@ FOUR = torch.tensor([True, False, True, True])
     ("call", "message"),
     [
         (lambda: confusion_matrix(FOUR, FOUR.float()), r"is_slip_predicted must be \[N\] bool.*fl"),
-        (lambda: confusion_matrix(FOUR[None], FOUR[None]), "is_slip_true must be"),
         (lambda: confusion_matrix(FOUR, FOUR[:3]), "got 4 and 3 bins"),
         (lambda: bin_metrics(FOUR, FOUR, ["a"], [2.0] * 4), "materials must have one.*, 4, got 1"),
         (lambda: bin_metrics(FOUR, FOUR, ["a"] * 4, [2.0]), "speeds_mm_s must have one.*, 4, got"),
@@ -99,9 +98,7 @@ FOUR = torch.tensor([True, False, True, True])
         (lambda: answer_counts(FOUR, torch.ones(3)), "of one N"),
         (lambda: answer_counts(FOUR, torch.tensor([1, 2, 0, 0])), "answers are -1, 0 or 1"),
         (lambda: weights_at_share(FOUR[2:], 0.5), "bins of slip and of non-slip"),
-        (lambda: weights_at_share(FOUR[:0], 0.5), "bins of slip and of non-slip"),
         (lambda: weights_at_share(FOUR, 0.0), "slip_share must lie between 0 and 1"),
-        (lambda: weights_at_share(FOUR, float("nan")), "slip_share must lie between 0 and 1"),
     ],
 )  # fmt: skip
 def test_wrong_input_is_named(call, message):

@@ -206,10 +206,8 @@ def test_the_file_holds_what_stands_in_for_a_channel(kind, small, tmp_path):
     ("masked", "said"),
     [
         (["SG9"], r"^masked_channels names the channel 'SG9', .* take some of SG1, SG2, PVDF1, PV"),
-        ("SG", r"^masked_channels names the channel 'SG'"),
         (3, r"^masked_channels must be a list of names of channels, got 3"),
         (torch.zeros(3).bool(), r"bool mask \[4\], got torch.bool \(3,\)"),
-        (torch.zeros(4), r"bool mask \[4\], got torch.float32 \(4,\)"),
     ],
 )
 def test_what_is_no_channel_of_the_hand_is_refused_in_one_line(masked, said, small):
@@ -277,21 +275,6 @@ def test_gradients_are_those_of_backward(bins_of, either):
 
 
 @pytest.mark.slow
-def test_compiled_it_holds_for_other_bins(either, monkeypatch):
-    """With samples for features, as capturing the descriptors takes half a minute."""
-
-    def samples(bins):
-        return bins.index_select(-2, either.channel_index)[..., 7]
-
-    monkeypatch.setattr(either, "_features", samples)
-    monkeypatch.setattr(either.extractor, "backend", "torch")  # the engine would ask for none
-    torch.compiler.reset()
-    compiled = torch.compile(either.predict, backend="eager")  # capture alone, without a compiler
-    for bins in (healthy_bins(either), broken_bins(either)):
-        assert_same(compiled(bins), either.predict(bins))
-
-
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
 def test_a_detector_compiles():
     either = with_gaussians(seed=SEED)
@@ -329,10 +312,8 @@ def test_autocast_changes_nothing(backend):
     ("convert", "message"),
     [
         (torch.Tensor.bfloat16, r"got torch.bfloat16; convert with .float\(\) or .double\(\)"),
-        (torch.Tensor.half, "got torch.float16; convert"),
         (torch.Tensor.int, "got torch.int32; convert"),
         (torch.Tensor.numpy, "got numpy.ndarray; use torch.as_tensor"),
-        (torch.Tensor.tolist, "got list; use torch.as_tensor"),
     ],
 )
 def test_what_is_no_tensor_of_volts_is_refused(convert, message):

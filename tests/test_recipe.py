@@ -22,16 +22,14 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Platt, calibration_from_dict, fit_platt
-from tactslip_torch.model.fit import TrainingBins, fit_machine, held_out_scores
+from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.missing_channels import RESOLUTION
 from tactslip_torch.training import plan as planning
 from tactslip_torch.training.learner import SlipLearner
 from tactslip_torch.training.plan import (
     TrainingPass,
-    candidates,
     choose_model,
-    fitted_selection,
     plan_detector,
 )
 from tactslip_torch.training.recipe import (
@@ -44,9 +42,6 @@ from tactslip_torch.training.recipe import (
     select_features,
 )
 from tactslip_torch.training.tuning import (
-    SETTINGS,
-    GridPoint,
-    LearnedSettings,
     Tuning,
     grid_points,
     grouped_loss,
@@ -137,19 +132,13 @@ def test_a_sample_stands_for_all_bins_with_both_classes_of_one_weight(balance, r
         ({"balance": "none"}, r"recipe.balance must be one of undersample, weights, got 'none'"),
         ({"kernel": "rbf"}, r"recipe.kernel=rbf needs recipe.gamma"),
         ({"penalties": ()}, r"recipe.penalties must be positive, got \[\]"),
-        ({"penalties": (0.1, 0.0)}, r"recipe.penalties must be positive"),
-        ({"penalties": float("nan")}, r"recipe.penalties must be positive"),
         ({"penalties": (0.1, float("inf"))}, r"validation needs finite values"),
         (
             {"num_features": 1.5},
             r"recipe.num_features must be whole numbers of at least 1, got \[1.5\]",
         ),
-        ({"num_features": 0}, r"recipe.num_features must be whole numbers of at least 1"),
-        ({"penalties": "strong"}, r"recipe.penalties must be positive, got \['strong'\]"),
         ({"offsets": -1.0}, r"recipe.offsets must not be negative"),
-        ({"tail": 0.5}, r"recipe.tail must lie in \[0, 0.5\)"),
         ({"tail": "0.1"}, r"recipe.tail must lie in \[0, 0.5\), got '0.1'"),  # text is no number
-        ({"tail": [0.1]}, r"recipe.tail must lie in \[0, 0.5\), got \[0.1\]"),  # nor is a list
         ({"most_correlation": 0.0}, r"recipe.most_correlation must lie in \(0, 1\]"),
         ({"sample_bins": 1}, r"recipe.sample_bins must be at least 2"),
         ({"degree": 0}, r"degree of the kernel must be a whole number"),
@@ -469,17 +458,6 @@ def test_what_is_done_to_a_group_does_not_reach_machines_without_it(drawn):
     assert rows[0]["balanced_accuracy"]["M3"] != rows[1]["balanced_accuracy"]["M3"]
 
 
-def test_the_selection_of_a_choice_scales_what_it_names(drawn):
-    sample = drawn[0]
-    for structure in candidates(recipe(), 480):
-        found = fitted_selection(recipe(), FILM_POOL, sample, structure)
-        z = found(sample.features)
-        assert z.shape == (len(sample.features), found.size)
-        assert z.abs().max() <= 1
-        assert found.size == (structure.num_features or found.size)
-        assert (found.pooling is None) == (structure.use == "channel")
-
-
 def test_scenes_have_the_weight_that_is_asked_for(rng):
     names = ("M1|arm_motion", "M1|paper", "M2|arm_motion", "M2|paper")
     sample = sample_of(rng, names)
@@ -526,11 +504,6 @@ def bins(small):
     return tuning_bins(sample, plan.selection.selected, sample_weight(RECIPE, sample), 12)
 
 
-@pytest.fixture
-def settings(small):
-    return LearnedSettings(SETTINGS, GridPoint(0.1, 0.5, 0.0, 0.0), small[2].selection.scaler)
-
-
 def tuned_by(small, sample, tuning):
     maker, _, plan, _ = small
     return tuning(plan, sample, [str(name) for name in maker.pool.names])
@@ -555,35 +528,6 @@ def test_loss_is_the_mean_over_groups_and_classes_by_the_slope_of_least_loss(rng
         other = Platt(factor * fitted.calibration.slope, 0.0)
         assert grouped_loss(scores, is_slip, groups, other).loss > fitted.loss
     assert grouped_loss(scores + 1.0, is_slip, groups).loss > fitted.loss + 0.05  # decides at 0
-
-
-def test_gradients_of_every_setting_are_those_of_differences(settings, bins):
-    with torch.no_grad():  # away from the start, where clipped values lie on the edge
-        settings.logs["scales"] -= 0.1
-
-    def loss(calibration=None):
-        z = settings.scaled(bins.features)
-        scores = held_out_scores(
-            z, bins.is_slip, bins.group, settings.penalty, settings.offset, bins.weights
-        )
-        return grouped_loss(scores, bins.is_slip, bins.group, calibration)
-
-    found = loss()
-    found.loss.backward()
-    checked = 0
-    for name, parameter in settings.named_parameters():
-        flat, slope = parameter.data.view(-1), parameter.grad.reshape(-1)
-        for place in {0, len(flat) // 2}:
-            kept, step, values = float(flat[place]), 1e-5, []
-            for sign in (1, -1):
-                flat[place] = kept + sign * step
-                with torch.no_grad():
-                    values.append(float(loss(found.calibration).loss))
-            flat[place] = kept
-            expected = (values[0] - values[1]) / (2 * step)
-            assert float(slope[place]) == pytest.approx(expected, rel=2e-3, abs=2e-6), name
-            checked += abs(expected) > 1e-5
-    assert checked >= 3
 
 
 def test_grid_is_of_refits_without_the_group(small, bins):
@@ -639,8 +583,6 @@ def test_a_held_out_group_does_not_change_its_descent(small):
     ("values", "message"),
     [
         ({"learn": ["bias"]}, "tuning.learn must be a list of some of penalty, offset"),
-        ({"learn": []}, "tuning.learn must be a list"),
-        ({"learn": "penalty"}, "tuning.learn must be a list"),
         ({"steps": 0}, "tuning.steps must be a positive whole number, got 0"),
         ({"bins": "abc"}, "tuning.bins must be a positive whole number, got 'abc'"),
         ({"rate": float("nan")}, "tuning.rate must be a positive finite number, got nan"),

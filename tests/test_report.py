@@ -346,36 +346,7 @@ def test_results_have_a_table_and_a_figure_of_all_there_is(drawn, tmp_path, caps
 RATE_HZ, HOP_S = 2000.0, 0.01
 
 
-def pieces(rng, total, most):
-    """Cuts of 0 to ``total`` into pieces of 0 to ``most``."""
-    at = 0
-    while at < total:
-        size = int(rng.integers(0, most + 1))
-        yield slice(at, at + size)
-        at += size
-
-
 # While a stream passes -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("view", [(0.0, 1.2), (0.5, 0.8)])
-def test_traces_take_what_is_in_view_and_the_status_it_begins_with(rng, view):
-    """Of pieces of any length."""
-    samples, times = rng.standard_normal((3, 4000)), 0.065 + HOP_S * np.arange(190)
-    columns = np.stack([rng.random(190), *(rng.random((3, 190)) < 0.5), rng.random(190)])
-    traces = Traces("abc", RATE_HZ, HOP_S, view)
-    for piece in pieces(rng, 4000, 300):
-        traces.add_samples(samples[:, piece])
-    for piece in pieces(rng, 190, 9):
-        traces.add_decisions(times[piece], *columns[:, piece])
-    first, last = (round(edge * RATE_HZ) for edge in view)
-    np.testing.assert_allclose(traces.samples()[0], np.arange(first, last) / RATE_HZ)
-    np.testing.assert_array_equal(traces.samples()[1], samples[:, first:last])
-    seen = (times > view[0] - 0.006) & (times < view[1])
-    decided_s, decided = traces.decisions()
-    np.testing.assert_allclose(decided_s, times[seen])
-    np.testing.assert_array_equal(decided[[0, 1, 3, 4]], columns[[0, 1, 3, 4]][:, seen])
-    np.testing.assert_array_equal(decided[2], 1 - columns[2, seen])
 
 
 @pytest.mark.parametrize(

@@ -143,16 +143,11 @@ def test_survives_json(rule: Rule) -> None:
     ("plain", "said"),
     [
         ({"name": "viterbi"}, "no sequential rule is called 'viterbi'; there are k_of_n, "),
-        ({}, "no sequential rule is called None"),
         ({"name": "k_of_n", "k": 2}, "do not fit.*'n'"),
-        ({"name": "cusum", "drift": 0, "slope": 1}, "do not fit.*'slope'"),
-        ({"name": "bayes"}, "no sequential rule is called 'bayes'; there are k_of_n, cusum"),
         ({"name": "k_of_n", "k": 4, "n": 3}, "between 1 and n, got k=4 and n=3"),
-        ({"name": "k_of_n", "k": 0, "n": 3}, "between 1 and n, got k=0"),
         ({"name": "cusum", "evidence": 1.1}, r"evidence must lie in \(0, 1\], got 1.1"),
         ({"name": "cusum", "drift": math.inf}, "drift must be finite"),
         ({"name": "cusum", "ceiling": 0.0}, "ceiling must be positive"),
-        ({"name": "cusum", "ceiling": math.nan}, "ceiling must be positive"),
     ],
 )
 def test_no_such_rule(plain: dict, said: str) -> None:
@@ -267,7 +262,6 @@ def test_too_little_to_show_a_budget_is_refused_with_what_would_do(budget, amoun
     ("numbers", "match"),
     [
         ({"limit": 0.0}, "onset.budget of held must be positive, got 0"),
-        ({"limit": math.inf}, "onset.budget of held must be positive, got inf"),
         ({"limit": 1.0, "is_share": True}, "onset.budget of held must be between 0 and 1, got 1"),
         ({"limit": 1.0, "confidence": 1.0}, "onset.confidence must lie between 0 and 1, got 1"),
     ],

@@ -214,12 +214,8 @@ def test_a_flipped_byte_is_refused_in_one_line_wherever_it_counts(saved):
     "change",
     [
         {"digest": "0" * 32},
-        {"digest": None},
         {"facts": "{}"},
-        {"facts": 3},
-        {"tensors": {}},
         {"tensors": [1, 2]},
-        {"tensors": {"float": 1.0}},
         {"tensors": {3: torch.zeros(2), "a": torch.zeros(2)}},
         {"tensors": {"float": torch.zeros(3).to_sparse()}},
     ],

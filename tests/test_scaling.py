@@ -10,19 +10,6 @@ from tactslip_torch.features.ops import signed_log
 from tactslip_torch.model.scaling import FeatureScaler
 
 
-def test_gradcheck_and_the_gradient_where_clipped(rng):
-    scaler = FeatureScaler(-torch.ones(3).double(), torch.ones(3).double())
-    features = torch.from_numpy(rng.uniform(-0.9, 0.9, (4, 3))).requires_grad_()
-    assert torch.autograd.gradcheck(scaler, features)
-    outside = torch.tensor([[3.0, -3.0, 0.5]], dtype=torch.float64, requires_grad=True)
-    scaler(outside).sum().backward()
-    assert outside.grad.tolist() == [[0, 0, 1]]
-    still = FeatureScaler(torch.ones(1), torch.ones(1))
-    at = torch.tensor([[1.0], [2.0]], requires_grad=True)
-    still(at).sum().backward()
-    assert at.grad.tolist() == [[0], [0]]
-
-
 def test_errors_name_the_feature():
     with pytest.raises(ValueError, match=r"\(2,\).*\(3,\)"):
         FeatureScaler(torch.zeros(2), torch.ones(3))
@@ -89,14 +76,6 @@ def test_signed_log_equals_numpy_at_any_magnitude(dtype, features, knee):
     expected = signed_log_of(features.numpy(), knee.numpy())
     eps, tiny = torch.finfo(dtype).eps, torch.finfo(dtype).tiny
     np.testing.assert_allclose(actual.numpy(), expected, rtol=8 * eps, atol=2 * tiny * float(knee))
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("zero", [0.0, -0.0])
-def test_the_derivative_at_zero_is_one(zero, dtype):
-    at = torch.full((1, 3), zero, dtype=dtype, requires_grad=True)
-    signed_log(at, torch.tensor([1e-30, 1.0, 1e30], dtype=dtype)).sum().backward()
-    assert at.grad.tolist() == [[1, 1, 1]]
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script. is deprecated")  # torch's own, in jvp

@@ -215,7 +215,6 @@ REFUSED = [
     (lambda: Scene("M7"), r"unknown material 'M7'; known are M1, .*wood"),
     (scene(fidelity="lugre"), r"unknown fidelity 'lugre'; known are kinematic, bristles$"),
     (scene(sample_rate_hz=0), r"sample_rate_hz must be positive and finite, got 0"),
-    (scene(acceleration_m_s2=-1.0), r"acceleration_m_s2 must be positive"),
     (scene(tail_s=-1), r"tail_s must be finite and not negative, got -1"),
     (scene(strokes=()), r"a scene needs a stroke, or a tail_s to rest for; it has neither"),
     (scene(strokes=(Stroke(9, 2),)), r"stroke 1 of 2 mm is too short to slip surely"),
@@ -226,17 +225,13 @@ REFUSED = [
     ),
     (scene(contact=Contact(touching=("SG99",))), r"contact\.touching names \['SG99'\], which this"),
     (scene(faults=Faults(dead=("PVDF99",))), r"faults names \['PVDF99'\], which this hand does"),
-    (scene(faults=Faults(swapped=(("X", "SG1"),))), r"faults names \['X'\], which this hand"),
     (group(Stroke, speed_mm_s=-3.0), r"Stroke\.speed_mm_s must be .*, got -3"),
     (group(Stroke, speed_mm_s=3, distance_mm=0), r"Stroke\.distance_mm must be positive, got 0"),
-    (group(Stroke, speed_mm_s=3, pause_s=-1), r"Stroke\.pause_s must be finite and not neg.*-1"),
     (group(Stroke, speed_mm_s=4, moves="it"), r"moves must be one of hand, object, both, got 'it'"),
     (group(Contact, mu_s=-0.2), r"Contact\.mu_s must be finite and not negative, got -0\.2"),
     (group(Contact, mu_s=0.5, mu_k=0.6), r"mu_k must not exceed mu_s, got mu_k=0\.6 and mu_s=0\.5"),
     (group(Contact, lifted_fraction=1), r"lifted_fraction must be below 1, or no element is in"),
-    (group(Contact, touching=()), r"touching must be null or some channels, or no element"),
     (group(Contact, load_n=0), r"load_n must be positive, or no element is in contact, got 0"),
-    (group(Contact, presliding_mm=(3.0, 0.3)), r"Contact\.presliding_mm must be \(low, high\)"),
     (group(Contact, relaxation=(0.5, 1.5)), r"Contact\.relaxation must be at most 1"),
     (group(Sensors, num_bits=1), r"Sensors\.num_bits must be 2 to 32, got 1"),
     (group(Sensors, pvdf_highpass_hz=0.66), r"pvdf_highpass_hz must be at least 2, .* got 0\.66"),
@@ -249,7 +244,6 @@ REFUSED = [
     (group(Dynamics, step_us=0.0), r"Dynamics\.step_us must be in \(0, 5000\], got 0"),
     (group(Dynamics, num_bristles=1.5), r"num_bristles must be a whole number of 1 or more"),
     (surface(-1, (0.8, 0.9)), r"x: expected mu_s > 0 and mu_ratio .* got -1 and \(0\.8, 0\.9\)"),
-    (surface(1, (0.8, 1.2)), r"x: .* 0 < low <= high <= 1, got 1 and \(0\.8, 1\.2\)"),
     (
         truth(strokes=CARRY, handling=Handling(carried_kg=50.0)),
         r"carrying 50 kg at 0\.5 m/s2 takes 25 N, more than half of the [\d.]+ N of static",
@@ -268,15 +262,12 @@ REFUSED = [
         r"machine_hz must lie below 27 Hz at 60 samples a second, got \(30, 50\)",
     ),
     (bristles(step_us=300.0), r"^a whole number of steps .* take 250$"),
-    (bristles(step_us=1000.0), r"^a whole number of steps .* take 500$"),
     # a skin that relaxes altogether gives way to so slow an arm faster than it is stretched
     (
         bristles(strokes=(Stroke(0.4, 0.8, 0.1),), contact=SOFT),
         r"^stroke 1 never slides: .* 0 % of the load let go",
     ),
     (recording(windows=[(-0.1, 0.5)]), r"within the recording, 0 <= start < end .* \(-0\.1, 0\.5"),
-    (recording(windows=[(1.0, 99.0)]), r"within the recording, .* got \(1, 99\)"),
-    (recording(windows=[(1.0, 1.0)]), r"within the recording, .* got \(1, 1\)"),
     (recording(windows=[(0.0, float("nan"))]), r"a window must be finite, got \(0\.0, nan\)"),
     (recording(channels=["SG1", "SG15"]), r"unknown channels SG15; this hand has SG1, .*PVDF10"),
     (recording(dtype=torch.int64), r"dtype must be floating, got torch\.int64"),
@@ -303,25 +294,6 @@ def test_what_cannot_be_is_refused_in_one_line(call, message):
 BRISTLES = ("one", "many")
 ALL_SPEEDS = (Stroke(20.0, 16.0, 0.4), Stroke(40.0, 24.0, 0.4), Stroke(60.0, 36.0, 0.4))
 """Half a second of every speed of the paper."""
-
-
-@pytest.mark.parametrize(
-    ("speed", "distance", "acceleration"), [(20, 100, 0.5), (60, 5, 0.5), (1, 7, 9)]
-)
-def test_arm_travels_its_distance_with_bounded_acceleration(speed, distance, acceleration):
-    contact = Contact(presliding_mm=(0.1, 0.1))
-    strokes = (Stroke(speed, distance, 0.5),)
-    scene = Scene("M1", strokes=strokes, contact=contact, acceleration_m_s2=acceleration)
-    (stroke,) = scene.arm
-    t, dt = np.linspace(0.0, stroke.stop_s + 0.2, 40001, retstep=True)
-    travel, velocity = stroke.travel_mm(t), stroke.speed_mm_s(t)
-    assert travel[0] == 0
-    assert travel[-1] == pytest.approx(distance, rel=1e-12)
-    np.testing.assert_allclose(np.gradient(travel, t), velocity, atol=dt * 1000 * acceleration)
-    assert velocity.max() <= speed * (1 + 1e-12)
-    assert np.abs(np.gradient(velocity, t)).max() <= 1000 * acceleration * (1 + 1e-6)
-    within = np.linspace(1e-3, distance * 0.999, 57)
-    np.testing.assert_allclose(stroke.travel_mm(stroke.time_of_travel_s(within)), within, rtol=1e-9)
 
 
 def test_elements_let_go_one_after_the_other_each_after_its_own_travel():
@@ -358,25 +330,6 @@ def test_friction_stays_in_its_cone_sticks_before_and_falls_after_letting_go():
 
 
 # --- bristles -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("model", BRISTLES)
-def test_pauses_relax_as_in_closed_form_and_strokes_join_without_a_jump(model):
-    scene = scene_on(model, "M3", strokes=SHORT)
-    (a, time_s), (b, _) = contacts(scene), contacts(replace(scene, fidelity="kinematic"))
-    truth = timeline(scene)
-    (first_s, stop_s), (second_s, _) = truth.arm_s
-    paused, before = (time_s > stop_s + 0.25) & (time_s < second_s), time_s < first_s
-    assert min(paused.sum(), before.sum()) > 200
-    seams = np.searchsorted(time_s, [first_s, stop_s, stop_s + 0.25, second_s])
-    for mine, other in zip(a.values(), b.values(), strict=True):
-        np.testing.assert_allclose(mine.friction_n[paused], other.friction_n[paused], 1e-9)
-        assert not mine.friction_n[before].any()
-        assert not mine.slide[before].any()
-        # the spring's force changes by at most k v dt a sample: no seam shows in it
-        steps = np.abs(np.diff(mine.friction_n[time_s < truth.duration_s]))
-        for seam in seams:
-            assert steps[seam - 2 : seam + 2].max() < 0.01 * mine.friction_n.max()
 
 
 def swing(friction_n):

@@ -15,8 +15,6 @@ from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine, held_ou
 from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, RadialBasis
 from tactslip_torch.model.solve import solve_symmetric
 
-EPS = 2.0**-52
-
 
 def with_spectrum(rng, values):
     basis = np.linalg.qr(rng.standard_normal((len(values), len(values))))[0]
@@ -37,29 +35,6 @@ def tensors(*arrays):
 def close(actual, expected, tolerance):
     assert actual.shape == expected.shape
     assert np.abs(actual.detach().numpy() - expected).max() <= tolerance * np.abs(expected).max()
-
-
-# Cholesky -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("num", "decades"), [(1, 0), (2, 9), (40, 6), (200, 9)])
-@pytest.mark.parametrize("weighted", [False, True])
-def test_a_well_posed_system_is_solved_to_the_stated_error(num, decades, weighted, rng):
-    matrix = with_spectrum(rng, np.geomspace(10.0**-decades, 1, num))
-    right, penalty = rng.standard_normal(num), 1e13
-    weights = 10.0 ** rng.uniform(-3, 3, num) if weighted else np.ones(num)
-    system = matrix + np.diag(1 / (penalty * weights))
-    given = torch.from_numpy(matrix.copy())
-    x, report, factor, _ = solve_symmetric(given, *tensors(right), penalty, *tensors(weights))
-    assert torch.equal(given, torch.from_numpy(matrix))
-    assert (report.method, report.rank, report.size) == ("cholesky", num, num)
-    close(factor.tril() @ factor.tril().mT, system, 1e-13)
-    close(x, np.linalg.solve(system, right), 4 * report.error + 1e-13)
-    scale = np.sqrt(np.outer(np.diag(system), np.diag(system)))
-    condition = np.linalg.cond(system / scale, 1)
-    assert condition / 4 <= report.condition <= 1.01 * condition
-    assert report.error == pytest.approx(np.sqrt(num) * EPS * report.condition)
-    assert report.condition <= report.condition_bound
 
 
 # Eigenvectors ---------------------------------------------------------------------------------
@@ -84,17 +59,6 @@ def test_what_is_null_is_left_out(num, weighted, penalty, rng, caplog):
     if np.isfinite(penalty):
         assert {record.levelno for record in caplog.records} == {logging.WARNING}
         assert str(report) in caplog.messages[-1]
-
-
-def test_what_is_left_out_is_stated(rng):
-    """An eigenvalue a of rounding's size adds a C / (1 + a C) of its share; null ones say so."""
-    values = np.r_[2e-16, np.geomspace(0.1, 1, 7)]
-    matrix, right = with_spectrum(rng, values), rng.choice([-1.0, 1.0], 8)
-    report = solve_symmetric(*tensors(matrix, right), 2e13).report
-    share = np.linalg.eigh(matrix)[1][:, 0] @ right
-    assert abs(share) * 4e-3 / 1.004 / np.sqrt(8) <= report.left_out <= 0.1
-    assert report.error == report.left_out
-    assert "unless what is left out is null" in str(report)
 
 
 # 80 digits ------------------------------------------------------------------------------------
@@ -147,7 +111,7 @@ def coefficients_of(machine):
     return whole[np.triu_indices(len(whole))]
 
 
-@pytest.mark.parametrize("penalty", [1e-12, 1e-6, 1e3, 1e6, 1e9, 1e12, 1e15])
+@pytest.mark.parametrize("penalty", [1e-6, 1e3, 1e9, 1e15])
 @pytest.mark.parametrize("spread", [0, 4])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_stated_errors_are_true_or_the_system_refused(kind, spread, penalty):

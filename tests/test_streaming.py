@@ -270,10 +270,7 @@ def test_a_long_gap_ends_the_stream_and_begins_another(within, caplog):
     "times",
     [
         0.2495,  # the last sample's
-        0.0,
-        -1e12,
         np.array([0.25, 0.2505, 0.2505]),
-        np.array([0.25, 0.2505, 0.2500]),
         np.array([0.25, -7.0, 9.0]),
     ],
 )
@@ -362,29 +359,6 @@ def test_a_copy_of_a_running_stream_goes_on_by_itself(copied, rule):
     assert torch.equal(rest[1].score, rest[0].score)
     whole = offline(DETECTOR, settings_of(rule), samples)
     assert torch.equal(joined([*before, rest[0]]).is_alarm, whole.is_alarm)
-
-
-@pytest.mark.slow
-def test_an_hour_needs_no_more_memory_than_a_second():
-    """What is pickled holds all that a stream remembers; the detector is left out of it."""
-    settings = settings_of(RULES[0], hop=2000)
-    stream = stream_of(DETECTORS["PVDF", "centred"], settings)
-    samples = signal(20_000, 6).T
-
-    def size():
-        alone = copy.copy(stream)
-        alone.detector = None
-        return len(pickle.dumps(alone))
-
-    sizes, buffers = [], []
-    for push in range(360):
-        stream.push(samples[:13_579], push * 10.0)
-        found = stream.push(samples[13_579:])
-        sizes.append(size())
-        buffers.append(stream.state_bytes)
-    assert max(sizes) - sizes[1] < 64  # larger numbers
-    assert max(buffers) == buffers[1] < 4 * 8 * 2500
-    assert int(found.number[-1]) == 3599
 
 
 # Gradients -------------------------------------------------------------------------------------
