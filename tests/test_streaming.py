@@ -1,7 +1,6 @@
 """A stream in pieces, and the alarm of evidence and bins, against the whole and plain loops."""
 
 import copy
-import logging
 import math
 import pickle
 from dataclasses import replace
@@ -162,47 +161,11 @@ def spoilt(kind, samples):
     match kind:
         case "nan":
             middle[1] = torch.nan
-        case "all nan":
-            middle[:] = torch.nan
         case "now and then":
             middle[0, ::90] = torch.inf
         case "dead":
             middle[3] = 0.0
-        case "rail":
-            middle[2] = 5.0
-        case "huge":
-            middle[:] *= 1e30
-        case "larger than float32":
-            middle[0] = -1e300
-        case "denormal":
-            middle[:] *= 1e-40
     return samples
-
-
-@pytest.mark.parametrize(("rule", "dtype"), [(RULES[0], torch.float32), (RULES[1], torch.float64)])
-@pytest.mark.parametrize(
-    "kind",
-    ["nan", "all nan", "now and then", "dead", "rail", "huge", "larger than float32", "denormal"],
-)
-def test_broken_samples_are_flagged_and_gone_when_they_are_over(kind, rule, dtype):
-    clean = signal(6000, 6)
-    samples, settings = spoilt(kind, clean), settings_of(rule)
-    stream = stream_of(settings=settings, dtype=dtype)
-    found = joined([*(stream.push(part.T) for part in samples.split(123, -1)), stream.flush()])
-    assert_same(found, offline(DETECTOR, settings, samples.to(dtype)))
-    for entries in found:
-        assert torch.as_tensor(entries, dtype=torch.float64).isfinite().all()
-    starts = HOP * found.number
-    touched = (starts - 25 < 4000) & (starts + 125 > 2000)
-    within = (starts - 25 >= 2000) & (starts + 125 <= 4000)
-    if kind not in ("huge", "denormal"):  # those are only large or small
-        assert not found.is_valid[within].any()
-    assert found.is_valid[~touched].all()
-    healthy = in_pieces(stream_of(settings=settings, dtype=dtype), clean)
-    close = 1e-9 if dtype == torch.float64 else 1e-4
-    torch.testing.assert_close(
-        found.score[~touched], healthy.score[~touched], rtol=close, atol=close
-    )
 
 
 # Times ------------------------------------------------------------------------------------------
@@ -230,60 +193,6 @@ def test_times_shift_what_comes_out_and_change_nothing_else(each, start_s):
         torch.testing.assert_close(getattr(found, name), expected, rtol=0, atol=1e-6)
     assert len(plain.alarms) > 0
     assert_same(found._replace(available_s=plain.available_s, onset_s=plain.onset_s), plain)
-
-
-@pytest.mark.parametrize("within", [False, True])
-def test_a_long_gap_ends_the_stream_and_begins_another(within, caplog):
-    samples = signal(3000, 6)
-    times = np.arange(3000) / RATE
-    times[1300:] += 101 / RATE
-    times[2000:] += 3600.0
-    fresh = stream_of()
-    parts = [
-        [fresh.push(samples[:, a:b].T, float(times[a])), fresh.flush()]
-        for a, b in ((0, 1300), (1300, 2000), (2000, 3000))
-    ]
-    expected = joined([part for pair in parts for part in pair])
-    stream = stream_of()
-    caplog.set_level(logging.WARNING)
-    if within:
-        pushed = [stream.push(samples.T, times)]
-    else:
-        cuts = [0, 500, 1300, 1400, 2000, 2500, 3000]
-        pushed = [stream.push(samples[:, a:b].T, times[a:b]) for a, b in pairwise(cuts)]
-    found = joined([*pushed, stream.flush()])
-    for name in ("available_s", "onset_s"):
-        pair = getattr(found, name), getattr(expected, name)
-        torch.testing.assert_close(*pair, rtol=0, atol=1e-9)
-    assert_same(
-        found._replace(available_s=expected.available_s, onset_s=expected.onset_s), expected
-    )
-    assert (found.number == 0).sum() == 3
-    assert stream.num_gaps == 2
-    assert [record.getMessage() for record in caplog.records] == [
-        "the stream begins anew at 0.7005 s, behind a gap",
-        "the stream begins anew at 3601.0505 s, behind a gap",
-    ]
-
-
-@pytest.mark.parametrize(
-    "times",
-    [
-        0.2495,  # the last sample's
-        np.array([0.25, 0.2505, 0.2505]),
-        np.array([0.25, -7.0, 9.0]),
-    ],
-)
-def test_times_that_go_back_are_refused_and_change_nothing(times):
-    stream, twin = stream_of(), stream_of()
-    samples = signal(1000, 6)
-    for each in (stream, twin):
-        each.push(samples[:, :500].T, 0.0)
-    with pytest.raises(ValueError, match=r"^time_s goes back: sample \d of these is at .*s, .*$"):
-        stream.push(samples[:, 500:503].T, times)
-    expected = joined([twin.push(samples[:, 500:].T, 0.25), twin.flush()])
-    found = joined([stream.push(samples[:, 500:].T, 0.25), stream.flush()])
-    assert_same(found, expected)
 
 
 def test_a_clock_of_its_own_and_jitter_make_no_gaps(rng):
