@@ -5,12 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.kernel_ridge import KernelRidge
 
 from tactslip_torch.features.statistics import TrainingStatistics
-from tactslip_torch.model.moments import SufficientStats
+from tactslip_torch.model.moments import FORMAT, SufficientStats
+from tactslip_torch.own_files import load_table, save_table
 
 NUM = 4
 ABOUT = {"hand": {"name": "paper24", "channels": ["SG1", "PVDF1"]}, "scaler": "range"}
@@ -56,6 +57,47 @@ def balanced(is_slip, weights):
 
 
 # Machines -------------------------------------------------------------------------------------
+
+
+@settings(max_examples=20)
+@given(
+    seed=st.integers(0, 99),
+    order=st.randoms(use_true_random=False),
+    num_shards=st.integers(1, 5),
+    degree=st.sampled_from([1, 2]),
+)
+def test_any_order_and_sharding_gives_the_same_sums(seed, order, num_shards, degree):
+    batches = make_batches(seed=seed)
+    whole = stats_of(batches, degree=degree)
+    order.shuffle(batches)
+    shards = [stats_of(batches[part::num_shards], degree=degree) for part in range(num_shards)]
+    while len(shards) > 1:  # any tree of merges
+        order.shuffle(shards)
+        other = shards.pop()
+        shards[0].merge(other)
+    assert_same(shards[0], whole)
+    for batch in batches[3:]:
+        whole.remove(*batch)
+    assert_same(whole, stats_of(batches[:3], degree=degree))
+    for batch in batches[:3]:
+        whole.remove(*batch)
+    assert not bool(whole.sums.any())  # nothing is left where no bin is
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_sums_come_back_from_their_file(degree, tmp_path):
+    stats = stats_of(make_batches(), degree=degree)
+    stats.save(tmp_path / "sums.pt")
+    again = SufficientStats.load(tmp_path / "sums.pt")
+    assert_same(again, stats)
+    assert torch.equal(again.sums, stats.sums)
+    again.merge(stats_of([BATCH], degree=degree))
+    assert load_table(tmp_path / "sums.pt", FORMAT)[0]["degree"] == degree
+    save_table(tmp_path / "other.pt", "tactslip_torch sums 1", {}, {})
+    with pytest.raises(ValueError, match=r"made by version 0\.1\.0 or earlier"):
+        SufficientStats.load(tmp_path / "other.pt")
+    with pytest.raises(FileNotFoundError):
+        SufficientStats.load(tmp_path / "nothing.pt")
 
 
 @pytest.mark.parametrize("balance", ["weights", "none"])

@@ -1,6 +1,7 @@
 """Threads, processes, files that are written whole, tables of tensors, and batches seen."""
 
 import os
+import pickle
 import random
 import time
 import zipfile
@@ -227,6 +228,36 @@ def test_content_that_does_not_fit_its_digest_is_refused(saved, change):
     content.pop(next(iter(change)))
     torch.save(content, saved)
     assert refusal(saved) == f"{saved} is damaged or no file of ours; make it again"
+
+
+class Trap:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return type(self.mark).mkdir, (self.mark,)
+
+
+def test_other_files_are_refused_and_nothing_in_them_is_executed(tmp_path):
+    path, mark = tmp_path / "a.pt", tmp_path / "sprung"
+    trapped = {"format": FORM, "facts": "{}", "tensors": {}, "digest": Trap(mark)}
+    for content in (torch.zeros(3), {"format": torch.zeros(3)}, [FORM], {}, None, trapped):
+        torch.save(content, path)
+        assert refusal(path) == f"{path} is damaged or no file of ours; make it again"
+    path.write_bytes(pickle.dumps(Trap(mark)))
+    with pytest.raises(ValueError, match="no file of ours"):
+        load_table(path, FORM)
+    assert not mark.exists()
+    pickle.loads(path.read_bytes())
+    assert mark.exists(), "the trap is none"
+    save_table(path, "test table 2", VALUES, tables())
+    assert refusal(path) == f"{path} must be of format 'test table 1', got 'test table 2'"
+    with pytest.raises(ValueError, match=r"made by version 0\.1\.0 or earlier; make it"):
+        load_table(path, "test table 3")
+    with pytest.raises(FileNotFoundError, match=r"no file at .*nowhere\.pt"):
+        load_table(tmp_path / "nowhere.pt", FORM)
 
 
 @pytest.mark.parametrize("how", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA])

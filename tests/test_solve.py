@@ -293,6 +293,30 @@ def test_scores_are_those_of_refits(
 # Refusals -------------------------------------------------------------------------------------
 
 
+def inputs_of(rng, num_bins, num_features, kind):
+    """Features, labels, groups, C, c and weights; a gradient is wanted of all that have one."""
+    bins, groups = draw(rng, num_bins, num_features, weighted=True), grouped(rng, num_bins, kind)
+    numbers = [torch.tensor(value, dtype=torch.float64) for value in (0.7, 0.4)]
+    z, weights = bins.features.requires_grad_(), bins.weights.requires_grad_()
+    penalty, offset = [number.requires_grad_() for number in numbers]
+    return z, bins.is_slip, groups, penalty, offset, weights
+
+
+@pytest.mark.parametrize(("kind", "num_features"), [("mixed", 2), ("bins", 5)])
+def test_scores_are_those_in_closed_form_with_derivatives_right_twice(kind, num_features, rng):
+    """With more bins than monomials, and fewer."""
+    z, is_slip, groups, *numbers = inputs_of(rng, 10, num_features, kind)
+
+    def scores(z, *numbers):
+        return held_out_scores(z, is_slip, groups, *numbers)
+
+    bins = TrainingBins(z.detach(), is_slip, numbers[2].detach())
+    closed = HeldOut(bins, groups, Polynomial(2, 0.4), "dual").at(0.7).scores
+    torch.testing.assert_close(scores(z, *numbers).detach(), closed, rtol=0, atol=1e-10)
+    assert torch.autograd.gradcheck(scores, (z, *numbers))
+    assert torch.autograd.gradgradcheck(scores, (z, *numbers))
+
+
 def held_out(bins, groups, *numbers, **more):
     return held_out_scores(bins.features, bins.is_slip, groups, *numbers, **more)
 

@@ -1,6 +1,7 @@
 """A stream in pieces, and the alarm of evidence and bins, against the whole and plain loops."""
 
 import copy
+import logging
 import math
 import pickle
 from dataclasses import replace
@@ -195,6 +196,63 @@ def test_times_shift_what_comes_out_and_change_nothing_else(each, start_s):
     assert_same(found._replace(available_s=plain.available_s, onset_s=plain.onset_s), plain)
 
 
+@pytest.mark.parametrize("within", [False, True])
+def test_a_long_gap_ends_the_stream_and_begins_another(within, caplog):
+    samples = signal(3000, 6)
+    times = np.arange(3000) / RATE
+    times[1300:] += 101 / RATE
+    times[2000:] += 3600.0
+    fresh = stream_of()
+    parts = [
+        [fresh.push(samples[:, a:b].T, float(times[a])), fresh.flush()]
+        for a, b in ((0, 1300), (1300, 2000), (2000, 3000))
+    ]
+    expected = joined([part for pair in parts for part in pair])
+    stream = stream_of()
+    caplog.set_level(logging.WARNING)
+    if within:
+        pushed = [stream.push(samples.T, times)]
+    else:
+        cuts = [0, 500, 1300, 1400, 2000, 2500, 3000]
+        pushed = [stream.push(samples[:, a:b].T, times[a:b]) for a, b in pairwise(cuts)]
+    found = joined([*pushed, stream.flush()])
+    for name in ("available_s", "onset_s"):
+        pair = getattr(found, name), getattr(expected, name)
+        torch.testing.assert_close(*pair, rtol=0, atol=1e-9)
+    assert_same(
+        found._replace(available_s=expected.available_s, onset_s=expected.onset_s), expected
+    )
+    assert (found.number == 0).sum() == 3
+    assert stream.num_gaps == 2
+    assert [record.getMessage() for record in caplog.records] == [
+        "the stream begins anew at 0.7005 s, behind a gap",
+        "the stream begins anew at 3601.0505 s, behind a gap",
+    ]
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        0.2495,  # the last sample's
+        0.0,
+        -1e12,
+        np.array([0.25, 0.2505, 0.2505]),
+        np.array([0.25, 0.2505, 0.2500]),
+        np.array([0.25, -7.0, 9.0]),
+    ],
+)
+def test_times_that_go_back_are_refused_and_change_nothing(times):
+    stream, twin = stream_of(), stream_of()
+    samples = signal(1000, 6)
+    for each in (stream, twin):
+        each.push(samples[:, :500].T, 0.0)
+    with pytest.raises(ValueError, match=r"^time_s goes back: sample \d of these is at .*s, .*$"):
+        stream.push(samples[:, 500:503].T, times)
+    expected = joined([twin.push(samples[:, 500:].T, 0.25), twin.flush()])
+    found = joined([stream.push(samples[:, 500:].T, 0.25), stream.flush()])
+    assert_same(found, expected)
+
+
 def test_a_clock_of_its_own_and_jitter_make_no_gaps(rng):
     """A crystal 20 ppm fast for ten minutes, 24 samples; times good to a fifth of a sample."""
     stream, chunk = stream_of(settings=settings_of(hop=2000)), 2000
@@ -271,6 +329,29 @@ def test_a_copy_of_a_running_stream_goes_on_by_itself(copied, rule):
 
 
 # Gradients -------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_an_hour_needs_no_more_memory_than_a_second():
+    """What is pickled holds all that a stream remembers; the detector is left out of it."""
+    settings = settings_of(RULES[0], hop=2000)
+    stream = stream_of(DETECTORS["PVDF", "centred"], settings)
+    samples = signal(20_000, 6).T
+
+    def size():
+        alone = copy.copy(stream)
+        alone.detector = None
+        return len(pickle.dumps(alone))
+
+    sizes, buffers = [], []
+    for push in range(360):
+        stream.push(samples[:13_579], push * 10.0)
+        found = stream.push(samples[13_579:])
+        sizes.append(size())
+        buffers.append(stream.state_bytes)
+    assert max(sizes) - sizes[1] < 64  # larger numbers
+    assert max(buffers) == buffers[1] < 4 * 8 * 2500
+    assert int(found.number[-1]) == 3599
 
 
 def test_gradients_of_a_stream_are_slopes(rng):
