@@ -23,10 +23,10 @@ from tactslip_torch.analysis.latency import (
     Limits,
     Timing,
     detector_parts,
-    main,
     measure_costs,
     parts_of,
     time_calls,
+    time_in_fresh_process,
 )
 from tactslip_torch.analysis.pareto import (
     Candidate,
@@ -605,9 +605,11 @@ def test_calls_are_timed_one_by_one_and_interrupted_ones_told_but_not_counted(mo
     assert time_calls(played, [None], 100, runs=1).p50_us == 5000  # hardly one was left alone
 
 
-def test_the_timing_of_a_detector_is_a_line_of_json(tmp_path, capsys):
+@pytest.mark.slow
+def test_a_saved_detector_is_timed_in_a_process_of_its_own(tmp_path):
     small_detector().save(tmp_path / "detector.pt")
-    main([str(tmp_path / "detector.pt"), "10", "auto"])
-    assert json.loads(capsys.readouterr().out)["calls"] == 10
-    with pytest.raises(SystemExit, match=r"usage: python -m tactslip_torch.analysis.latency"):
-        main([])
+    timing = time_in_fresh_process(tmp_path / "detector.pt", 20, "auto")
+    assert timing.calls == 20
+    assert 0 < timing.p50_us <= timing.p99_us <= timing.p99_all_us
+    with pytest.raises(FileNotFoundError, match=r"gone.pt"):
+        time_in_fresh_process(tmp_path / "gone.pt", 20)

@@ -10,6 +10,7 @@ import torch
 from drawing import assert_png, rows_of
 from matplotlib.colors import to_hex
 
+from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.events import (
     EventRules,
@@ -20,7 +21,6 @@ from tactslip_torch.onset.events import (
 )
 from tactslip_torch.report.metrics import answer_metrics, bin_metrics, split_metrics
 from tactslip_torch.report.onset import (
-    ALARM,
     REST,
     SLIP,
     Traces,
@@ -30,8 +30,6 @@ from tactslip_torch.report.onset import (
     view_of,
 )
 from tactslip_torch.report.recordings import (
-    DrawnRecording,
-    Trial,
     dataset_figure,
     ranges_table,
     signals_figure,
@@ -55,7 +53,7 @@ from tactslip_torch.report.results import (
     validation_figure,
     write_results,
 )
-from tactslip_torch.report.style import table
+from tactslip_torch.report.style import ALARM, table
 from tactslip_torch.report.sweep import sweep_table, write_sweep
 
 REASON = "nobody looked"
@@ -538,26 +536,40 @@ def test_runs_stand_beside_each_other_with_mean_and_deviation(tmp_path):
         assert list(csv.reader(file))[2] == ["seed=1", "0.7", "0.6"]
 
 
+# What a set holds --------------------------------------------------------------------------------
+
+
 HAND = HandLayout.paper24()
 CHANNELS = HAND.to_rows()
 SIGNAL_HZ = 2000.0
 GAUGES, FILMS = HAND.names[:14], HAND.names[14:]
-STROKES = {"onsets_s": (2.0, 5.0), "slip_s": ((2.0, 4.0), (5.0, 6.5)), "non_slip_s": ((6.75, 7.5),)}
+STROKES = {
+    "onsets_s": (2.0, 5.0),
+    "sliding_s": ((2.0, 4.0), (5.0, 6.5)),
+    "non_slip_s": ((6.75, 7.5),),
+}
 
 
-def row(title="M1", num_samples=16000, seed=0, **truth):
+def recording_of(volts, onsets_s=(), sliding_s=None, **truth):
+    sliding_s = [(onset, 8.0) for onset in onsets_s] if sliding_s is None else sliding_s
+    samples, speeds = torch.from_numpy(volts), [20.0] * len(onsets_s)
+    return Recording(samples, SIGNAL_HZ, "M1", speeds, onsets_s, sliding_s, **truth)
+
+
+def row(num_samples=16000, seed=0, **truth):
     """Noise around an offset per channel, with a burst of one sample in each."""
     rng = np.random.default_rng(seed)
     volts = 0.01 * rng.standard_normal((24, num_samples)) + np.linspace(-1, 2, 24)[:, None]
     volts[np.arange(24), rng.integers(0, num_samples, 24)] += 0.7
-    return DrawnRecording(title, torch.from_numpy(volts), SIGNAL_HZ, **truth)
+    return recording_of(volts, **truth)
 
 
 @pytest.fixture
 def draw_signals(drawn, tmp_path):
     """Draws recordings; their figure."""
 
-    def drawing(*rows, channels=CHANNELS, views=None):
+    def drawing(*recordings, channels=CHANNELS, views=None):
+        rows = list(zip(("M1", "M6"), recordings, strict=False))
         signals_figure(rows, channels, tmp_path / "a.png", title="SIMULATED", views=views)
         assert_png(tmp_path / "a.png")
         return drawn[-1]
@@ -572,7 +584,7 @@ def lines_of(axes):
 
 def test_gauges_stand_left_films_right_one_recording_a_row_with_every_extreme(draw_signals):
     recording = row()
-    figure = draw_signals(recording, row("M6", seed=1))
+    figure = draw_signals(recording, row(seed=1))
     panels = np.array(figure.axes).reshape(2, 3)
     for (measured, gauges, films), name in zip(panels, ("M1", "M6"), strict=True):
         assert measured.get_ylabel() == f"{name}\nvolts"
@@ -614,7 +626,11 @@ def test_onsets_are_marked_and_slides_and_handling_shaded_as_far_as_in_view(
 
 
 # What a set holds --------------------------------------------------------------------------------
-TRIALS = [Trial("wood", "paper", 8.0, 3.5, 0.75, 2), Trial("iron", "paper", 9.0, 10.0, 0.0, 1)]
+KNOWN = ("material", "scene", "duration_s", "slip_s", "non_slip_s", "num_onsets")
+TRIALS = [
+    dict(zip(KNOWN, known, strict=True))
+    for known in (("wood", "paper", 8.0, 3.5, 0.75, 2), ("iron", "paper", 9.0, 10.0, 0.0, 1))
+]
 
 
 @pytest.mark.parametrize("level", [1.0, np.nan])
@@ -622,9 +638,9 @@ def test_a_set_is_drawn_by_material_above_the_traces_of_a_recording(drawn, tmp_p
     recording = row(**STROKES)
     recording.samples[:] *= level
     names = [f"E{i}" for i in range(40)]
-    wide = DrawnRecording("w/0", torch.cat([recording.samples] * 2)[:40], SIGNAL_HZ, **STROKES)
+    wide = recording_of(np.tile(recording.samples, (2, 1))[:40], **STROKES)
     for example, of in ((recording, HAND.names), (wide, names)):
-        dataset_figure(TRIALS, example, of, tmp_path / "a.png", title="a set")
+        dataset_figure(TRIALS, ("w/0", example), of, tmp_path / "a.png", title="a set")
     bars, traces = drawn[0].axes
     assert [label.get_text() for label in bars.get_yticklabels()] == ["wood", "iron"]
     widths = [patch.get_width() for patch in bars.patches]
@@ -634,7 +650,8 @@ def test_a_set_is_drawn_by_material_above_the_traces_of_a_recording(drawn, tmp_p
 
 
 def test_tables_of_a_set():
-    both = trials_table([*TRIALS, Trial("wood", "taps", 4.0, 0.0, 0.0, 0)], simulated=True)
+    taps = ("wood", "taps", 4.0, 0.0, 0.0, 0)
+    both = trials_table([*TRIALS, dict(zip(KNOWN, taps, strict=True))], simulated=True)
     assert both.startswith("SIMULATED")
     rows = [line.split() for line in both.splitlines()]
     assert ["wood", "2", "4.00", "8.00", "12.0", "2", "3.5", "0.8"] in rows
