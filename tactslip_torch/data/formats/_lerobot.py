@@ -97,7 +97,10 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     """
     table, info = table_of(path), _info_of(path.parent)
     chosen = _features_in(info, how)
-    columns = _columns_of(table, _number_of(path), chosen)
+    counts = {name: math.prod(feature["shape"]) for name, feature in chosen.items()}
+    found = _rows_of(table, _number_of(path), [_TIME, *chosen], 1 + sum(counts.values()))
+    lists = [_flat(found, name, count) for name, count in ((_TIME, 1), *counts.items())]
+    columns = [row for rows in lists for row in rows]
     names = _names_of(chosen)
     fps = info.get("fps")
     if not isinstance(fps, int | float) or not 0 < fps < math.inf:
@@ -138,16 +141,10 @@ def _whole(info: Mapping[str, Any], name: str, most: int, least: int = 0) -> int
 
 def _listed_place(folder: Path, number: int) -> dict[str, int]:
     """The chunk and file that ``meta/episodes`` gives for an episode."""
-    library = needs("pyarrow.parquet", "reading LeRobot datasets")
     wanted = ["data/chunk_index", "data/file_index"]
     for path in sorted((folder / "meta" / "episodes").glob("*/*.parquet")):
-        with library.ParquetFile(path) as file:
-            rows = file.metadata.num_rows
-            check_plausible("meta/episodes", rows * 24, path.stat().st_size, MOST_WHOLE)
-            found = file.read(columns=[_EPISODE, *wanted], use_threads=False).to_pydict()
-        if number in found[_EPISODE]:
-            at = found[_EPISODE].index(number)
-            return {name.partition("/")[2]: int(found[name][at]) for name in wanted}
+        if found := _rows_of(path, number, wanted, len(wanted)).to_pylist():
+            return {name.partition("/")[2]: int(found[0][name]) for name in wanted}
     raise Refused("is listed in no file of meta/episodes; download the dataset whole")
 
 
@@ -194,42 +191,30 @@ def _names_of(chosen: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return names
 
 
-def _columns_of(
-    table: Path, number: int, chosen: Mapping[str, Mapping[str, Any]]
-) -> list[NDArray[Any]]:
-    """Times and all numbers of an episode, ``[T]`` each."""
+def _rows_of(table: Path, number: int, columns: Sequence[str], num_numbers: int) -> Any:
+    """The rows of an episode, so many numbers each, in some columns of a file."""
     library = needs("pyarrow.parquet", "reading LeRobot datasets")
-    total = 1 + sum(math.prod(feature["shape"]) for feature in chosen.values())
     with library.ParquetFile(table) as file:
-        schema, rows = file.schema_arrow, file.metadata.num_rows
-        if missing := [name for name in (_TIME, _EPISODE, *chosen) if name not in schema.names]:
-            raise Refused(f"lies in {table.name}, which has no column {missing[0]!r}")
-        check_plausible(f"{table.name}", rows * total * 4, table.stat().st_size, MOST_WHOLE)
-    found = library.read_table(
+        names, num_rows = file.schema_arrow.names, file.metadata.num_rows
+    if missing := [name for name in (_EPISODE, *columns) if name not in names]:
+        raise Refused(f"lies in {table.name}, which has no column {missing[0]!r}")
+    check_plausible(table.name, num_rows * num_numbers * 4, table.stat().st_size, MOST_WHOLE)
+    return library.read_table(
         table,
-        columns=[_TIME, _EPISODE, *chosen],
+        columns=columns,
         filters=[(_EPISODE, "==", number)],
         use_threads=False,
         partitioning=None,  # names of folders are no columns
     ).combine_chunks()
-    columns = [_flat(found.column(_TIME), (1,), _TIME)[0]]
-    for name, feature in chosen.items():
-        columns += list(_flat(found.column(name), feature["shape"], name))
-    return columns
 
 
-def _flat(column: Any, shape: Sequence[int], name: str) -> NDArray[Any]:
-    """The numbers of a column, ``[prod(shape), T]``; lists may be nested as the shape is."""
-    types, rows, values = (
-        needs("pyarrow", "reading LeRobot datasets").types,
-        len(column),
-        column.combine_chunks(),
-    )
-    kinds = (types.is_list, types.is_large_list, types.is_fixed_size_list)
-    while any(is_kind(values.type) for is_kind in kinds):
+def _flat(table: Any, name: str, count: int) -> NDArray[Any]:
+    """The numbers of a column, ``[count, T]``; lists may be nested."""
+    values = table.column(name).combine_chunks()
+    while hasattr(values, "flatten") and values.type.num_fields:  # a list, of any kind
         values = values.flatten()
     numbers = np.asarray(values.to_numpy(zero_copy_only=False))
-    if numbers.size != rows * math.prod(shape) or numbers.dtype.kind not in "iufb":
-        raise Refused(f"has {numbers.size} numbers in {name!r} of {rows} frames of {list(shape)}")
+    if numbers.size != len(table) * count or numbers.dtype.kind not in "iufb":
+        raise Refused(f"has {numbers.size} numbers in {name!r} of {len(table)} frames of {count}")
     numbers = numbers.astype(np.uint8) if numbers.dtype.kind == "b" else numbers
-    return numbers.reshape(rows, math.prod(shape)).T
+    return numbers.reshape(len(table), count).T
