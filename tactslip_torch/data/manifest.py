@@ -262,25 +262,24 @@ def _contradictions(truth: Timeline) -> list[str]:
 
 def _overlaps(truth: Timeline) -> list[str]:
     """Stretches that cannot both be, of a truth whose numbers are fine one by one."""
-    found = []
-    for name in SPANS:
-        for clash in _clashes(getattr(truth, name)):
-            found.append(f"{name}: {clash} overlap or stand in the wrong order")
-    for clash in _clashes((*truth.sliding_s, *truth.slip_s), truth.non_slip_s):
-        found.append(f"slip and non-slip overlap: {clash}")
-    for clash in _clashes(truth.sliding_s, truth.slip_s):
-        found.append(f"sliding_s and slip_s overlap: {clash}")
+    checks: list[tuple[str, Iterable[Stretch], Iterable[Stretch] | None]] = [
+        (f"{name}: {{}} overlap or stand in the wrong order", getattr(truth, name), None)
+        for name in SPANS
+    ]
+    slip = (*truth.sliding_s, *truth.slip_s)
+    checks.append(("slip and non-slip overlap: {}", slip, truth.non_slip_s))
+    checks.append(("sliding_s and slip_s overlap: {}", truth.sliding_s, truth.slip_s))
+    found = [
+        what.format(clash) for what, ones, others in checks for clash in _clashes(ones, others)
+    ]
     for onset, (first, last) in zip(truth.onsets_s, truth.released_s, strict=False):
         if not first <= onset <= last:
             found.append(
                 f"the onset at {onset:g} s is not within its released_s, {first:g}-{last:g} s"
             )
-    if len(truth.sliding_s) == len(truth.onsets_s):
-        for onset, (_, end) in zip(truth.onsets_s, truth.sliding_s, strict=True):
-            if onset >= end:
-                found.append(
-                    f"the onset at {onset:g} s is not before the end of its slide, {end:g} s"
-                )
+    for onset, (_, end) in zip(truth.onsets_s, truth.sliding_s, strict=False):
+        if onset >= end:
+            found.append(f"the onset at {onset:g} s is not before the end of its slide, {end:g} s")
     return found
 
 
@@ -351,7 +350,8 @@ def _shown(values: Iterable[float]) -> str:
 
 NAMES = ("manifest.csv", "manifest.yaml", "manifest.yml")
 _ALIASES = {"object": "material", "cycle": "trial"}
-_COLUMNS = ("file", "material", "trial", "scene", "session", *_TRUTH_COLUMNS, "sample_rate_hz")
+_PLAIN = ("file", "material", "trial", "scene", "session", "sample_rate_hz")
+_COLUMNS = (*_PLAIN, *_TRUTH_COLUMNS)
 _IGNORED = ("simulated", "fidelity", "seed")
 """Further columns of what ``generate`` writes: files say this themselves."""
 
@@ -463,18 +463,14 @@ def read_manifest(path: Path, root: Path) -> Listing:
 
 def _draft(place: str, cells: Mapping[str, _Cell], root: Path) -> tuple[Entry | None, list[str]]:
     """A line, its trial -1 if it was left empty, and all that is wrong with it."""
-    problems = []
-    words = {}
-    for column in ("file", "material", "trial", "scene", "session", "sample_rate_hz"):
-        cell = cells.get(column, "")
-        if not isinstance(cell, str):
-            problems.append(f"{column} must be one value, got a list")
-            cell = ""
-        words[column] = cell
-    file, trial, rate = words["file"], words["trial"], words["sample_rate_hz"]
+    plain = {column: cells.get(column, "") for column in _PLAIN}
+    lists = [column for column, cell in plain.items() if isinstance(cell, list)]
+    problems = [f"{column} must be one value, got a list" for column in lists]
+    words = ["" if isinstance(cell, list) else cell for cell in plain.values()]
+    file, material, trial, scene, session, rate = words
     if problem := _file_problem(root, file):
         problems.append(problem)
-    if not words["material"]:
+    if not material:
         problems.append("no material")
     if trial and not (trial.isascii() and trial.isdigit() and len(trial) < 10):
         problems.append(
@@ -487,18 +483,10 @@ def _draft(place: str, cells: Mapping[str, _Cell], root: Path) -> tuple[Entry | 
     problems += wrong
     if problems:
         return None, problems
-    return Entry(
-        place,
-        PurePosixPath(*PureWindowsPath(file).parts).as_posix(),
-        RecordingId(
-            words["material"],
-            int(trial) if trial else -1,
-            words["scene"] or RecordingId.scene,
-            words["session"],
-        ),
-        truth,
-        float(rate) if rate else None,
-    ), []
+    path = PurePosixPath(*PureWindowsPath(file).parts).as_posix()
+    cycle = int(trial) if trial else -1
+    recording = RecordingId(material, cycle, scene or RecordingId.scene, session)
+    return Entry(place, path, recording, truth, float(rate) if rate else None), []
 
 
 def _file_problem(root: Path, file: str) -> str | None:

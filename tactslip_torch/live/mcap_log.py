@@ -32,8 +32,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tactslip_torch.data.formats._mcap import RECORDING
-from tactslip_torch.data.formats._messages import HEADER, TOPIC, Types, kind_of
+from tactslip_torch.data.formats._messages import HEADER, RECORDING, TOPIC, Types, kind_of
 from tactslip_torch.data.formats._reading import header_of, needs, text_of
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout

@@ -18,11 +18,10 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -73,12 +72,14 @@ class Format:
         name: of the format.
         endings: of its files, the first that of files that are written.
         module: the adapter, with its functions ``write`` and ``read``.
+        kind: behind the names of these functions, where a module serves several formats.
         is_folder: whether a recording is a folder, known by ``metadata.yaml``.
     """
 
     name: str
     endings: tuple[str, ...]
     module: str
+    kind: str = ""
     is_folder: bool = False
 
     def save(
@@ -101,7 +102,7 @@ class Format:
         samples = recording.samples.detach().cpu().contiguous().numpy()
         with (_whole_folder if self.is_folder else whole_file)(path) as temporary:
             try:
-                self._adapter.write(temporary, samples, header)
+                self._adapter("write")(temporary, samples, header)
             except Refused as error:
                 raise Refused(f"{path} {error}".replace(str(temporary), str(path))) from None
 
@@ -145,7 +146,7 @@ class Format:
         with ExitStack() as stack:
             with guarded(path):
                 self._check(path)
-                opened = (_isolated if how.isolate else self._adapter.read)(path, how, stack)
+                opened = (_isolated if how.isolate else self._adapter("read"))(path, how, stack)
                 if opened.archived is None and not how.isolate:
                     if how.speed is not None and opened.speed is None:
                         raise Refused(f"is of {self.name}, of which reading.speed is not read")
@@ -153,9 +154,10 @@ class Format:
                         opened = unfolded(opened, how)
             yield opened
 
-    @property
-    def _adapter(self) -> ModuleType:
-        return importlib.import_module(f"tactslip_torch.data.formats.{self.module}")
+    def _adapter(self, action: str) -> Callable[..., Any]:
+        module = importlib.import_module(f"tactslip_torch.data.formats.{self.module}")
+        call: Callable[..., Any] = getattr(module, action + self.kind)
+        return call
 
     def _check(self, path: Path) -> None:
         """Refuse what is no plain file or folder: reading a pipe would wait for ever."""
@@ -174,9 +176,9 @@ FORMATS = {
         Format("text", ("csv", "tsv", "txt", "dat", "lvm"), "_text"),
         Format("hdf5", ("h5", "hdf5", "he5"), "_hdf5"),
         Format("mat", ("mat",), "_mat"),
-        Format("mcap", ("mcap",), "_mcap"),
+        Format("mcap", ("mcap",), "_messages", "_mcap"),
         Format("parquet", ("parquet",), "_parquet"),
-        Format("rosbag2", ("bag2",), "_rosbag2", is_folder=True),
+        Format("rosbag2", ("bag2",), "_messages", "_rosbag2", is_folder=True),
     )
 }
 """By name; all can be written."""

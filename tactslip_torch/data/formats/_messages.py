@@ -1,4 +1,4 @@
-"""Messages on topics as samples, whatever file they are recorded in (``_mcap``, ``_rosbag2``).
+"""Recordings as MCAP files and as folders of rosbag2: messages on topics as samples, without ROS.
 
 Ours have one topic, ``/tactile``, of ``std_msgs/msg/Float32MultiArray`` or ``Float64MultiArray`` in
 CDR: a block of up to 0.1 s a message, ``[samples, channels]``, logged at the time of its first
@@ -11,7 +11,10 @@ from __future__ import annotations
 
 import json
 import keyword
+import os
 import re
+import shutil
+import tempfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -20,12 +23,14 @@ from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import quote, unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactslip_torch.data.formats._choice import chosen_columns, unit_of_time
 from tactslip_torch.data.formats._reading import (
+    MOST_HEADER,
     MOST_MEMBERS,
     SECONDS,
     Opened,
@@ -33,8 +38,11 @@ from tactslip_torch.data.formats._reading import (
     Refused,
     Samples,
     Spool,
+    check_plausible,
+    header_in,
     needs,
     opened_from,
+    text_of,
 )
 
 TOPIC = "/tactile"
@@ -43,6 +51,11 @@ HEADER = "tactslip_torch"
 _NOT_SAMPLES = ("/rosout", "/parameter_events", "/tf", "/tf_static", "/clock", "/diagnostics")
 _LOG_TIME = "log_time"
 _BLOCK_S = 0.1
+RECORDING = "tactslip_torch recording"
+_MOST_CHUNK = 256 * 2**20
+_METADATA = "metadata.yaml"
+_CHECKSUM = "tactslip_torch_message_sum"
+_SAFE = "{}[]:,"  # all else is written as in URLs: YAML writers wrap quoted text, and may err there
 _SECOND = 10**9  # in nanoseconds, as all times of messages
 _LONGEST = 2**62
 _GAP = 1.5  # usual spacings between messages; beyond, something is missing
@@ -485,3 +498,134 @@ def _read_topic(
         found = one
         found.add(message)
     return found, others
+
+
+# MCAP, by the library ``mcap`` ------------------------------------------------------------------
+
+
+def write_mcap(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
+    """Write blocks of samples, and a metadata record with everything else; nothing is packed."""
+    writer = needs("mcap.writer", "writing .mcap")
+    types, kind = Types(), kind_of(header)
+    with path.open("wb") as file:
+        output = writer.Writer(file, compression=writer.CompressionType.NONE)
+        output.start(profile="ros2", library="tactslip_torch")
+        output.add_metadata(RECORDING, {HEADER: text_of(header)})
+        schema = output.register_schema(kind, "ros2msg", types.definition(kind).encode())
+        channel = output.register_channel(TOPIC, "cdr", schema)
+        for number, (time, message) in enumerate(blocks(samples, header, types)):
+            output.add_message(channel, time, message, time, number)
+        output.finish()
+
+
+def read_mcap(path: Path, how: Reading, stack: ExitStack) -> Opened:
+    """A file of ours or of others, every message looked at once.
+
+    A file without its end is refused, not read up to there.
+    """
+    reader = _mcap_reader(path, stack)
+    return opened_messages(path, _mcap_messages(reader), _mcap_header(reader), how, stack)
+
+
+def _mcap_reader(path: Path, stack: ExitStack) -> Any:
+    """The reader of a file that has its end, and claims no more than is plausible."""
+    library = needs("mcap.reader", "reading .mcap")
+    file = stack.enter_context(path.open("rb"))
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(size - 37, 0))  # the footer: its kind and length, 20 bytes, and the magic
+    footer = file.read()
+    if footer[:9] != b"\2\x14\0\0\0\0\0\0\0" or footer[-8:] != b"\x89MCAP0\r\n":
+        raise Refused(
+            "is damaged or no recording of ours: it is no MCAP file, or ends in the middle; "
+            "of such a file mcap recover saves what is there"
+        )
+    file.seek(0)
+    reader = library.SeekingReader(file, validate_crcs=True, record_size_limit=_MOST_CHUNK)
+    summary = reader.get_summary()
+    sizes = [chunk.uncompressed_size for chunk in summary.chunk_indexes] if summary else []
+    check_plausible("its largest chunk", max(sizes, default=0), size, _MOST_CHUNK)
+    check_plausible("it", sum(sizes), size)
+    return reader
+
+
+def _mcap_header(reader: Any) -> dict[str, Any] | None:
+    summary = reader.get_summary()
+    if summary is None or all(one.name != RECORDING for one in summary.metadata_indexes):
+        return None
+    own = next(one.metadata for one in reader.iter_metadata() if one.name == RECORDING)
+    return header_in(own.get(HEADER))
+
+
+def _mcap_messages(reader: Any) -> Iterator[Message]:
+    """In the order in which they stand in the file."""
+    for schema, channel, message in reader.iter_messages(log_time_order=False):
+        topic = Topic(channel.topic, "", channel.message_encoding)
+        if schema is not None:
+            text = schema.data.decode(errors="replace")
+            topic = topic._replace(kind=schema.name, schema_encoding=schema.encoding, schema=text)
+        yield Message(topic, message.log_time, message.data)
+
+
+# rosbag2, by the library ``rosbags`` ------------------------------------------------------------
+
+
+def write_rosbag2(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
+    """Write a ``.db3`` file and ``metadata.yaml`` into a folder that is not there yet."""
+    library = needs("rosbags.rosbag2", "writing folders of rosbag2")
+    types, kind = Types(), kind_of(header)
+    with tempfile.TemporaryDirectory() as elsewhere:
+        plain = Path(elsewhere, "recording")  # "#" and "?" in a path are parts of URLs to SQLite
+        with library.Writer(plain, version=8) as writer:
+            definition, digest = types.definition(kind), types.store.hash_rihs01(kind)
+            channel = writer.add_connection(TOPIC, kind, msgdef=definition, rihs01=digest)
+            total = 0
+            for time, message in blocks(samples, header, types):
+                writer.write(channel, time, message)
+                total = zlib.crc32(message, total)
+            custom = {HEADER: text_of(header), _CHECKSUM: checksum_text(total)}
+            for name, text in custom.items():
+                writer.set_custom_data(name, quote(text, safe=_SAFE))
+        shutil.copytree(plain, path)
+
+
+def read_rosbag2(path: Path, how: Reading, stack: ExitStack) -> Opened:
+    """A folder of ours or of others, every message looked at once; several files are one."""
+    reader = _bag_reader(path, stack)
+    custom = _custom_of(reader)
+    own = header_in(custom.get(HEADER))
+    checksum = None if own is None else custom.get(_CHECKSUM, "")
+    return opened_messages(path, _bag_messages(reader), own, how, stack, checksum)
+
+
+def _bag_reader(path: Path, stack: ExitStack) -> Any:
+    """An open bag; its files lie in the folder itself, whatever it says."""
+    library = needs("rosbags.rosbag2", "reading folders of rosbag2")
+    for file in path.iterdir():
+        if file.is_symlink() and not file.resolve().is_relative_to(path.resolve()):
+            raise Refused(f"holds {file.name!r}, which leads out of the folder")
+    size = (path / _METADATA).stat().st_size
+    if size > 4 * MOST_HEADER:
+        raise Refused(f"has {_METADATA} of {size} bytes, at most {4 * MOST_HEADER} are read")
+    if re.search(rb"compression_mode:\W*file", (path / _METADATA).read_bytes(), re.IGNORECASE):
+        raise Refused("has packed files; unpack them first: ros2 bag convert")
+    if re.search(r"[?#%]", str(path)):
+        link = Path(stack.enter_context(tempfile.TemporaryDirectory()), "bag")
+        link.symlink_to(path.resolve(), target_is_directory=True)
+        path = link
+    return stack.enter_context(library.Reader(path))
+
+
+def _custom_of(reader: Any) -> dict[str, str]:
+    """What the writer of a bag added, as text."""
+    custom = reader.storage.metadata.custom
+    pairs = custom.items() if isinstance(custom, dict) else ()
+    return {name: unquote(text) for name, text in pairs if isinstance(text, str)}
+
+
+def _bag_messages(reader: Any) -> Iterator[Message]:
+    topics = {}
+    for one in reader.connections:
+        encoding = "ros2msg" if one.msgdef.format.name == "MSG" else ""
+        topics[one.id] = Topic(one.topic, one.msgtype, "cdr", encoding, one.msgdef.data)
+    for connection, time, content in reader.messages():
+        yield Message(topics[connection.id], time, bytes(content))
