@@ -331,7 +331,7 @@ class TopicColumns:
         return rows[:, self._columns], stamp, named
 
 
-class _TopicSamples:
+class _TopicSamples(TopicColumns):
     """The samples of a topic in the order of the file, and when they were taken.
 
     Args:
@@ -340,9 +340,9 @@ class _TopicSamples:
     """
 
     def __init__(self, first: Message, types: Types | None, how: Reading, stack: ExitStack) -> None:
-        self._of, self._how, self._stack = TopicColumns(first, types, how), how, stack
-        self.topic, self.names, self.checksum = self._of.topic, self._of.names, 0
-        self.spool = Spool(self._of.num_channels, "f4" if self._of.is_small else "f8", stack)
+        super().__init__(first, types, how)
+        self._how, self._stack, self.checksum = how, stack, 0
+        self.spool = Spool(self.num_channels, "f4" if self.is_small else "f8", stack)
         self._marks = Spool(3, np.int64, stack)  # when recorded, stamp or 0, number of samples
         self._named: list[Any] = []  # the times that ``how`` names
 
@@ -352,7 +352,7 @@ class _TopicSamples:
         Raises:
             Refused: if it is damaged or holds other channels than the first.
         """
-        rows, stamp, named = self._of.rows(message.content)
+        rows, stamp, named = self.rows(message.content)
         self.spool.add(rows)
         self._marks.add(np.array([[message.log_time, stamp or 0, len(rows)]], np.int64))
         self.checksum = zlib.crc32(message.content, self.checksum)
@@ -367,7 +367,7 @@ class _TopicSamples:
         rows, (logged, stamps, counts) = self.spool.array(), self._marks.array().T
         times = stamps if self._how.time == "auto" and stamps.any() else logged
         if self._named:
-            unit = unit_of_time(self._of.time_name, self._how)
+            unit = unit_of_time(self.time_name, self._how)
             times = _nanoseconds(np.array(self._named), SECONDS[unit])
         if (np.diff(times) < 0).any():
             order = np.argsort(times, kind="stable")

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from tactslip_torch.data.formats._choice import choose, why_not_numbers
 from tactslip_torch.data.formats._reading import (
     FORM,
-    MOST_CHANNELS,
     Opened,
     Reading,
     Refused,
@@ -101,21 +100,16 @@ def _header(content: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     needed = ("samples", "sample_rate_hz", *_WORDS, *MOMENTS, "provenance", "key")
     if missing := [name for name in needed if name not in content]:
         raise ValueError(f"no array {', '.join(missing)} in the archive")
-    shape = content["samples"].shape
-    columns = [column for column in _COLUMNS if f"channel_{column}" in content]
-    words = [content[f"channel_{column}"].tolist() for column in columns]
-    if len(shape) != 2 or shape[0] > MOST_CHANNELS or any(len(w) != shape[0] for w in words):
+    samples = content["samples"]
+    beside = {name: kept.tolist() for name, kept in content.items() if name != "samples"}
+    words = {c: beside[f"channel_{c}"] for c in _COLUMNS if f"channel_{c}" in beside}
+    if any(len(column) != len(samples) for column in words.values()):
         raise ValueError("a name for every row of samples")
-    rows = [dict(zip(columns, row, strict=True)) for row in zip(*words, strict=True)]
-    return {
-        "format": form,
-        "dtype": str(content["samples"].dtype),
-        "shape": list(shape),
-        "sample_rate_hz": float(content["sample_rate_hz"]),
-        **{name: str(content[name]) for name in _WORDS},
-        **{name: content[name].tolist() for name in MOMENTS},
-        **{name: content[name].tolist() if name in content else [] for name in STRETCHES},
-        **{name: json.loads(str(content[name])) for name in ("provenance", "key")},
+    rows = [dict(zip(words, row, strict=True)) for row in zip(*words.values(), strict=True)]
+    return beside | {
+        "dtype": str(samples.dtype),
+        "shape": list(samples.shape),
+        **{name: json.loads(beside[name]) for name in ("provenance", "key")},
         "channels": [
             {name: word for name, word in row.items() if word or name != "adapting"} for row in rows
         ],

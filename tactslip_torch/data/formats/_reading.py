@@ -538,7 +538,7 @@ def opened_from(
         if len(hand) != samples.num_channels:
             raise ValueError(f"{len(hand)} rows of channels for {samples.num_channels} channels")
         truth: dict[str, Any] = {name: tuple(map(float, header[name])) for name in MOMENTS}
-        header = {"released_s": (), **header}  # older files lack it
+        header = {"slip_s": (), "released_s": (), **header}  # where there is none
         for name in STRETCHES:
             truth[name] = tuple((float(start), float(end)) for start, end in header[name])
         recording = Recording(
