@@ -214,66 +214,48 @@ def choose(
             arrays.append(Array(name, kept, name.rpartition(separator)[2], labels, rate))
     several = [array for array in arrays if math.prod(array.values.shape) > 1]
     within = several if how.samples is None else _named(how.samples, several, refused)
-    times = [] if isinstance(how.time, int) else _times_of(several, refused, how)
-    speeds = _said(how.speed, several, refused) if isinstance(how.speed, str) else []
-    how = replace(how, speed=None) if speeds else how  # of the columns
-    beside = [*times, *speeds]
-    singles = [array for array in within if array.is_column and array not in beside]
+    columns = [array for array in several if array.is_column]  # which numbers count
     matrices = [array for array in within if not array.is_column]
-    called = {word for single in singles for word in (single.name, single.leaf)}
-    if matrices and (how.channels is None or not called.issuperset(how.channels)):
+    called = {word for array in columns if array in within for word in (array.name, array.leaf)}
+    is_matrix = bool(matrices) and (how.channels is None or not called.issuperset(how.channels))
+
+    def apart(wanted: str | int, what: str) -> Sequence[Array]:
+        """Arrays that are not the samples; none of what is a column of a matrix."""
+        if isinstance(wanted, int):
+            return [] if is_matrix else [columns[_position(None, len(columns), wanted, what)]]
+        if any(wanted in labels for array in several for labels in array.labels):
+            return []
+        return _named(wanted, several, refused)
+
+    times = [] if how.time in (None, "auto") else apart(how.time, "time")
+    if how.time == "auto":
+        times = [array for array in columns if _is_time_name(array.leaf)]
+    speeds = [] if how.speed is None else apart(how.speed, "speed")
+    how = replace(how, speed=None) if speeds else how  # of the columns
+    singles = [a for a in columns if a in within and a not in (*times, *speeds)]
+    if is_matrix:
         if len(matrices) > 1:
             raise Refused(f"holds several arrays, {_listed(matrices)}; say reading.samples")
-        opened = _of_matrix(path, matrices[0], times, how)
-        near = matrices[0]
+        opened, near = _of_matrix(path, matrices[0], times, how), matrices[0]
     elif singles:
-        columns = [array for array in several if array.is_column]
         opened, near = _of_columns(path, singles, columns, how)
     else:
         whys = "; ".join([f"{name!r} {why}" for name, why in refused.items()][:3])
-        reasons = f" ({whys})" if whys else ""
+        reasons = f" ({whys})" if whys else " but times" if times else ""
         raise Refused(f"holds no samples{reasons}; say reading.samples if it does")
-    if opened.stamps is None and times:
-        opened = _with_times(path, opened, times, how)
+    length = opened.samples.num_samples
+    fitting = [a for a in times if a.is_column and a.length == length]
+    if opened.stamps is None and fitting:
+        stamps, unit = Samples(path, [fitting[0].values]), unit_of_time(fitting[0].leaf, how)
+        opened = opened._replace(stamps=stamps, time_unit=unit)
+    elif opened.stamps is None and times and how.time != "auto":
+        raise Refused(f"has times {_listed(times)} for {length} samples; say reading.time")
     if speeds:
-        if not speeds[0].is_column or speeds[0].length != opened.samples.num_samples:
-            length = opened.samples.num_samples
+        if not speeds[0].is_column or speeds[0].length != length:
             raise Refused(f"has speeds {_listed(speeds)} for {length} samples; say reading.speed")
         opened = opened._replace(speed=Samples(path, [speeds[0].values]))
     rate = near.sample_rate_hz or _single_rate(arrays, near.name)
     return opened._replace(sample_rate_hz=rate)
-
-
-def _times_of(
-    several: Sequence[Array], refused: Mapping[str, str], how: Reading
-) -> Sequence[Array]:
-    """The arrays that may be times, by the name that was given or by what they are called."""
-    if how.time == "auto":
-        return [a for a in several if a.is_column and _is_time_name(a.leaf)]
-    if how.time is None:
-        return []
-    return _said(str(how.time), several, refused)
-
-
-def _said(wanted: str, several: Sequence[Array], refused: Mapping[str, str]) -> Sequence[Array]:
-    """The arrays of a name; none if it is that of a column of a matrix."""
-    if any(wanted in labels for array in several for labels in array.labels):
-        return []
-    return _named(wanted, several, refused)
-
-
-def _with_times(
-    path: str | os.PathLike[str], opened: Opened, times: Sequence[Array], how: Reading
-) -> Opened:
-    """The first of these times that has a time for every sample."""
-    length = opened.samples.num_samples
-    fitting = [array for array in times if array.is_column and array.length == length]
-    if fitting:
-        unit = unit_of_time(fitting[0].leaf, how)
-        return opened._replace(stamps=Samples(path, [fitting[0].values]), time_unit=unit)
-    if how.time != "auto":
-        raise Refused(f"has times {_listed(times)} for {length} samples; say reading.time")
-    return opened
 
 
 def _of_matrix(
@@ -311,29 +293,20 @@ def _of_columns(
     path: str | os.PathLike[str], singles: Sequence[Array], columns: Sequence[Array], how: Reading
 ) -> tuple[Opened, Array]:
     """Arrays of one column each, and the first of them; numbers count all such of the file."""
-
-    def found(wanted: str | int, what: str) -> Array:
-        if isinstance(wanted, str):
-            return _named(wanted, singles, {})[0]
-        return columns[_position(None, len(columns), wanted, what)]
-
-    time = found(how.time, "time") if isinstance(how.time, int) else None
-    speed = found(how.speed, "speed") if how.speed is not None else None
-    if how.channels is None:
-        chosen = [single for single in singles if single is not time and single is not speed]
-    else:
-        chosen = [found(wanted, "channels") for wanted in how.channels]
-    if not chosen:
-        raise Refused("holds no column but the times; say reading.time=null if it is none")
+    chosen = list(singles)
+    if how.channels is not None:
+        chosen = [
+            columns[_position(None, len(columns), wanted, "channels")]
+            if isinstance(wanted, int)
+            else _named(wanted, singles, {})[0]
+            for wanted in how.channels
+        ]
     if len({column.length for column in chosen}) > 1:
         raise Refused(f"holds columns of several lengths, {_listed(chosen)}; say reading.channels")
     names = tuple(column.leaf for column in chosen)
     if len(set(names)) < len(names):
         names = tuple(column.name for column in chosen)
-    opened = Opened(Samples(path, [column.values for column in chosen]), names=names)
-    if speed is not None:
-        opened = opened._replace(speed=Samples(path, [speed.values]))
-    return (opened if time is None else _with_times(path, opened, [time], how)), chosen[0]
+    return Opened(Samples(path, [column.values for column in chosen]), names=names), chosen[0]
 
 
 def _named(wanted: str, arrays: Sequence[Array], refused: Mapping[str, str]) -> list[Array]:
