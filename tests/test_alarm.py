@@ -37,7 +37,6 @@ from tactslip_torch.training.alarm import (
     DebouncedAlarm,
     Stream,
     Timing,
-    decide,
     labelled,
     score_streams,
     watched,
@@ -460,30 +459,6 @@ def test_bins_over_the_edge_of_a_slide_have_no_label():
         if inside or end <= 0.2 + 1e-9 or start >= 0.4 - 1e-9:
             expected[number] = inside
     assert dict(zip(kept.tolist(), is_slip.tolist(), strict=True)) == expected
-
-
-SLIDES = [(0.3, 0.5), (0.8, 1.0)]
-
-
-def test_alarms_their_ends_and_first_slip_decisions_by_a_plain_loop():
-    rng = np.random.default_rng(2)
-    stream = stream_of(np.repeat(rng.standard_normal(40), 3), SLIDES)
-    ((_, made),) = decide([stream], settings_of(), TIMING)
-    seen = watched(stream, made)
-    alarms = [i for i in range(120) if made.is_alarm[i]]
-    assert len(alarms) >= 2
-    assert seen.alarms_s == tuple((i * 20 + 125) / RATE_HZ for i in alarms)
-    for raised, end in zip(alarms, seen.alarm_ends_s, strict=True):
-        off = [i for i in range(raised, 120) if not made.is_on[i]]
-        assert end == (made.available_s[off[0]] if off else math.inf)
-    decisions = list(zip(made.available_s.tolist(), made.llr.tolist(), strict=True))
-    for onset, first in zip((0.3, 0.8), seen.first_positive_s, strict=True):
-        assert first == next(t for t, llr in decisions if t >= onset and llr > 0)
-    released_s = ((0.1, 0.35), (0.62, 0.8))
-    told = watched(stream._replace(times=times_of(2.0, SLIDES, released_s)), made)
-    assert told.released_s == released_s
-    for (release, _), first in zip(released_s, told.first_positive_s, strict=True):
-        assert first == next(t for t, llr in decisions if t >= release and llr > 0)
 
 
 # ------------------------------------------------------------------------------ without a rate

@@ -92,13 +92,6 @@ def test_a_stream_in_pieces_is_the_recording_scored_whole(name, data):
             ("labels.bin_ms=100", "features.level=null", "features.frames.SG=7",
              "+features.frames.force=null"),
         ),
-        pytest.param(
-            "40 at 1 kHz",
-            "kPa",
-            ("labels.bin_ms=30", "+features.frames.taxel=5", "+features.frames.thermistor=1",
-             "features.wavelet=db3", "features.level=2", "features.align=causal"),
-            marks=pytest.mark.slow,
-        ),
     ],
 )  # fmt: skip
 def test_train_takes_a_hand_from_its_configuration(name, units, changes, tmp_path):

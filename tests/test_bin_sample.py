@@ -87,31 +87,6 @@ def test_a_sample_equals_sorting_all_keys_at_once(recordings, most):
     assert bins.sample_weight.dtype == torch.float64
 
 
-def test_every_bin_is_as_likely_as_any_other():
-    """1000 of 20000 bins: a twentieth of each recording, quarter and value, within 5 sigma."""
-    sample = BinSample(1000)
-    values = torch.arange(20_000.0)[:, None]
-    for number in range(20):
-        rows = slice(1000 * number, 1000 * (number + 1))
-        sample.update(f"r{number}", "a", values[rows], torch.ones(1000))
-    bins = sample.bins()
-    quarters = torch.bincount(bins.bin_index // 250)
-    assert ((quarters - 250).abs() < 5 * (1000 * 0.25 * 0.75) ** 0.5).all()
-    by_recording = torch.bincount(bins.recording, minlength=20)
-    assert ((by_recording - 50).abs() < 5 * 50**0.5).all()
-    assert abs(float(bins.features.mean()) - 10_000) < 5 * 20_000 / 12**0.5 / 1000**0.5
-
-
-def test_a_sample_of_none_counts():
-    sample = sample_of(make_recordings([9, 9]), 0)
-    assert sum(sample.num_seen.values()) == 18
-    bins = sample.bins()
-    assert bins.features.shape == (0, NUM)
-    assert len(bins.sample_weight) == 0
-    assert BinSample(3).bins().features.shape == (0, 0)
-    assert BinSample(3).bins().group_names == ()
-
-
 def test_a_sample_of_fewer_than_none_is_refused():
     with pytest.raises(ValueError, match=r"0 bins or more .* got -1"):
         BinSample(-1)

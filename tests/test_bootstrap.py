@@ -80,34 +80,3 @@ def test_what_never_happened_may_still_happen_and_nothing_is_none():
     )
     assert many.ratio([0] * 30, [3] * 30)["high"] == 0.0  # no count of independent events
     assert many.rate([1] * 30, [0] * 30) is Bootstrap(0).share([], []) is None
-
-
-@pytest.mark.parametrize("wrong", [{"level": 0.0}, {"level": 1.0}, {"num": 0}])
-def test_draws_that_are_none_are_refused(wrong):
-    with pytest.raises(ValueError, match="level between 0 and 1 and at least one draw"):
-        Bootstrap(3, **wrong)
-
-
-def test_intervals_hold_as_often_as_they_say(rng):
-    """Recordings differ in their rate: 95 % hold the truth, a Poisson count's own interval not."""
-    sets, num = 200, 40
-    held = alone = shares = medians = 0
-    for _ in range(sets):
-        hours = rng.uniform(0.5, 1.5, num)
-        counts = rng.poisson(hours * rng.gamma(0.5, 4.0, num))  # 2 an hour in the mean
-        bootstrap = Bootstrap(num, num=200)
-        rate = bootstrap.rate(counts.tolist(), hours.tolist())
-        naive = Bootstrap(1, num=1).rate([counts.sum()], [hours.sum()])
-        held += rate["low"] <= 2.0 <= rate["high"]
-        alone += naive["low"] <= 2.0 <= naive["high"]
-        found = rng.binomial(3, rng.beta(4.0, 1.0, num))  # 80 % in the mean
-        share = bootstrap.share(found.tolist(), [3] * num)
-        shares += share["low"] <= 0.8 <= share["high"]
-        away = rng.normal(50.0, 10.0, num)[:, None] + rng.normal(0.0, 5.0, (num, 3))
-        recording = torch.arange(num).repeat_interleave(3)
-        median = bootstrap.quantile(torch.from_numpy(away).flatten(), recording, 0.5)
-        medians += median["low"] <= 50.0 <= median["high"]
-    assert 0.87 < held / sets < 0.985  # the bootstrap of 40 is a little short of 95
-    assert alone / sets < 0.8
-    assert 0.9 < shares / sets < 0.995
-    assert 0.9 < medians / sets < 0.995

@@ -72,7 +72,6 @@ def test_the_files_stand_beside_the_detector_and_repeat(tmp_path):
         ["A", "B"],
     )
     assert (drawn["unseen"]["recordings"], drawn["unseen"]["materials"]) == (1, ["C"])
-    assert written(path) == content
 
 
 # The bins it draws -----------------------------------------------------------------------------

@@ -1,5 +1,3 @@
-import pickle
-
 import numpy as np
 import pytest
 import torch
@@ -132,16 +130,6 @@ def test_no_bins_are_no_machine():
     none = TrainingBins(torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool))
     with pytest.raises(ValueError, match=r"^a machine needs training bins, got none; add"):
         fit_machine(none, 1.0)
-
-
-def test_a_head_remembers_its_solve_and_its_file_does_not(rng):
-    for kernel, names in (
-        (PAPER_KERNEL, {"quadratic", "linear", "constant"}),
-        (RadialBasis(1.0), {"support", "beta"}),
-    ):
-        machine = fit_machine(draw(rng, 8), 1.0, kernel)
-        assert set(machine.state_dict()) == names
-        assert pickle.loads(pickle.dumps(machine)).solved == machine.solved
 
 
 # Differentiable fits ---------------------------------------------------------------------------

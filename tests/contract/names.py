@@ -33,8 +33,6 @@ TRACEBACK_VARIABLE = "TACTSLIP_TRACEBACK"
 
 KEYS = {
     "bin_ms": "labels.bin_ms",
-    "bins_to_explain": "gradient_bins",
-    "bins_to_score": "scored_bins",
     "channels": "data.channels",
     "cycles": "data.cycles",
     "dtype": "features.dtype",
@@ -43,10 +41,8 @@ KEYS = {
     "experiment": "+exp",
     "folder": "hydra.run.dir",
     "format": "to",
-    "generated_cycles": "cycles",
     "held_out": "split.unseen",
     "materials": "data.materials",
-    "generated_materials": "materials",
     "num_features": "recipe.num_features",
     "num_held_out": "num_unseen",
     "penalties": "recipe.penalties",
@@ -85,14 +81,12 @@ BIN_GRAPH = "model.onnx"
 STREAM_GRAPH = "stream.onnx"
 SIDECAR = "{}.json"
 ONSETS = ("onsets.json", "onsets.csv")
-CERTIFICATE = "certificate.json"
 MANIFEST = "manifest.csv"
-IMPORTANCE = "sensors.json"
 DECISIONS = "{}_decisions.csv"
 RUN_FILES = (DETECTOR, METRICS, CHECKPOINT, "config.yaml", "confusion.png", "selected_features.png")
-CHECK, SUMMARY, CONVERT, TEMPLATE = "check", "summary", "convert", "label_template"
+CONVERT = "convert"
 UNSEEN_EXPERIMENT, REAL_EXPERIMENT = "unseen4", "biotacsp_dos"
-ADD, UNDO, LIST, FORGET = "add", "undo", "list", "forget"
+ADD, LIST, FORGET = "add", "list", "forget"
 
 # metrics.json: the splits' names, and what the fit alone decides
 TRAIN, TEST, HELD_OUT = "train", "test", "unseen"

@@ -16,7 +16,6 @@ from . import names
 from .names import SlipDetector, StreamingDetector, settings
 from .recordings import (
     CHANNELS,
-    NAMES,
     SEEN,
     SLIDE_S,
     TRIALS,
@@ -143,26 +142,6 @@ def test_detect_does_without_masked_channels(command, selected, recordings, tmp_
 # Data, generate ----------------------------------------------------------------------------------
 
 
-def test_data_checks_summarises_and_drafts_a_manifest(command, recordings, tmp_path):
-    told = settings(root_of_data=recordings, workers=0)
-    mine = settings(channels=CHANNELS)
-    out = command.well(tmp_path, "data", *settings(action=names.CHECK), *told, *mine)
-    assert f"{NUM_RECORDINGS} recordings of 4 materials, 36.0 s" in out
-    assert "0 problems" in out
-    words = settings(action=names.SUMMARY, output="summary.png")
-    lines = command.well(tmp_path, "data", *words, *told, *mine).splitlines()
-    rows = {line.split()[0]: line.split()[1:] for line in lines if line.split()}
-    assert rows["A"][:5] == ["3", "3.00", "3.00", "9.0", "3"]  # shortest, longest, all; onsets
-    assert (tmp_path / "summary.png").stat().st_size > 10_000
-    words = settings(action=names.TEMPLATE, pattern='"{material}_{trial}"', output="draft.csv")
-    command.well(tmp_path, "data", *words, *told)
-    drafted = {
-        (row["file"], row["material"], row["trial"]) for row in table(tmp_path / "draft.csv")
-    }
-    listed = {(r["file"], r["material"], r["trial"]) for r in table(recordings / names.MANIFEST)}
-    assert drafted == listed
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("to", ["npz", "h5"])
 def test_converted_recordings_are_the_same_set(command, selected, recordings, to, tmp_path):
@@ -176,26 +155,10 @@ def test_converted_recordings_are_the_same_set(command, selected, recordings, to
         assert splits[name][names.CONFUSION] == scores[names.CONFUSION], name
 
 
-def test_generate_writes_what_simulate_gives_and_goes_on(command, tmp_path):
-    words = settings(generated_materials=["M1"], workers=0, figure=False, folder="run", seed=0)
-    command.well(tmp_path, "generate", *words, *settings(generated_cycles=1))
-    (first,) = (tmp_path / "run").glob("*.npz")
-    with np.load(first, allow_pickle=False) as file:
-        samples, onsets_s = file["samples"], file["onsets_s"]
-    before = first.read_bytes()
-    assert samples.shape[0] == 24
-    assert len(onsets_s) == 3
-    command.well(tmp_path, "generate", *words, *settings(generated_cycles=2))
-    assert len(list((tmp_path / "run").glob("*.npz"))) == 2
-    assert first.read_bytes() == before
-    assert len(table(tmp_path / "run" / names.MANIFEST)) == 2
-
-
 # Adapt, certify, importance ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("back", [names.UNDO, names.FORGET])
-def test_adapt_adds_a_material_and_takes_it_back(command, selected, cache, back, tmp_path):
+def test_adapt_adds_a_material_and_takes_it_back(command, selected, cache, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(selected.folder, run)
     new = write_set(tmp_path / "new", {f"D/{trial}": 1 for trial in TRIALS})
@@ -206,43 +169,11 @@ def test_adapt_adds_a_material_and_takes_it_back(command, selected, cache, back,
     assert added.info["train_materials"] == [*SEEN, "D"]
     assert (probe(added) - probe(selected.detector)).abs().max() > 1e-6
     assert "D" in command.well(tmp_path, "adapt", *model, *settings(action=names.LIST))
-    which = settings(material="D", cache=cache) if back == names.FORGET else []
-    command.well(tmp_path, "adapt", *model, *settings(action=back), *which)
+    which = settings(action=names.FORGET, material="D", cache=cache)
+    command.well(tmp_path, "adapt", *model, *which)
     found = SlipDetector.load(run / names.DETECTOR)
     assert found.info["train_materials"] == list(SEEN)
     torch.testing.assert_close(probe(found), probe(selected.detector), rtol=1e-9, atol=1e-9)
-
-
-def test_a_certificate_holds_on_bins_it_has_not_seen(command, trained_by, recordings, tmp_path):
-    """Of the default; that of few features selects some that the least rounding moves far."""
-    data, general = [*of_set(recordings), *split_of_set()], trained_by("general")
-    words = settings(model=general.file, out=tmp_path, bins=100, bins_to_score=50, extremes=3)
-    command.well(tmp_path, "certify", *data, *words)
-    certificate = read(tmp_path / names.CERTIFICATE)
-    assert certificate["holds"] is True
-    detector = general.detector
-    length = detector.context_before + detector.pool.bin_samples + detector.context_after
-    bins = torch.from_numpy(samples_of("C", 1).T.copy()).unfold(1, length, 53).transpose(0, 1)
-    double, single = (detector.score_raw(bins.double()), detector.score_raw(bins.float()))
-    assert (double - single).abs().max() <= certificate["margin"]["score"]
-
-
-def test_importance_has_every_unit_and_refits_for_the_best(command, selected, cache, tmp_path):
-    few = settings(bins=20, bins_to_score=30, bins_to_explain=8, draws=20)
-    told = settings(model=selected.file, workers=0, cache=cache, folder="run")
-    command.well(tmp_path, "importance", *few, *told)
-    content = read(tmp_path / "run" / names.IMPORTANCE)
-    units = [(row["unit"], row["name"]) for row in content["units"]]
-    expected = [("channel", name) for name in NAMES]
-    assert units == [
-        *expected,
-        *(("finger", f) for f in ("index", "thumb")),
-        ("kind", "SG"),
-        ("kind", "PVDF"),
-    ]
-    num = sum(row["features_in_use"] for row in content["units"] if row["unit"] == "channel")
-    assert num == len(selected.detector.selected_names) == 12
-    assert {row["joins"] for row in content["best"]["channel"]} == set(NAMES)
 
 
 # A simulated set, and statistics in shards -------------------------------------------------------

@@ -59,3 +59,21 @@ def test_a_file_that_holds_no_detector_is_refused_by_name(trained, tmp_path, kep
     (tmp_path / "broken.pt").write_bytes(content[:size])
     with pytest.raises((ValueError, OSError), match=r"broken\.pt"):
         SlipDetector.load(tmp_path / "broken.pt")
+
+
+def test_code_in_a_file_is_not_executed(tmp_path):
+    target = tmp_path / "executed"
+    torch.save(_Trap(str(target)), tmp_path / "trap.pt")
+    with pytest.raises((ValueError, OSError)):
+        SlipDetector.load(tmp_path / "trap.pt")
+    assert not target.exists()
+
+
+class _Trap:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        from pathlib import Path
+
+        return Path.touch, (Path(self.path),)

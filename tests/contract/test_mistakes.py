@@ -80,7 +80,11 @@ def places(trained_by, recordings, tmp_path_factory):
     return {"{model}": model, "{root}": recordings, "{bare}": folder / DETECTOR}
 
 
-@pytest.mark.parametrize("name", MISTAKES)
+QUICK = ("seen and held out", "evaluate another hand", "detect without an alarm")
+SOME_SLOW = [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in MISTAKES]
+
+
+@pytest.mark.parametrize("name", SOME_SLOW)
 def test_a_mistake_is_one_line_and_a_failing_exit(command, places, name, tmp_path):
     which, overrides, words = MISTAKES[name]
     for word, place in places.items():

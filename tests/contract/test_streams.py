@@ -96,12 +96,34 @@ def test_a_masked_channel_counts_as_missing(trained):
     assert not found["is_valid"].any()
 
 
+def test_gaps_in_time_are_filled_or_begin_another_stream(trained, whole):
+    stream = in_double(trained)
+    short, long = 40, 400
+    holed = SAMPLES.copy()
+    holed[1000 : 1000 + short] = np.nan
+    expected = pushed(in_double(trained), holed)["score"]
+    parts = [
+        stream.push(SAMPLES[:1000], 0.0),
+        stream.push(SAMPLES[1000 + short :], (1000 + short) / RATE_HZ),
+    ]
+    found = torch.cat([part.score for part in [*parts, stream.flush()]])
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    stream.reset()
+    stream.push(SAMPLES[:1000], 0.0)
+    behind = stream.push(SAMPLES, (1000 + long) / RATE_HZ)
+    assert stream.num_gaps == 1
+    scores = torch.cat([behind.score[behind.number.argmin().item() :], stream.flush().score])
+    assert len(scores) >= len(whole["score"])
+    torch.testing.assert_close(scores[-len(whole["score"]) :], whole["score"], rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("samples", "time_s", "words"),
     [
         (np.zeros((3, 5)), None, r"\[n, 4\].*\(3, 5\)"),
         (np.zeros((3, 4), np.int16), None, "floating.*int16"),
         (np.zeros((3, 4)), [0.1, 0.2], r"time_s.*3.*\(2,\)"),
+        (np.zeros((3, 4)), -5.0, "goes back"),
     ],
 )
 def test_what_cannot_be_pushed_is_refused_and_changes_nothing(
