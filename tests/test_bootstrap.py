@@ -73,6 +73,12 @@ def test_the_ends_of_a_rate_are_two_sided_scores_of_a_poisson_count(count):
     assert rate["value"] == pytest.approx(3 * count / hours)
 
 
+@pytest.mark.parametrize("wrong", [{"level": 0.0}, {"level": 1.0}, {"num": 0}])
+def test_draws_that_are_none_are_refused(wrong):
+    with pytest.raises(ValueError, match="level between 0 and 1 and at least one draw"):
+        Bootstrap(3, **wrong)
+
+
 def test_what_never_happened_may_still_happen_and_nothing_is_none():
     many = Bootstrap(30)
     assert many.share([0] * 30, [3] * 30)["high"] == pytest.approx(

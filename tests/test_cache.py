@@ -58,8 +58,8 @@ def test_what_is_stored_comes_back_bit_by_bit(cache, values):
 @pytest.mark.parametrize(
     "damage",
     [
-        *(lambda content, n=n: content[:n] for n in (0, 4, 40, 200, -4)),
-        *(lambda content, n=n: content[:n] + b"?" + content[n + 1 :] for n in (0, 130, 300)),
+        *(lambda content, n=n: content[:n] for n in (0, 40, -4)),
+        *(lambda content, n=n: content[:n] + b"?" + content[n + 1 :] for n in (0, 300)),
         lambda content: b"not features at all" * 20,
         lambda content: bytes(len(content)),
     ],

@@ -174,11 +174,8 @@ def test_a_mistake_is_answered_in_one_line(line):
     [
         ("train split.seen=M1", "split.seen", ["M1"]),
         ("train data=files data.root=x data.materials=cup", "data.materials", ["cup"]),
-        ("generate materials=M1", "materials", ["M1"]),
-        ("calibrate-simulator seeds=1001", "seeds", [1001]),
         ("train recipe.use=pooled", "recipe.use", "pooled"),  # a text, or a list to choose from
         ("train features.pooling=sorted", "features.pooling", "sorted"),
-        ("train recipe.num_features=60", "recipe.num_features", 60),
     ],
 )
 def test_a_text_is_a_list_of_one_where_a_list_is_wanted(line, key, value):

@@ -193,6 +193,14 @@ def test_a_column_that_may_be_the_label_is_no_channel_unless_said(tmp_path, name
     assert FileRecordings(tmp_path, channels=rows_named("b", "a")).hand.names == ("b", "a")
 
 
+def test_many_files_are_looked_at_in_processes(tmp_path):
+    for place in range(18):
+        table(tmp_path / f"{place}.csv", samples(place, 20))
+    manifest(tmp_path, *(f"{place}.csv,wood,{place},,,slip" for place in range(18)))
+    source = FileRecordings(tmp_path)
+    assert [source.entry(name).file for name in source.ids] == [f"{n}.csv" for n in range(18)]
+
+
 # Keys ----------------------------------------------------------------------------------------
 
 

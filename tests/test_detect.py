@@ -16,7 +16,7 @@ from tactslip_torch.commands import detect as module
 from tactslip_torch.commands.detect import detect, main
 from tactslip_torch.commands.entry import one_line
 from tactslip_torch.data.formats import FORMATS, Samples
-from tactslip_torch.model.calibration import Abstention, Platt
+from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, score_stream
 from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.report.onset import COLUMNS
@@ -126,6 +126,19 @@ def test_the_truth_stands_beside_them(run):
     assert events["num_false_alarms"] == len(false)
 
 
+def test_an_alarm_behind_the_first_release_is_not_early(model, tmp_path):
+    samples = volts(4.0, ((1.9, 4.0),))
+    truth = {"onsets_s": (2.0,), "sliding_s": ((2.0, 4.0),), "speeds_mm_s": (20.0,)}
+    save(tmp_path / "a.npz", recording(samples, released_s=((1.9, 2.1),), **truth))
+    (entry,) = detected(model, tmp_path, tmp_path / "out", "threshold=3")["recordings"]
+    (onset,), last = entry["truth"]["onsets"], entry["alarms"][-1]
+    assert 1.9 < last["alarm_s"] < 2.0
+    assert (last["outcome"], onset["outcome"], onset["slid_mm"]) == ("found", "found", 0.0)
+    assert onset["first_release_s"] == 1.9
+    assert [onset["delay_s"], last["delay_s"]] == pytest.approx([last["alarm_s"] - 2.0] * 2)
+    assert onset["delay_first_s"] == pytest.approx(last["alarm_s"] - 1.9)
+
+
 def test_the_files_agree_with_each_other(run):
     folder, content = run
     assert sorted(path.name for path in folder.iterdir()) == [
@@ -153,19 +166,6 @@ def test_the_files_agree_with_each_other(run):
     assert set(by_sign) == {0, 1}
     with Image.open(folder / "a_onsets.png") as image:
         assert image.format == "PNG"
-
-
-def test_a_detector_with_thresholds_abstains_between_them(tmp_path):
-    detector = small_detector(SEED)
-    score = offline(volts()).score
-    low, high = (float(score[side].median()) for side in (score < 0, score > 0))
-    detector.info |= {"alarm": SETTINGS.to_dict(), "abstain": Abstention(0.95, low, high).to_dict()}
-    detector.save(tmp_path / "abstaining.pt")
-    save(tmp_path / "a.npz", recording())
-    detected(tmp_path / "abstaining.pt", tmp_path / "a.npz", tmp_path / "out", "decisions=true")
-    for row in rows_of(tmp_path / "out" / "a_decisions.csv"):
-        wanted = 1 if float(row["score"]) >= high else 0 if float(row["score"]) < low else -1
-        assert int(row["answer"]) == wanted
 
 
 # What it is told ---------------------------------------------------------------------------------

@@ -1,4 +1,3 @@
-import copy
 import math
 
 import numpy as np
@@ -217,31 +216,6 @@ def test_many_bins_are_judged_as_few_are(method):
         torch.testing.assert_close(whole.flatten(0, 1), torch.cat(parts), rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("align", ["centred", "causal", "trailing"])
-def test_a_saved_detector_loads_with_its_align_and_a_nan_before_a_bin_is_told(align, tmp_path):
-    made = random_detector()
-    made.channel_filter = ChannelFilter(made.channel_filter.window_lengths, align=align)
-    made.save(tmp_path / "a.pt")
-    loaded = SlipDetector.load(tmp_path / "a.pt")
-    assert loaded.channel_filter.align == align
-    assert (loaded.context_before, loaded.look_ahead) == (made.context_before, made.look_ahead)
-    samples = noise(3)
-    expected = made.predict_raw(samples).score
-    assert torch.equal(loaded.predict_raw(samples).score, expected)
-    before = samples.clone()
-    before[..., : made.context_before] += 1.0
-    assert (loaded.predict_raw(before).score != expected).all()
-    channel = loaded.pool.hand.names.index(loaded.selected_names[0].channel)
-    start = loaded.context_before - loaded.channel_filter.reaches[channel][0]
-    samples[1, channel, start] = torch.nan  # the first sample that the bin's frames take in
-    found = loaded.predict_raw(samples)
-    assert found.is_valid.tolist() == [True, False, True]
-    assert found.is_missing.nonzero().tolist() == [[1, channel]]
-    name = loaded.pool.hand.names[channel]
-    with pytest.raises(ValueError, match=rf"^bin 1, channel {name}, sample {start} is nan"):
-        loaded.predict_raw(samples, nonfinite="raise")
-
-
 @pytest.mark.parametrize("head", ["quadratic", "watched", "constant feature"])
 def test_one_bin_is_judged_as_many_are(head):
     """By NumPy or by modules: with a NaN, a dead channel, values beyond any knee, both dtypes."""
@@ -264,16 +238,3 @@ def test_one_bin_is_judged_as_many_are(head):
     torch.testing.assert_close(
         detector(samples[:1, :, 25:125]), detector(samples[..., 25:125])[:1], rtol=1e-4, atol=1e-5
     )
-
-
-def test_one_bin_sees_what_is_changed_in_place_and_in_copies():
-    """As ``load_state_dict`` does; what was judged before leaves nothing behind."""
-    detector, other = random_detector(), random_detector()
-    for buffer in (other.scaler.maximum, other.head.linear, other.head.constant):
-        buffer.mul_(1.5)
-    bins = noise(6)[..., 25:125]
-    assert detector(bins[0]).isfinite()
-    copied = copy.deepcopy(detector)
-    for changed in (detector, copied):
-        changed.load_state_dict(other.state_dict())
-        torch.testing.assert_close(changed(bins[0]), other(bins)[0], rtol=1e-9, atol=1e-9)

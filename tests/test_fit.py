@@ -212,6 +212,9 @@ def test_what_cannot_be_differentiated_is_refused(route, rng):
         fit_quadratic(z[:0], targets[:0], 1.0)
     with pytest.raises(ValueError, match=r"offset .* at least 0, got -0.5"):
         fit_quadratic(z, targets, 1.0, -0.5)
+    nothing = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    with pytest.raises(ValueError, match=r"no derivative by an offset .* of 0; .* route='dual'"):
+        fit_quadratic(z, targets, 1.0, nothing, route="primal")
     with pytest.raises(ValueError, match="weights must be positive"):
         fit_quadratic(z, targets, 1.0, weights=-torch.ones(12))
     with pytest.raises(ValueError, match="must be finite, got nan"):

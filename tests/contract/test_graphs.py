@@ -1,6 +1,5 @@
 """The exported graphs, run by onnxruntime alone, against the detector in torch."""
 
-import json
 from itertools import pairwise
 
 import numpy as np
@@ -133,13 +132,3 @@ def test_the_stream_graph_decides_as_the_stream(exported, cuts, is_broken):
         else:
             close = 1e-9 if name.endswith("_s") else CLOSE[precision] * spread.get(name, 1.0)
             np.testing.assert_allclose(values, truth, rtol=0, atol=close, err_msg=name)
-
-
-@pytest.mark.parametrize("name", [BIN_GRAPH, STREAM_GRAPH])
-def test_a_graph_says_what_it_takes(exported, name):
-    folder, detector, precision = exported
-    told = json.loads((folder / names.SIDECAR.format(name)).read_text())
-    assert told["channels"] == NAMES
-    assert told["sample_rate_hz"] == detector.pool.sample_rate_hz
-    assert told["precision"] == precision
-    assert told["simulated"] is False
