@@ -8,7 +8,6 @@ from statistics import mean, median, quantiles, stdev
 from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from tactslip_torch.report import style
@@ -196,14 +195,9 @@ def bars(
     style.lanes(axes, names)
     if is_log:
         axes.set_xscale("log")
-        plain_decades(axes.xaxis)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
     axes.margins(x=0.12)
     axes.set_xlabel(about)
     if len(series) > 1:
         axes.legend()
-
-
-def plain_decades(axis: Axis) -> None:
-    """Write decades as numbers, and nothing between them."""
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
-    axis.set_minor_formatter(NullFormatter())
