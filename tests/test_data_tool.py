@@ -92,7 +92,8 @@ def test_a_file_that_is_damaged_in_its_samples_is_a_problem(root, capsys, monkey
 
 def test_summary_tells_and_draws_what_there_is(root, tmp_path, capsys):
     trials = run("summary", root, ROWS, f"output={tmp_path / 'set.png'}")
-    assert [(t.material, t.slip_s, t.non_slip_s, t.num_onsets) for t in trials] == [
+    told = ("material", "slip_s", "non_slip_s", "num_onsets")
+    assert [tuple(trial[key] for key in told) for trial in trials] == [
         ("wood", 1.0, 0.25, 1),
         ("wood", 0.5, 0.0, 1),
         ("iron", 3.0, 0.0, 0),
