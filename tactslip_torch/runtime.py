@@ -17,9 +17,8 @@ import stat
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -63,51 +62,33 @@ def for_each(function: Callable[[Item], object], items: Iterable[Item]) -> None:
         >>> squares
         tensor([ 0.,  1.,  4.,  9., 16.])
     """
-    number = torch.get_num_threads()
-    if number == 1:
-        for item in items:
-            function(item)
-        return
-    queue = deque(items)
-    grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
-
-    def work() -> None:
-        with torch.inference_mode(inference), torch.set_grad_enabled(grad):
-            try:
-                while queue:
-                    try:
-                        item = queue.popleft()  # atomic
-                    except IndexError:  # another thread took the last one
-                        return
-                    function(item)
-            finally:
-                queue.clear()
-
-    pool = _pool(number)
-    futures = [pool.submit(work) for _ in range(min(number, len(queue)))]
-    try:
-        wait(futures)
-    finally:  # if interrupted, what still runs writes to the caller's memory
-        queue.clear()
-        wait(futures)
-    for future in futures:
-        future.result()
+    in_parts(function, list(items))
 
 
 def in_parts(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """What ``function`` returns for every item, in their order, made by ``for_each``.
+    """What ``function`` returns for every item, in their order, called as by ``for_each``.
 
     Example:
         >>> in_parts(torch.sum, torch.arange(6).split(4))
         [tensor(6), tensor(9)]
     """
-    results: dict[int, Result] = {}
+    number = torch.get_num_threads()
+    if number == 1:
+        return [function(item) for item in items]
+    grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
-    def call(index: int) -> None:
-        results[index] = function(items[index])
+    def call(item: Item) -> Result:
+        with torch.inference_mode(inference), torch.set_grad_enabled(grad):
+            return function(item)
 
-    for_each(call, range(len(items)))
-    return [results[index] for index in range(len(items))]
+    pool = _pool(number)
+    futures = [pool.submit(call, item) for item in items]
+    try:
+        wait(futures, return_when=FIRST_EXCEPTION)
+    finally:  # if interrupted, what still runs writes to the caller's memory
+        begun = [future for future in futures if not future.cancel()]
+        wait(begun)
+    return [future.result() for future in begun]
 
 
 def _pool(number: int) -> ThreadPoolExecutor:

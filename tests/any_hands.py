@@ -19,9 +19,8 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import KEY, AlarmSettings
 from tactslip_torch.onset.rules import Cusum
-from tactslip_torch.signals.filtering import Align, ChannelFilter
+from tactslip_torch.signals.filtering import Align, ChannelFilter, frame_lengths
 from tactslip_torch.signals.wavelet import WaveletFilters, highest_level
-from tactslip_torch.training.experiment import frame_lengths
 from tactslip_torch.training.recipe import Recipe
 
 

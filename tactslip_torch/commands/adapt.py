@@ -20,10 +20,11 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from tactslip_torch.commands.entry import entry_point, leave_results
+from tactslip_torch.commands.entry import entry_point, leave_results, save_config
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.deploy.export import export_detector, stale_graphs
+from tactslip_torch.features.cache import versions
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import KEY as ALARM
 from tactslip_torch.report.adaptation import adaptation_figure, adaptation_table, journal_table
@@ -43,7 +44,7 @@ from tactslip_torch.training.adaptation import (
     solve,
     statistics_of,
 )
-from tactslip_torch.training.experiment import feature_cache, features_of, save_config, versions
+from tactslip_torch.training.experiment import feature_cache, features_of
 
 FORMAT = "tactslip_torch adaptation 1"
 

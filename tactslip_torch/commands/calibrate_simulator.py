@@ -20,7 +20,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from tactslip_torch.analysis.signal_checks import Signals, check_signals, filtered
 from tactslip_torch.commands.configuration import Composed
-from tactslip_torch.commands.entry import entry_point, leave_results
+from tactslip_torch.commands.entry import entry_point, leave_results, save_config
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.features.statistics import TrainingStatistics
@@ -34,7 +34,7 @@ from tactslip_torch.simulation.scene import (
     SIMULATION_VERSION,
 )
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
-from tactslip_torch.training.experiment import feature_maker, save_config
+from tactslip_torch.training.experiment import feature_maker
 from tactslip_torch.training.plan import TrainingPass, plan_detector
 from tactslip_torch.training.recipe import Recipe
 

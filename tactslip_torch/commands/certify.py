@@ -23,12 +23,11 @@ from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import ROLES, Split
 from tactslip_torch.deploy.export import CERTIFICATE_FORMAT
-from tactslip_torch.features.cache import cache_key
+from tactslip_torch.features.cache import cache_key, versions
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.report.certificate import certificate_figure, conclusion
 from tactslip_torch.runtime import check_number, plain, write_json
 from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.experiment import versions
 
 _EXIT_DOES_NOT_HOLD = 1
 

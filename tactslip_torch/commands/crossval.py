@@ -21,7 +21,7 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from tactslip_torch.commands.entry import entry_point, leave_results
+from tactslip_torch.commands.entry import entry_point, leave_results, save_config
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import seen6
 from tactslip_torch.features.bin_sample import BinSample, SampledBins
@@ -31,7 +31,7 @@ from tactslip_torch.model.fit import fit_machine
 from tactslip_torch.report.crossval import crossval_figure, crossval_table
 from tactslip_torch.runtime import bar, in_processes, one_thread
 from tactslip_torch.training.datamodule import SlipDataModule
-from tactslip_torch.training.experiment import feature_cache, feature_maker, save_config
+from tactslip_torch.training.experiment import feature_cache, feature_maker
 from tactslip_torch.training.plan import plan_detector
 from tactslip_torch.training.recipe import Recipe, balanced_accuracy
 

@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from tactslip_torch.commands.entry import entry_point, one_line
+from tactslip_torch.commands.entry import entry_point, one_line, save_config
 from tactslip_torch.data.file_recordings import hand_file
 from tactslip_torch.data.folder import file_facts, recording_files
 from tactslip_torch.data.formats import Reading, open_file, pieces
 from tactslip_torch.data.recording import Recording
+from tactslip_torch.features.cache import versions
 from tactslip_torch.live.mcap_log import McapLog
 from tactslip_torch.live.rerun_log import RerunLog
 from tactslip_torch.live.sinks import Block, Sink
@@ -55,7 +56,6 @@ from tactslip_torch.report.onset import (
 )
 from tactslip_torch.report.style import csv_writer
 from tactslip_torch.runtime import plain, steps
-from tactslip_torch.training.experiment import save_config, versions
 
 FORMAT = "tactslip_torch onsets 1"
 _PIECE_S = 1.0

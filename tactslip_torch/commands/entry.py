@@ -27,8 +27,7 @@ from tactslip_torch.commands.configuration import (
     with_lists,
 )
 from tactslip_torch.commands.stopping import Stopped
-from tactslip_torch.report.sweep import sweep_table, write_sweep
-from tactslip_torch.runtime import is_first_process, process_number, write_json
+from tactslip_torch.runtime import is_first_process, process_number, whole_file, write_json
 
 log = logging.getLogger(__name__)
 
@@ -118,6 +117,8 @@ class _Run(NamedTuple):
 
 def _compare(runs: Sequence[_Run]) -> None:
     """A table and a figure of the runs of a sweep, by what differs between them."""
+    from tactslip_torch.report.sweep import sweep_table, write_sweep  # draws, which few commands do
+
     common = set(runs[0].given).intersection(*(run.given for run in runs))
     told = [(" ".join(o for o in r.given if o not in common) or "all", r.scores) for r in runs]
     place, simulated = runs[0].place, any(run.simulated for run in runs)
@@ -129,6 +130,12 @@ def _are_scores(returned: Any) -> bool:
     """Whether a run returned numbers by name, which those of a sweep are compared by."""
     is_mapping = isinstance(returned, Mapping) and bool(returned)
     return is_mapping and all(type(value) is float for value in returned.values())
+
+
+def save_config(config: DictConfig, folder: Path) -> None:
+    """Write the resolved configuration."""
+    with whole_file(folder / "config.yaml") as temporary:
+        temporary.write_text(OmegaConf.to_yaml(config, resolve=True))
 
 
 def leave_results(

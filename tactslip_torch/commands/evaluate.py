@@ -14,7 +14,7 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split, evaluated_once
@@ -30,7 +30,6 @@ from tactslip_torch.training.experiment import (
     features_of,
     make_trainer,
     merged_results,
-    save_config,
 )
 from tactslip_torch.training.learner import SlipLearner
 

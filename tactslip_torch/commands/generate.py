@@ -20,14 +20,13 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig
 
-from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written, write_manifest
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.features.cache import source_digest
 from tactslip_torch.report.recordings import signals_figure, view_around, written_table
 from tactslip_torch.runtime import bar, in_processes, num_processes
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.experiment import frame_lengths, save_config
+from tactslip_torch.signals.filtering import ChannelFilter, frame_lengths
 
 BEFORE_S, AFTER_S = 2.0, 3.0  # of the onset drawn close up: five seconds, as in the paper
 

@@ -27,10 +27,11 @@ from tactslip_torch.analysis.importance import (
     score_gradients,
 )
 from tactslip_torch.analysis.raw_bins import draw_bins
-from tactslip_torch.commands.entry import entry_point, leave_results
+from tactslip_torch.commands.entry import entry_point, leave_results, save_config
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import ROLES, Split
 from tactslip_torch.features.bin_sample import BinSample
+from tactslip_torch.features.cache import versions
 from tactslip_torch.features.selection import t_scores
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.detector import SlipDetector
@@ -38,12 +39,7 @@ from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.report.importance import best_table, sensors_csv, sensors_figure, sensors_table
 from tactslip_torch.runtime import bar, check_number, one_thread
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule, training_origin
-from tactslip_torch.training.experiment import (
-    feature_cache,
-    features_of,
-    save_config,
-    versions,
-)
+from tactslip_torch.training.experiment import feature_cache, features_of
 from tactslip_torch.training.recipe import (
     FeatureSelection,
     Recipe,

@@ -42,7 +42,7 @@ from tactslip_torch.analysis.pareto import (
     worth_naming,
     worth_timing,
 )
-from tactslip_torch.commands.entry import entry_point, leave_results
+from tactslip_torch.commands.entry import entry_point, leave_results, save_config
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
@@ -51,12 +51,7 @@ from tactslip_torch.report.pareto import none_meets, pareto_figure, pareto_table
 from tactslip_torch.runtime import bar, check_number
 from tactslip_torch.signals.filtering import Align
 from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.experiment import (
-    common_metadata,
-    feature_cache,
-    feature_maker,
-    save_config,
-)
+from tactslip_torch.training.experiment import common_metadata, feature_cache, feature_maker
 
 _EXIT_NONE_MEETS = 1
 _TIMES = ("p50_us", "p99_us", "p99_all_us", "interrupted")

@@ -19,7 +19,7 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Checkpoint
 from omegaconf import DictConfig
 
-from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split, have_same_bins
@@ -43,7 +43,6 @@ from tactslip_torch.training.experiment import (
     feature_rows,
     make_trainer,
     merged_results,
-    save_config,
     write_tensorboard,
 )
 from tactslip_torch.training.learner import SlipLearner

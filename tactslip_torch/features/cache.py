@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.runtime import PACKAGE, whole_file
+from tactslip_torch.runtime import PACKAGE, __version__, whole_file
 
 log = logging.getLogger(__name__)
 
@@ -45,6 +45,15 @@ def source_digest(package: Path = PACKAGE) -> str:
         digest.update(path.relative_to(package).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def versions() -> dict[str, str]:
+    """What made a result, for files that say so."""
+    return {
+        "tactslip_torch": __version__,
+        "torch": torch.__version__,
+        "code": source_digest(),
+    }
 
 
 class FeatureCache:

@@ -14,12 +14,12 @@ import zipfile
 from pathlib import Path
 
 from tactslip_torch.data.formats import named_format
+from tactslip_torch.features.cache import versions
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.pretrained import NAME, RECORDING
 from tactslip_torch.runtime import whole_file
 from tactslip_torch.simulation.scene import Scene, Stroke
 from tactslip_torch.simulation.simulate import simulate
-from tactslip_torch.training.experiment import versions
 
 TRAIN = ["+exp=unseen4", "onset=debounced", "baselines=false", "export=false"]
 SCENE = Scene(

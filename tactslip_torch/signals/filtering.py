@@ -24,6 +24,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
+from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import check_choice
 
 Align = Literal["centred", "causal", "trailing"]
@@ -283,6 +284,31 @@ class _Group(NamedTuple):
     length: int
     channels: slice | list[int]  # a slice of neighbours: looked up without a copy
     is_wanted: bool
+
+
+def frame_lengths(hand: HandLayout, frames: Mapping[str, int | None]) -> list[int]:
+    """The frame of each channel, from ``features.frames``.
+
+    Args:
+        hand: the channels.
+        frames: an odd number of samples by kind of channel; 1 or ``None`` leaves the kind as it is.
+
+    Raises:
+        ValueError: if a kind has no frame, or one that is even or no number.
+    """
+    if missing := [kind for kind in hand.kinds if kind not in frames]:
+        raise ValueError(
+            f"features.frames has no frame for {', '.join(missing)} channels; give an odd number "
+            f"of samples, as +features.frames.{missing[0]}=11, or null to leave them unfiltered"
+        )
+    lengths = {kind: 1 if frames[kind] is None else frames[kind] for kind in hand.kinds}
+    for kind, length in lengths.items():
+        if not isinstance(length, int) or length < 1 or length % 2 == 0:
+            raise ValueError(
+                f"features.frames.{kind} must be an odd number of samples, or null to leave such "
+                f"channels unfiltered, got {length!r}"
+            )
+    return [int(lengths[channel.kind] or 1) for channel in hand.channels]
 
 
 class ChannelFilter(nn.Module):

@@ -28,7 +28,7 @@ from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.features.cache import (
     FeatureCache,
     default_cache_folder,
-    source_digest,
+    versions,
 )
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
@@ -37,8 +37,8 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.native import BackendName, backend_of
 from tactslip_torch.report.metrics import merged_answers, merged_metrics, summed_metrics
-from tactslip_torch.runtime import LEAD, Progress, __version__, check_choice, whole_file
-from tactslip_torch.signals.filtering import Align, ChannelFilter
+from tactslip_torch.runtime import LEAD, Progress, check_choice
+from tactslip_torch.signals.filtering import Align, ChannelFilter, frame_lengths
 from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.learner import event_numbers
@@ -144,31 +144,6 @@ def feature_maker(
     return FeatureMaker(source, pool, channel_filter, rule, None, computed_in, computed_by)
 
 
-def frame_lengths(hand: HandLayout, frames: Mapping[str, int | None]) -> list[int]:
-    """The frame of each channel, from ``features.frames``.
-
-    Args:
-        hand: the channels.
-        frames: an odd number of samples by kind of channel; 1 or ``None`` leaves the kind as it is.
-
-    Raises:
-        ValueError: if a kind has no frame, or one that is even or no number.
-    """
-    if missing := [kind for kind in hand.kinds if kind not in frames]:
-        raise ValueError(
-            f"features.frames has no frame for {', '.join(missing)} channels; give an odd number "
-            f"of samples, as +features.frames.{missing[0]}=11, or null to leave them unfiltered"
-        )
-    lengths = {kind: 1 if frames[kind] is None else frames[kind] for kind in hand.kinds}
-    for kind, length in lengths.items():
-        if not isinstance(length, int) or length < 1 or length % 2 == 0:
-            raise ValueError(
-                f"features.frames.{kind} must be an odd number of samples, or null to leave such "
-                f"channels unfiltered, got {length!r}"
-            )
-    return [int(lengths[channel.kind] or 1) for channel in hand.channels]
-
-
 def features_of(
     detector: SlipDetector, source: RecordingSource, rule: LabelRule, cache: FeatureCache
 ) -> FeatureMaker:
@@ -260,12 +235,6 @@ def make_trainer(
     return trainer
 
 
-def save_config(config: DictConfig, folder: Path) -> None:
-    """Write the resolved configuration."""
-    with whole_file(folder / "config.yaml") as temporary:
-        temporary.write_text(OmegaConf.to_yaml(config, resolve=True))
-
-
 def write_tensorboard(folder: Path, config: DictConfig, metrics: Mapping[str, Any]) -> None:
     """Add to a run's TensorBoard its figures, validation, configuration, and final scores.
 
@@ -318,15 +287,6 @@ def feature_rows(names: Sequence[FeatureName], hand: HandLayout) -> list[dict[st
             about = {"kind": channel.kind, "finger": channel.finger}
         rows.append({"name": str(name), **asdict(name), **about})
     return rows
-
-
-def versions() -> dict[str, str]:
-    """What made a result, for files that say so."""
-    return {
-        "tactslip_torch": __version__,
-        "torch": torch.__version__,
-        "code": source_digest(),
-    }
 
 
 def common_metadata(
