@@ -329,7 +329,8 @@ class HeldOut:
     ) -> None:
         check_route(route, kernel)
         bins = bins.double()
-        self._order, self._groups = _ordered(groups, bins.is_slip)
+        _check_groups(groups, bins.is_slip)
+        self._order, self._groups = ordered_groups(groups)
         self._kernel, self._z = kernel, bins.features[self._order]
         self._targets, self._weights = bins.targets[self._order], bins.sample_weight[self._order]
         num_bins, num_features = self._z.shape
@@ -406,15 +407,10 @@ class HeldOut:
         num = layout.num_features
         head, factor = kernel.solve(self._system, moment, penalty, num, MOST_CONDITION)
         assert factor is not None  # as most_condition is given
-        residuals, roots = self._targets - head(self._z), self._weights.sqrt()
-        for groups, part in _chunks(self._small):
-            scaled = kernel.monomials(self._z[part]) * roots[part, None]
-            columns = torch.linalg.solve_triangular(factor, scaled.mT, upper=False)
-            products = columns.mT @ columns
-            for own in groups:
-                hat, root = own.within(products, part), roots[own.rows]
-                right = root * residuals[own.rows]
-                residuals[own.rows] = residuals_without(hat, right, own.name) / root
+        residuals = self._targets - head(self._z)
+        residuals = residuals_without(
+            self._small, kernel, factor, self._z, self._weights.sqrt(), residuals
+        )
         for own, sums in self._large:
             z = self._z[own.rows]
             normal = layout.normal_matrix(self._total - sums, kernel.offset)
@@ -470,7 +466,8 @@ def held_out_scores(
         torch.Size([4, 1])
     """
     bins = TrainingBins(z, is_slip, weights).double()
-    order, members = _ordered(groups, is_slip)
+    _check_groups(groups, is_slip)
+    order, members = ordered_groups(groups)
     c, offset = (
         torch.as_tensor(x, dtype=torch.float64, device=z.device) for x in (penalty, offset)
     )
@@ -487,31 +484,48 @@ def held_out_scores(
     return (targets - torch.cat(residuals))[order.argsort()]
 
 
-def residuals_without(hat: Tensor, right: Tensor, name: object) -> Tensor:
-    """``(I - hat)^-1 right``: residuals of a group under the machine without it.
+def residuals_without(
+    groups: Sequence[Group],
+    kernel: Polynomial,
+    factor: Tensor,
+    z: Tensor,
+    roots: Tensor,
+    residuals: Tensor,
+) -> Tensor:
+    """Residuals of bins of small groups under the machine without their group; others stay.
 
     Args:
-        hat: ``W^1/2 Phi (L L')^-1 Phi' W^1/2`` between the bins of the group.
-        right: ``W^1/2`` times the residuals of the machine of all bins.
-        name: of the group, for the error.
+        groups: ``ordered_groups`` of the bins, or some of them.
+        kernel: of degree 1 or 2.
+        factor: the lower Cholesky factor of the normal equations of all bins.
+        z: scaled features.
+        roots: of the weights.
+        residuals: of the machine of all bins.
 
     Shape:
-        - hat: ``[n, n]``; right, output: ``[n]``
+        - factor: ``[P, P]``; z: ``[N, K]``; roots, residuals, output: ``[N]``
 
     Raises:
-        ValueError: if the group leaves too little.
+        ValueError: if a group leaves too little.
     """
-    left = torch.eye(len(hat)).to(hat) - hat
-    factor, info = torch.linalg.cholesky_ex(left)
-    if info or bool((factor.diagonal().square() < _LEAST_EIGENVALUE).any()):
-        raise ValueError(
-            f"the machine without group {name} is too far from the machine of all bins to be told "
-            "from it in float64; lower the penalty, or refit without the group"
-        )
-    return torch.cholesky_solve(right[:, None], factor)[:, 0]
+    found = residuals.clone()
+    for some, part in _chunks(groups):
+        scaled = kernel.monomials(z[part]) * roots[part, None]
+        columns = torch.linalg.solve_triangular(factor, scaled.mT, upper=False)
+        left = torch.eye(columns.shape[1]).to(columns) - columns.mT @ columns  # I - hat
+        for own in some:
+            lower, info = torch.linalg.cholesky_ex(own.within(left, part))
+            if info or bool((lower.diagonal().square() < _LEAST_EIGENVALUE).any()):
+                raise ValueError(
+                    f"the machine without group {own.name} is too far from the machine of all bins "
+                    "to be told from it in float64; lower the penalty, or refit without the group"
+                )
+            right = (roots * residuals)[own.rows, None]
+            found[own.rows] = torch.cholesky_solve(right, lower)[:, 0] / roots[own.rows]
+    return found
 
 
-class _Group(NamedTuple):
+class Group(NamedTuple):
     """A group, and its rows among ordered bins."""
 
     name: int
@@ -519,6 +533,7 @@ class _Group(NamedTuple):
 
     @property
     def size(self) -> int:
+        """Number of bins."""
         return int(self.rows.stop - self.rows.start)
 
     def within(self, products: Tensor, part: slice) -> Tensor:
@@ -527,26 +542,23 @@ class _Group(NamedTuple):
         return products[own, own]
 
 
-def _ordered(groups: Tensor, is_slip: Tensor) -> tuple[Tensor, list[_Group]]:
-    """Which bin comes where when large groups come last, and the groups in that order."""
-    if groups.shape != is_slip.shape or groups.is_floating_point():
-        raise ValueError(
-            f"expected a whole number for the group of each of {len(is_slip)} bins, got "
-            f"{tuple(groups.shape)} {groups.dtype}"
-        )
+def ordered_groups(groups: Tensor) -> tuple[Tensor, list[Group]]:
+    """Which bin comes where when large groups come last, and the groups in that order.
+
+    Shape:
+        - groups, order: ``[N]``, whole numbers
+    """
     names, member, counts = torch.unique(groups, return_inverse=True, return_counts=True)
-    _check_groups(names, member, is_slip)
     rank = counts.argsort(stable=True)
     order = rank.argsort()[member].argsort(stable=True)
     ends = counts[rank].cumsum(0).tolist()
-    starts = [0, *ends[:-1]]
-    slices = map(slice, starts, ends)
-    return order, list(map(_Group, names[rank].tolist(), slices))
+    slices = map(slice, [0, *ends[:-1]], ends)
+    return order, list(map(Group, names[rank].tolist(), slices))
 
 
-def _chunks(groups: Sequence[_Group]) -> Iterator[tuple[list[_Group], slice]]:
+def _chunks(groups: Sequence[Group]) -> Iterator[tuple[list[Group], slice]]:
     """Whole groups and their bins: as many as fit a chunk, at least one."""
-    some: list[_Group] = []
+    some: list[Group] = []
     for own in groups:
         if some and own.rows.stop - some[0].rows.start > _CHUNK:
             yield some, slice(some[0].rows.start, some[-1].rows.stop)
@@ -565,17 +577,23 @@ def _check_penalty(penalty: float) -> None:
         )
 
 
-def _check_groups(names: Tensor, member: Tensor, is_slip: Tensor) -> None:
+def _check_groups(groups: Tensor, is_slip: Tensor) -> None:
+    if groups.shape != is_slip.shape or groups.is_floating_point():
+        raise ValueError(
+            f"expected a whole number for the group of each of {len(is_slip)} bins, got "
+            f"{tuple(groups.shape)} {groups.dtype}"
+        )
+    names = groups.unique()
     if len(names) < 2:
         raise ValueError(
             f"held-out scores need at least two groups, all {len(is_slip)} bins are in "
             f"{names.tolist()}"
         )
     for kind, own in (("slip", is_slip), ("non-slip", ~is_slip)):
-        counts = torch.bincount(member[own], minlength=len(names))
-        lost = (counts == own.sum()).nonzero().flatten().tolist()
-        if lost:
+        having = groups[own].unique()
+        if len(having) < 2:
+            name = int(having[0] if len(having) else names[0])
             raise ValueError(
-                f"without group {int(names[lost[0]])} no {kind} bin is left to train on; take "
-                "smaller groups, or other bins"
+                f"without group {name} no {kind} bin is left to train on; take smaller groups, or "
+                "other bins"
             )

@@ -36,7 +36,13 @@ from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.calibration import ABSTENTION as ABSTAIN
 from tactslip_torch.model.calibration import Abstention, fit_platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.fit import MOST_CONDITION, HeldOut, TrainingBins, residuals_without
+from tactslip_torch.model.fit import (
+    MOST_CONDITION,
+    HeldOut,
+    TrainingBins,
+    ordered_groups,
+    residuals_without,
+)
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
@@ -60,7 +66,6 @@ kept rising to about the last of these, and what the others lost rose with it.
 """
 
 _JOURNAL = "adaptations"  # under which SlipDetector.info keeps the entries of all steps
-_CHUNK = 1024  # bins of whole recordings whose columns are solved at a time, unless one has more
 _MOST_WEIGHT = 8000.0  # of a bin; more would hide the others
 _OF_ONE = 4.0
 """A single material may fall by so many margins: some 800 sampled bins tell its change to half a
@@ -521,18 +526,14 @@ def solve(statistics: Statistics) -> Solved:
     normal, moment = sums.normal_equations(machine.offset, balance=machine.balance)
     head, factor = kernel.solve(normal, moment, machine.penalty, sums.num_features, MOST_CONDITION)
     assert factor is not None  # as most_condition is given
-    roots = (class_scales(statistics)[known.is_slip.long()] * known.weight).sqrt()
-    targets = torch.where(known.is_slip, 1.0, -1.0).double()
-    right = roots * (targets - head(known.z))
-    residuals = torch.empty_like(right)
-    for groups in _chunks(known.recording):
-        rows = torch.cat(groups)
-        scaled = kernel.monomials(known.z[rows]) * roots[rows, None]
-        columns = torch.linalg.solve_triangular(factor, scaled.mT, upper=False)
-        for group, own in zip(groups, columns.split([*map(len, groups)], dim=1), strict=True):
-            name = int(known.recording[group[0]])
-            residuals[group] = residuals_without(own.mT @ own, right[group], name)
-    return Solved(head, known, targets - residuals / roots)
+    order, groups = ordered_groups(known.recording)
+    z, is_slip = known.z[order], known.is_slip[order]
+    roots = (class_scales(statistics)[is_slip.long()] * known.weight[order]).sqrt()
+    targets = torch.where(is_slip, 1.0, -1.0).double()
+    residuals = residuals_without(groups, kernel, factor, z, roots, targets - head(z))
+    scores = torch.empty_like(residuals)
+    scores[order] = targets - residuals
+    return Solved(head, known, scores)
 
 
 def class_scales(statistics: Statistics) -> Tensor:
@@ -541,19 +542,6 @@ def class_scales(statistics: Statistics) -> Tensor:
     if statistics.machine.balance == "none":
         return torch.ones_like(weight)
     return weight.sum() / (2 * weight)
-
-
-def _chunks(recording: Tensor) -> Iterator[list[Tensor]]:
-    """Rows of whole recordings, some at a time."""
-    _, sizes = torch.unique(recording, return_counts=True)
-    groups: list[Tensor] = []
-    for rows in recording.argsort(stable=True).split(sizes.tolist()):
-        if groups and sum(map(len, groups)) + len(rows) > _CHUNK:
-            yield groups
-            groups = []
-        groups.append(rows)
-    if groups:
-        yield groups
 
 
 def mean_recall(says_slip: Tensor, is_slip: Tensor) -> float:

@@ -561,58 +561,56 @@ class CalibratedAlarm:
         roles = self.roles(detector)
         learn = roles.pop("learn")
         onset, left_out, chosen = self.classifier(self.streams, learn, num_workers)
-        recordings = [recording for own in roles.values() for recording in own]
         scorers: dict[str, Scorer] = {OURS: detector, **(baselines or {})}
-        hop = onset.evidence.hop_samples
+        hop, rate = onset.evidence.hop_samples, self.streams.sample_rate_hz
         hops = {name: getattr(own, "hop_samples", hop) for name, own in scorers.items()}
         hops[OURS] = self.hop_samples
-        rate, num_calibrate = self.streams.sample_rate_hz, len(roles["calibrate"])
         others = {one.material: left_out.get(one.material, onset) for one in roles["calibrate"]}
         score = partial(score_streams, self.streams, scorers=scorers, hops=hops)
-        scored = score(roles["calibrate"], onset=others, num_workers=num_workers)
-        rest = score(recordings[num_calibrate:], onset=onset, num_workers=num_workers)
-        scored = {name: own + rest[name] for name, own in scored.items()}
+        scored = {
+            role: score(
+                own, onset=others if role == "calibrate" else onset, num_workers=num_workers
+            )
+            for role, own in roles.items()
+        }
         timings = {
             name: Timing(rate, hops[name], scorer.pool.bin_samples, scorer.look_ahead)
             for name, scorer in scorers.items()
         }
-        calibrating = {name: own[:num_calibrate] for name, own in scored.items()}
-        methods = self.methods(calibrating, timings, onset)
+        methods = self.methods(scored["calibrate"], timings, onset)
         amounts = self._amounts({"learn": learn, **roles})
         _, settings = methods[JOINT]
-        quiet = [one for one in calibrating[OURS] if one.recording.scene == self.slip_free]
+        calibrating: dict[str, list[Stream]] = {PAPER_SCENE: [], self.slip_free: []}
+        for stream in scored["calibrate"][OURS]:
+            calibrating.setdefault(stream.recording.scene, []).append(stream)
+        curve = threshold_curve(calibrating[self.slip_free], settings, timings[OURS])
         metadata = {
             **settings.metadata,
             "simulated": self.streams.is_simulated,
             "streams": amounts["calibrate"],
-            "threshold_curve": threshold_curve(quiet, settings, timings[OURS]),
+            "threshold_curve": curve,
         }
         settings = replace(settings, metadata=metadata)
         detector.info[KEY] = settings.to_dict()
-        places = [role for role, own in roles.items() for _ in own]
-        groups: dict[tuple[str, str], list[int]] = {}  # by scene, "" for the usual ones, and role
-        for index, (role, recording) in enumerate(zip(places, recordings, strict=True)):
-            scene = "" if recording.scene in (PAPER_SCENE, self.slip_free) else recording.scene
-            if role != "calibrate":
-                groups.setdefault((scene, role), []).append(index)
         compute_s = {OURS: _push_seconds(detector, settings)}
-        events: dict[str, dict[str, dict[str, Any]]] = {"": {}}
-        rows = [(group, name) for group in groups for name in methods]
-        for (scene, role), name in bar(rows, "events", "table row"):
+        events = defaultdict[str, dict[str, dict[str, Any]]](lambda: defaultdict(dict))
+        told = {}
+        checked = [role for role in roles if role != "calibrate" and roles[role]]
+        for role, name in bar(list(product(checked, methods)), "events", "table row"):
             scorer, made = methods[name]
-            own = [scored[scorer][index] for index in groups[scene, role]]
-            found = self._events(own, made, timings[scorer], compute_s.get(scorer))
-            events.setdefault(scene, {}).setdefault(role, {})[name] = found
-        paper = [one for one in calibrating[OURS] if one.recording.scene == PAPER_SCENE]
-        self._say_what_costs(self._events(paper, settings, timings[OURS], None), settings)
-        checked = events.pop("")
-        budget_rows = self._budget_rows(checked, events, methods, roles)
-        told = {
-            f"{role} stream": _reliability(
-                [scored[OURS][index] for index in groups["", role]], settings, timings[OURS]
-            )
-            for role in checked
-        }
+            by_scene = defaultdict[str, list[Stream]](list)  # "" the usual ones
+            for stream in scored[role][scorer]:
+                scene = stream.recording.scene
+                by_scene["" if scene in (PAPER_SCENE, self.slip_free) else scene].append(stream)
+            for scene, own in by_scene.items():
+                found = self._events(own, made, timings[scorer], compute_s.get(scorer))
+                events[scene][role][name] = found
+            if name == JOINT and (found := _reliability(by_scene[""], settings, timings[OURS])):
+                told[f"{role} stream"] = found
+        of_paper = self._events(calibrating[PAPER_SCENE], settings, timings[OURS], None)
+        self._say_what_costs(of_paper, settings)
+        budget_rows = self._budget_rows(events, methods, roles)
+        usual = events.pop("", {})
         return {
             "rule": JOINT,
             "sample_rate_hz": rate,
@@ -629,8 +627,8 @@ class CalibratedAlarm:
                 for name, (scorer, made) in methods.items()
             },
             "budget": budget_rows,
-            "reliability": {name: found for name, found in told.items() if found},
-            "events": {f"{role} stream": found for role, found in checked.items()},
+            "reliability": told,
+            "events": {f"{role} stream": found for role, found in usual.items()},
             "scenes": {
                 scene: {"trained": scene in self.learn_scenes} | by_role
                 for scene, by_role in events.items()
@@ -740,29 +738,31 @@ class CalibratedAlarm:
         settings: AlarmSettings,
         timing: Timing,
         budgets: Sequence[Budget],
-    ) -> dict[Budget, _Scores]:
-        """What thresholds are set on."""
+    ) -> list[_Scores]:
+        """What thresholds are set on, of each budget."""
         settle_s = (timing.bin_samples + timing.look_ahead) / timing.sample_rate_hz + _SETTLE_S
-        found = dict[Budget, _Scores]()
+        decisions_h, found = self._decisions_h(settings), []
         for budget in budgets:
+            scores = _Scores(budget)
             own = [stream for stream in streams if stream.recording.scene == budget.scene]
-            scores = found[budget] = _Scores()
             for stream, made in decide(own, settings, timing):
-                time_s, quiet = made.available_s.numpy(), np.ones(len(made.available_s), bool)
-                firsts = first_releases(stream.times.onsets_s, stream.times.released_s)
-                for first_s, (_, end_s) in zip(firsts, stream.times.sliding_s, strict=True):
+                time_s, times = made.available_s.numpy(), stream.times
+                quiet = np.ones(len(time_s), bool)
+                firsts = first_releases(times.onsets_s, times.released_s)
+                for first_s, (_, end_s) in zip(firsts, times.sliding_s, strict=True):
                     before_s = first_s - EventRules().early_s
                     quiet &= (time_s < before_s) | (time_s > end_s + settle_s)
                 scores.statistic.append(made.statistic.numpy())
                 scores.onset_score.append(made.onset_score.numpy())
                 scores.is_quiet.append(quiet)
-                scores.knocks += len(stream.times.non_slip_s)
-                scores.hours += int(quiet.sum()) * settings.decision_samples / self._rate_per_h
+                hours = int(quiet.sum()) / decisions_h
+                scores.amount += len(times.non_slip_s) if budget.is_share else hours
+            found.append(scores)
         return found
 
     def _lowest(
         self,
-        scored: Mapping[Budget, _Scores],
+        scored: Sequence[_Scores],
         settings: AlarmSettings,
         name: str,
         of_allowed: float = 1.0,
@@ -773,35 +773,32 @@ class CalibratedAlarm:
             lowest_threshold(
                 getattr(scores, name),
                 scores.is_quiet,
-                int(of_allowed * budget.allowed(scores.amount(budget))),
+                int(of_allowed * scores.budget.allowed(scores.amount)),
                 is_raised=scores.raised(settings) if name == "onset_score" else None,
                 **times,
             )
-            for budget, scores in scored.items()
+            for scores in scored
         )
 
-    def _told(self, settings: AlarmSettings, scored: Mapping[Budget, _Scores]) -> AlarmSettings:
+    def _told(self, settings: AlarmSettings, scored: Sequence[_Scores]) -> AlarmSettings:
         """The settings, with what their thresholds gave on the recordings that they were set on."""
         rows = list[dict[str, Any]]()
-        for budget, scores in scored.items():
-            alarms, amount = (
-                scores.alarms(settings, settings.latch_times(self.streams.sample_rate_hz)),
-                scores.amount(budget),
-            )
+        times = settings.latch_times(self.streams.sample_rate_hz)
+        for scores in scored:
+            budget, alarms = scores.budget, scores.alarms(settings, times)
             rows.append(
                 {
                     "scene": budget.scene,
                     "is_share": budget.is_share,
                     "limit": budget.limit,
-                    "amount": amount,
-                    "allowed": budget.allowed(amount),
+                    "amount": scores.amount,
+                    "allowed": budget.allowed(scores.amount),
                     "alarms": sum(alarms),
-                    "bound": budget.bound(sum(alarms), amount),
+                    "bound": budget.bound(sum(alarms), scores.amount),
                 }
             )
             if budget.scene == self.slip_free and not budget.is_share:
-                decisions_h = self._rate_per_h / settings.decision_samples
-                hours = [len(own) / decisions_h for own in scores.is_quiet]
+                hours = [len(own) / self._decisions_h(settings) for own in scores.is_quiet]
                 rate = Bootstrap(len(hours), self.level).rate(alarms, hours)
                 onset = settings.onset
                 calibrated = {
@@ -812,9 +809,9 @@ class CalibratedAlarm:
         metadata = {"slip_free": self.slip_free, "budget": rows, "calibrated": calibrated}
         return replace(settings, metadata=metadata | {"confidence": self.confidence})
 
-    @property
-    def _rate_per_h(self) -> float:
-        return 3600 * self.streams.sample_rate_hz
+    def _decisions_h(self, settings: AlarmSettings) -> float:
+        """Decisions of an hour."""
+        return 3600 * self.streams.sample_rate_hz / settings.decision_samples
 
     def _say_what_costs(self, numbers: Mapping[str, Any], settings: AlarmSettings) -> None:
         """Warn where budgets leave fewer slips found than wanted, and name what costs them."""
@@ -832,18 +829,18 @@ class CalibratedAlarm:
 
     def _budget_rows(
         self,
-        usual: Mapping[str, Mapping[str, Any]],
-        scenes: Mapping[str, Mapping[str, Mapping[str, Any]]],
+        events: Mapping[str, Mapping[str, Mapping[str, Any]]],
         methods: Mapping[str, object],
         roles: Mapping[str, Sequence[RecordingId]],
     ) -> list[dict[str, Any]]:
         """What each method had of each budget, on recordings of each role."""
         rows = []
         for role, budget, name in product(roles, self.budgets, methods):
-            if budget.scene == self.slip_free:
-                numbers = usual.get(role, {}).get(name, {}).get("per_scene", {}).get(budget.scene)
-            else:
-                numbers = scenes.get(budget.scene, {}).get(role, {}).get(name)
+            is_usual = budget.scene == self.slip_free
+            scene = "" if is_usual else budget.scene
+            numbers = events.get(scene, {}).get(role, {}).get(name, {})
+            if is_usual:
+                numbers = numbers.get("per_scene", {}).get(budget.scene)
             if not numbers:
                 continue
             alarms, amount = numbers["num_false_alarms"], numbers["quiet_hours"]
@@ -902,17 +899,13 @@ class CalibratedAlarm:
 
 @dataclass
 class _Scores:
-    """Of the recordings of a scene, each a row of decisions."""
+    """Of the recordings of a budget's scene, each a row of decisions; ``amount`` of it there is."""
 
+    budget: Budget
     statistic: list[NDArray[Any]] = field(default_factory=list)
     onset_score: list[NDArray[Any]] = field(default_factory=list)
     is_quiet: list[NDArray[np.bool_]] = field(default_factory=list)
-    hours: float = 0.0
-    knocks: int = 0
-
-    def amount(self, budget: Budget) -> float:
-        """What alarms are counted against."""
-        return self.knocks if budget.is_share else self.hours
+    amount: float = 0
 
     def raised(self, settings: AlarmSettings) -> list[NDArray[np.bool_]]:
         """Where bins alone would raise an alarm."""

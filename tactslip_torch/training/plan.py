@@ -223,14 +223,12 @@ class Choice:
             balanced accuracy, and what it would be at that group's best threshold.
         nested: balanced accuracy of the whole procedure on each group that it did not see, and
             their mean; ``None`` with fewer than three groups.
-        edge: what to say of a grid of penalties that ended at its edge; empty if it did not.
     """
 
     structure: Structure
     penalty: float
     rows: list[dict[str, Any]]
     nested: dict[str, Any] | None
-    edge: str
 
 
 def candidates(recipe: Recipe, num_bins: int) -> list[Structure]:
@@ -294,7 +292,7 @@ def choose_model(
             shown.update()
 
         for_each(leave_out, folds)
-    edge = _extend_grid(bins)
+    _extend_grid(bins, groups)
     accuracy = bins.accuracies(groups)
     chosen = _best(accuracy, recipe.tolerance)
     order = sorted(accuracy[groups[0]], key=lambda key: (structures.index(key[0]), key[1]))
@@ -314,7 +312,7 @@ def choose_model(
             inner = bins.accuracies([other for other in groups if other != group], group)
             by_name[bins.names[group]] = accuracy[group][_best(inner, recipe.tolerance)]
         nested = {"mean": sum(by_name.values()) / len(by_name), "balanced_accuracy": by_name}
-    return Choice(*chosen, rows, nested, edge)
+    return Choice(*chosen, rows, nested)
 
 
 def fitted_selection(
@@ -591,26 +589,22 @@ def _best(table: _Table, tolerance: float) -> Candidate:
     return min((key for key, mean in means.items() if mean >= least), key=order)
 
 
-def _extend_grid(bins: _Bins) -> str:
-    """Extend a grid of penalties whose end was chosen, or is best; says what was done."""
-    groups, tolerance = bins.whole_groups(), bins.recipe.tolerance
-    if len(bins.recipe.penalties_ascending) < 2:
-        return ""
-    said = []
-    for is_low in (True, False):
+def _extend_grid(bins: _Bins, groups: Sequence[int]) -> None:
+    """Extend a grid of penalties whose end was chosen, or is best, and say so."""
+    recipe, added = bins.recipe, list[str]()
+    for is_low in (True, False) if len(recipe.penalties_ascending) > 1 else ():
         for _ in range(MOST_EXTENSIONS):
             table = bins.accuracies(groups)
             means = _means(table)
-            best = _best(table, tolerance) if is_low else max(means, key=means.__getitem__)
+            best = _best(table, recipe.tolerance) if is_low else max(means, key=means.__getitem__)
             own = [penalty for structure, penalty in means if structure == best[0]]
             if best[1] != (min(own) if is_low else max(own)):
                 break
             beyond = best[1] / 10 if is_low else best[1] * 10
             for_each(partial(bins.leave_out, structures=best[:1], penalties=[beyond]), bins.scores)
-            said.append(f"{beyond:g}")
-    if not said:
-        return ""
-    return f"recipe.penalties ended at its edge and was extended by {', '.join(said)}"
+            added.append(f"{beyond:g}")
+    if added:
+        log.info("recipe.penalties ended at its edge and was extended by %s", ", ".join(added))
 
 
 def _row(bins: _Bins, key: Candidate, by_group: Mapping[int, float]) -> dict[str, Any]:
@@ -798,8 +792,6 @@ def plan_detector(
             choice = choose_model(recipe, pool, sample, is_nested=is_nested, show=show)
             structure, penalty = choice.structure, choice.penalty
             rows, nested = choice.rows, choice.nested
-            if choice.edge:
-                log.info("%s", choice.edge)
         else:
             penalties = recipe.penalties_ascending
             structure, penalty = candidates(recipe, num_bins)[0], penalties[len(penalties) // 2]

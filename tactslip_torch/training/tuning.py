@@ -22,7 +22,6 @@ from torch.nn.functional import softplus
 
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.bin_sample import SampledBins
-from tactslip_torch.features.ops import signed_log
 from tactslip_torch.model.calibration import Platt, fit_platt
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine, held_out_scores
 from tactslip_torch.model.kernels import Polynomial
@@ -404,19 +403,9 @@ class LearnedSettings(nn.Module):
         """Of the features, 1 at first: ``[K]``."""
         return torch.exp(self.logs["scales"])
 
-    def scaled(self, features: Tensor) -> Tensor:
-        """Features in the kernel, ``[N, K]`` in [-1, 1]; what ``scaler()`` makes of them."""
-        start = self._scaler
-        if start.knee is not None:
-            features = signed_log(features, start.knee)
-        width = start.maximum - start.minimum
-        is_constant = width == 0
-        relative = (features - start.minimum) / torch.where(is_constant, 1.0, width)
-        return torch.where(is_constant, 0.0, self.scales * (2 * relative - 1)).clamp(-1, 1)
-
     def scaler(self) -> FeatureScaler:
-        """The ranges that hold the scales as they are now."""
-        start, scales = self._scaler, self.scales.detach()
+        """The ranges that hold the scales as they are now, differentiable."""
+        start, scales = self._scaler, self.scales
         middle = (start.minimum + start.maximum) / 2
         half = (start.maximum - start.minimum) / 2 / scales
         return FeatureScaler(middle - half, middle + half, start.knee)
@@ -439,7 +428,7 @@ class _Descent:
     def loss(self) -> Tensor:
         """The loss as settings are now, ``[]``; adds a row to the history."""
         settings, bins = self.settings, self.bins
-        z = settings.scaled(bins.features)
+        z = settings.scaler()(bins.features)
         scores = held_out_scores(
             z, bins.is_slip, bins.group, settings.penalty, settings.offset, bins.weights
         )
@@ -450,7 +439,7 @@ class _Descent:
                 training = TrainingBins(z.detach(), bins.is_slip, bins.weights)
                 kernel = Polynomial(2, float(settings.offset))
                 machine = fit_machine(training, float(settings.penalty), kernel)
-                scores = machine(settings.scaled(self.held.features))
+                scores = machine(settings.scaler()(self.held.features))
                 held = grouped_loss(scores, self.held.is_slip, self.held.group, found.calibration)
             row |= {"held_loss": float(held.loss), "held_accuracy": held.balanced_accuracy}
         self.history.append(row)
