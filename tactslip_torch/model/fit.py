@@ -40,10 +40,10 @@ from tactslip_torch.model.kernels import (
     collapse,
     gram_matrix,
     machine_of,
-    stated,
+    solved_machine,
 )
 from tactslip_torch.model.moments import ProductSums
-from tactslip_torch.model.solve import check_weights, solve_by_autograd, solve_symmetric
+from tactslip_torch.model.solve import check_weights, solve_symmetric
 
 log = logging.getLogger(__name__)
 
@@ -136,13 +136,11 @@ def fit_machine(
         return kernel.solve(normal, moment, penalty, bins.features.shape[1])[0]
     gram = gram_matrix(kernel, bins.features)
     solution = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
+    num_features = bins.features.shape[1]
+    most_rank = kernel.num_monomials(num_features) if isinstance(kernel, Polynomial) else len(gram)
     make = functools.partial(machine_of, bins.features, kernel=kernel)
-    machine = make(solution.x)
-    if isinstance(kernel, Polynomial) and isinstance(machine, QuadraticForm):
-        num_monomials = kernel.num_monomials(bins.features.shape[1])
-        machine.solved = stated(machine, solution, make, num_monomials)
-    else:
-        machine.solved = solution.report
+    machine = solved_machine(solution, make, most_rank)
+    if not isinstance(machine, QuadraticForm):
         log.info(
             "%s does not fold into a quadratic form: all %d training bins are kept, %s",
             kernel,
@@ -229,7 +227,8 @@ def fit_quadratic(
         name="gram" if is_dual else "X'WX",
         most_condition=_MOST_CONDITION,
     )
-    solved = solve_by_autograd(system + ridge.diag(), right)
+    lower = torch.linalg.cholesky(system + ridge.diag())
+    solved = torch.cholesky_solve(right[:, None], lower)[:, 0]
     machine = collapse(z, solved, kernel) if is_dual else kernel.head(solved, z.shape[1])
     machine.solved = report
     return machine

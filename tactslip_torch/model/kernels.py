@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -150,11 +151,9 @@ class Polynomial:
             normal, moment, penalty, name="X'WX", in_span=True, most_condition=most_condition
         )
 
-        def make(weights: Tensor) -> QuadraticForm:
-            return self.head(weights, num_features)
-
-        machine = make(solution.x)
-        machine.solved = stated(machine, solution, make, len(normal))
+        make = partial(self.head, num_features=num_features)
+        machine = solved_machine(solution, make, len(normal))
+        assert isinstance(machine, QuadraticForm)
         return machine, solution.factor
 
     def _pairs(self, num_features: int) -> tuple[Tensor, Tensor]:
@@ -258,23 +257,24 @@ def gram_matrix(kernel: Kernel, z: Tensor) -> Tensor:
     return gram
 
 
-def stated(
-    machine: QuadraticForm, solution: Solution, make: Callable[[Tensor], Head], most_rank: int
-) -> SolveReport:
-    """The report on a machine's solution, with the error of its coefficients.
+def solved_machine(solution: Solution, make: Callable[[Tensor], Head], most_rank: int) -> Head:
+    """The machine of solved weights; its report has the error of a quadratic form's coefficients.
 
     Args:
-        machine: of the solution.
-        solution: of its weights.
+        solution: of the weights.
         make: a machine of weights.
         most_rank: as many components as can differ from 0, those of the map.
     """
-    moved = max(float(_coefficients(make(move)).abs().max()) for move in solution.moves.mT)
-    largest = float(_coefficients(machine).abs().max())
-    report = solution.report
-    is_known = report.rank >= min(report.size, most_rank)
-    elsewhere = moved / largest if is_known and largest > 0 else 0.0 if is_known else math.inf
-    return replace(report, elsewhere=elsewhere)
+    machine, report = make(solution.x), solution.report
+    if isinstance(machine, QuadraticForm):
+        largest = float(_coefficients(machine).abs().max())
+        moved = max(float(_coefficients(make(move)).abs().max()) for move in solution.moves.mT)
+        elsewhere = math.inf
+        if report.rank >= min(report.size, most_rank):
+            elsewhere = moved / largest if largest > 0 else 0.0
+        report = replace(report, elsewhere=elsewhere)
+    machine.solved = report
+    return machine
 
 
 def _coefficients(machine: Head) -> Tensor:

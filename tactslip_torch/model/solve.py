@@ -203,15 +203,6 @@ def solve_symmetric(
     return Solution(_finite(x, name), report, None, moves)
 
 
-def solve_by_autograd(system: Tensor, right: Tensor) -> Tensor:
-    """``system^-1 right``, differentiable any number of times, of a positive definite system.
-
-    Shape:
-        - system: ``[n, n]``; right, output: ``[n]``
-    """
-    return torch.cholesky_solve(right[:, None], torch.linalg.cholesky(system))[:, 0]
-
-
 def check_weights(weights: Tensor) -> None:
     """Refuse weights of bins that are not positive and finite.
 

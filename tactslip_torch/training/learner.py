@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -277,7 +278,7 @@ class SlipLearner(L.LightningModule):
         self.metrics: dict[str, Any] = {}
         self.events: dict[str, dict[str, list[RecordingEvents]]] = {}
         self.seconds: dict[str, float] = {}
-        self.worker_seconds: dict[str, float] = {}
+        self.worker_seconds = Counter[str]()
         self._pass_started = 0.0
         self._num_threads = torch.get_num_threads()
         self._statistics = TrainingStatistics(len(pool.names), self.recipe.sample_bins)
@@ -304,7 +305,7 @@ class SlipLearner(L.LightningModule):
         """Gather statistics in the first epoch, what the plan needs in the second."""
         if not batch:  # NOTHING
             return
-        self._add_seconds(batch)
+        self.worker_seconds.update(batch.seconds)
         mask = batch.roles["train"]
         features, is_slip = batch.features[mask], batch.is_slip[mask]
         if self._second is None or self._is_resumed:
@@ -377,7 +378,7 @@ class SlipLearner(L.LightningModule):
     def test_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
         """Score the bins of one recording."""
         assert self.detector is not None  # on_test_start
-        self._add_seconds(batch)
+        self.worker_seconds.update(batch.seconds)
         chosen = batch.features[:, list(self.detector.selected)].double()
         device = next(self.detector.buffers()).device  # Lightning may have moved it
         scaled = self.detector.scaled(chosen.to(device))
@@ -436,10 +437,6 @@ class SlipLearner(L.LightningModule):
         """What the machine was solved from, and the first pass's sample of its bins."""
         assert self._second is not None  # fitted
         return self._second, self._statistics.sample.bins()
-
-    def _add_seconds(self, batch: RecordingFeatures) -> None:
-        for stage, seconds in batch.seconds.items():
-            self.worker_seconds[stage] = self.worker_seconds.get(stage, 0.0) + seconds
 
     def _fingerprint(self) -> str:
         data: SlipDataModule = self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning's

@@ -35,7 +35,6 @@ from torch import Tensor
 
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
-from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.statistics import TrainingStatistics
@@ -328,17 +327,22 @@ def fitted_selection(
     """
     bins = _Bins(recipe, pool, sample, allowed)
     columns = _Columns(bins, torch.ones_like(bins.is_slip), bins.is_slip | True, structure.parts)
-    places = columns.ranked(structure)
-    names = columns.names(structure.parts)
-    names = [names[place] for place in places.tolist()]
-    scaler, layer = columns.scaler(structure, places), columns.pooling
-    index = {name: place for place, name in enumerate(_names_of(pool, sample))}
+    known, layer = list[Any](), columns.pooling
+    for part in structure.parts:
+        known += bins.feature_names if part == "channel" or layer is None else layer.names
+    names = inputs = [known[place] for place in columns.ranked(structure).tolist()]
     if layer is None or not any(name.is_pooled for name in names):
-        return FeatureSelection(tuple(index[name] for name in names), scaler)
-    if structure.use == "both":
-        layer = layer.with_channels(bins.feature_names)
-    layer = layer.select([layer.names.index(name) for name in names])
-    return FeatureSelection(tuple(index[name] for name in layer.inputs), scaler, layer)
+        layer = None
+    else:
+        if structure.use == "both":
+            layer = layer.with_channels(bins.feature_names)
+        layer = layer.select([layer.names.index(name) for name in names])
+        inputs = list(layer.inputs)
+    index = {name: place for place, name in enumerate(_names_of(pool, sample))}
+    selected = [index[name] for name in inputs]
+    x = sample.features[:, selected].double()
+    scaler = FeatureScaler.fit(x if layer is None else layer(x), **bins.scaling)
+    return FeatureSelection(tuple(selected), scaler, layer)
 
 
 def group_scores(columns: Tensor, is_slip: Tensor, groups: Tensor) -> Tensor:
@@ -388,6 +392,7 @@ class _Bins:
         self.feature_names = [names[place] for place in places.tolist()]
         self.features = sample.features[:, places]
         self.is_kept = torch.ones_like(sample.is_slip)
+        self.scaling: dict[str, Any] = {"compress": recipe.compress, "tail": recipe.tail}
         self.scores: dict[frozenset[int], dict[int, dict[Candidate, Tensor]]] = {}
         self._stratum = 2 * sample.group + sample.is_slip.long()
 
@@ -458,7 +463,7 @@ class _Columns:
     """Scaled columns of some sampled bins, with what the training bins among them taught."""
 
     def __init__(self, bins: _Bins, rows: Tensor, train: Tensor, parts: Sequence[str]) -> None:
-        self._bins, self.train = bins, train[rows]
+        self.train = train[rows]
         self._is_slip, self._groups = bins.is_slip[train], bins.groups[train]
         features = bins.features[rows]
         self.pooling: ChannelPooling | None = None
@@ -473,22 +478,13 @@ class _Columns:
             inputs = torch.tensor([place[name] for name in layer.inputs])
             self.pooling = layer
             columns["pooled"] = layer(features.index_select(1, inputs).double())
-        options: dict[str, Any] = {"compress": bins.recipe.compress, "tail": bins.recipe.tail}
-        self._scalers: dict[str, FeatureScaler] = {}
         self._scaled: dict[str, Tensor] = {}
         for name, x in columns.items():
             x = x.double()
-            scaler = FeatureScaler.fit(x[self.train], **options)
-            self._scalers[name] = scaler
+            scaler = FeatureScaler.fit(x[self.train], **bins.scaling)
             self._scaled[name] = torch.cat([scaler(part) for part in x.split(_SCALED_BINS)])
         self._ranks: dict[str, Tensor] = {}
         self._products: dict[str, Tensor] = {}
-
-    def names(self, parts: Sequence[str]) -> list[FeatureName]:
-        """Of the columns of these kinds."""
-        pooled = () if self.pooling is None else self.pooling.names
-        of = {"channel": self._bins.feature_names, "pooled": pooled}
-        return [name for part in parts for name in of[part]]
 
     def num(self, structure: Structure) -> int:
         """K of a structure."""
@@ -511,16 +507,6 @@ class _Columns:
                 self._products[name] = z @ z[self.train].mT
         first, *others = (self._products[name] for name in structure.parts)
         return sum(others, first)
-
-    def scaler(self, structure: Structure, places: Tensor) -> FeatureScaler:
-        """Of some columns of a structure."""
-        scalers = [self._scalers[name] for name in structure.parts]
-        knees = [scaler.knee for scaler in scalers if scaler.knee is not None]
-        return FeatureScaler(
-            torch.cat([scaler.minimum for scaler in scalers])[places],
-            torch.cat([scaler.maximum for scaler in scalers])[places],
-            torch.cat(knees)[places] if knees else None,
-        )
 
     def ranked(self, structure: Structure) -> Tensor:
         """Places of the columns of a structure, best first; all in their order."""

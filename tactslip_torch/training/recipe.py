@@ -488,15 +488,11 @@ def sample_weight(recipe: Recipe, sample: SampledBins) -> Tensor:
     Raises:
         ValueError: if a class is absent, or a scene is weighed that no recording is of.
     """
-    is_slip = sample.is_slip.long()
-    if recipe.scene_weights:
-        by_scene = scene_weights(recipe, sample)
-        of_stratum = sample.sample_weight.new_tensor(
-            [by_scene[_scene(name)] for name in sample.group_names]
-        )
-        return sample.sample_weight * of_stratum[sample.group, is_slip]
-    of_class = sample.sample_weight.new_tensor(_balance(recipe, _class_counts(sample)))
-    return sample.sample_weight * of_class[is_slip]
+    by_scene = scene_weights(recipe, sample)
+    of_stratum = sample.sample_weight.new_tensor(
+        [by_scene[_scene(name)] for name in sample.group_names]
+    )
+    return sample.sample_weight * of_stratum[sample.group, sample.is_slip.long()]
 
 
 def scene_weights(recipe: Recipe, sample: SampledBins) -> dict[str, tuple[float, float]]:
