@@ -217,6 +217,7 @@ def _with_one(z: Tensor) -> Tensor:
 
 Kernel = Polynomial | RadialBasis
 PAPER_KERNEL = Polynomial(degree=2, offset=0.5)
+_KINDS: dict[Any, type[Kernel]] = {"polynomial": Polynomial, "radial basis": RadialBasis}
 
 
 def kernel_from_dict(values: Mapping[str, Any]) -> Kernel:
@@ -229,19 +230,14 @@ def kernel_from_dict(values: Mapping[str, Any]) -> Kernel:
         >>> kernel_from_dict({"kind": "polynomial", "degree": 3, "offset": 1.0})
         Polynomial(degree=3, offset=1.0)
     """
-    numbers = {name: value for name, value in values.items() if name != "kind"}
+    numbers = dict(values)
+    kind = numbers.pop("kind", None)
+    if kind not in list(_KINDS):
+        raise ValueError(f"kind of the kernel must be one of {', '.join(_KINDS)}, got {kind!r}")
     try:
-        match values.get("kind"):
-            case "polynomial":
-                return Polynomial(**numbers)
-            case "radial basis":
-                return RadialBasis(**numbers)
-            case kind:
-                raise ValueError(
-                    f"kind of the kernel must be one of polynomial, radial basis, got {kind!r}"
-                )
+        return _KINDS[kind](**numbers)
     except TypeError as error:
-        raise ValueError(f"{numbers} does not describe a {values['kind']} kernel") from error
+        raise ValueError(f"{numbers} does not describe a {kind} kernel") from error
 
 
 def gram_matrix(kernel: Kernel, z: Tensor) -> Tensor:
