@@ -27,7 +27,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -327,17 +327,15 @@ def fitted_selection(
     """
     bins = _Bins(recipe, pool, sample, allowed)
     columns = _Columns(bins, torch.ones_like(bins.is_slip), bins.is_slip | True, structure.parts)
-    known, layer = list[Any](), columns.pooling
-    for part in structure.parts:
-        known += bins.feature_names if part == "channel" or layer is None else layer.names
-    names = inputs = [known[place] for place in columns.ranked(structure).tolist()]
-    if layer is None or not any(name.is_pooled for name in names):
-        layer = None
-    else:
+    names = inputs = [columns.names[place] for place in columns.places(structure).tolist()]
+    layer = columns.pooling
+    if layer is not None and any(name.is_pooled for name in names):
         if structure.use == "both":
             layer = layer.with_channels(bins.feature_names)
         layer = layer.select([layer.names.index(name) for name in names])
         inputs = list(layer.inputs)
+    else:
+        layer = None
     index = {name: place for place, name in enumerate(_names_of(pool, sample))}
     selected = [index[name] for name in inputs]
     x = sample.features[:, selected].double()
@@ -460,64 +458,62 @@ class _Bins:
 
 
 class _Columns:
-    """Scaled columns of some sampled bins, with what the training bins among them taught."""
+    """Scaled columns of some sampled bins, with what the training bins among them taught.
+
+    Attributes:
+        train: which of the bins are training bins, ``[n]``.
+        z: the columns, ``[n, K]``, those of channels before pooled ones.
+        names: of the columns.
+        pooling: that made the pooled ones.
+    """
 
     def __init__(self, bins: _Bins, rows: Tensor, train: Tensor, parts: Sequence[str]) -> None:
         self.train = train[rows]
         self._is_slip, self._groups = bins.is_slip[train], bins.groups[train]
-        features = bins.features[rows]
-        self.pooling: ChannelPooling | None = None
-        columns = {"channel": features} if "channel" in parts else {}
-        if "pooled" in parts:
-            setting = bins.recipe.pooling
-            assert setting is not None  # recipe
-            assert bins.hand is not None  # plan_detector
-            own = features[self.train]
-            layer = ChannelPooling.fit(bins.hand, bins.feature_names, own, setting)
-            place = {name: index for index, name in enumerate(bins.feature_names)}
-            inputs = torch.tensor([place[name] for name in layer.inputs])
-            self.pooling = layer
-            columns["pooled"] = layer(features.index_select(1, inputs).double())
-        self._scaled: dict[str, Tensor] = {}
-        for name, x in columns.items():
+        features, scaled = bins.features[rows], list[Tensor]()
+        self.names, self.pooling = list[Any](), None
+        self._places, self._products = dict[str, Tensor](), dict[str, Tensor]()
+        for part in sorted(parts):
+            x, names = features, bins.feature_names
+            if part == "pooled":
+                setting = bins.recipe.pooling
+                assert setting is not None  # recipe
+                assert bins.hand is not None  # plan_detector
+                own = features[self.train]
+                layer = self.pooling = ChannelPooling.fit(bins.hand, names, own, setting)
+                place = {name: index for index, name in enumerate(names)}
+                x = layer(features[:, [place[name] for name in layer.inputs]].double())
+                names = list(layer.names)
             x = x.double()
             scaler = FeatureScaler.fit(x[self.train], **bins.scaling)
-            self._scaled[name] = torch.cat([scaler(part) for part in x.split(_SCALED_BINS)])
-        self._ranks: dict[str, Tensor] = {}
-        self._products: dict[str, Tensor] = {}
+            scaled.append(torch.cat([scaler(few) for few in x.split(_SCALED_BINS)]))
+            self._places[part] = torch.arange(len(names)) + len(self.names)
+            self.names += names
+        self.z = torch.cat(scaled, 1)
 
-    def num(self, structure: Structure) -> int:
-        """K of a structure."""
-        num = sum(self._scaled[name].shape[1] for name in structure.parts)
-        return min(num, structure.num_features or num)
-
-    def of(self, structure: Structure) -> Tensor:
-        """Scaled columns of a structure, best first, ``[n, K]``."""
-        z = torch.cat([self._scaled[name] for name in structure.parts], 1)
-        return z if structure.num_features is None else z[:, self.ranked(structure)]
+    def places(self, structure: Structure) -> Tensor:
+        """Which columns a structure takes, best first; all in their order."""
+        places = torch.cat([self._places[part] for part in structure.parts])
+        if structure.num_features is None:
+            return places
+        order = self._scores[places].argsort(descending=True, stable=True)
+        return places[order[: structure.num_features]]
 
     def products(self, structure: Structure) -> Tensor:
         """Inner products of all bins with the training bins, ``[n, train]``."""
         if structure.num_features is not None:
-            z = self.of(structure)
+            z = self.z[:, self.places(structure)]
             return z @ z[self.train].mT
-        for name in structure.parts:
-            if name not in self._products:
-                z = self._scaled[name]
-                self._products[name] = z @ z[self.train].mT
-        first, *others = (self._products[name] for name in structure.parts)
+        for part in structure.parts:
+            if part not in self._products:
+                z = self.z[:, self._places[part]]
+                self._products[part] = z @ z[self.train].mT
+        first, *others = (self._products[part] for part in structure.parts)
         return sum(others, first)
 
-    def ranked(self, structure: Structure) -> Tensor:
-        """Places of the columns of a structure, best first; all in their order."""
-        if structure.num_features is None:
-            return torch.arange(self.num(structure))
-        for name in structure.parts:
-            if name not in self._ranks:
-                z = self._scaled[name][self.train]
-                self._ranks[name] = group_scores(z, self._is_slip, self._groups)
-        scores = torch.cat([self._ranks[name] for name in structure.parts])
-        return scores.argsort(descending=True, stable=True)[: structure.num_features]
+    @cached_property
+    def _scores(self) -> Tensor:
+        return group_scores(self.z[self.train], self._is_slip, self._groups)
 
 
 def _ridge_scores(
@@ -532,8 +528,9 @@ def _ridge_scores(
     Through the primal or the dual, whichever has fewer unknowns.
     """
     kernel, is_train = structure.kernel, columns.train
-    if kernel.degree == 1 and columns.num(structure) < len(targets):
-        z = columns.of(structure)
+    places = columns.places(structure)
+    if kernel.degree == 1 and len(places) < len(targets):
+        z = columns.z[:, places]
         x = torch.cat([z, torch.full_like(z[:, :1], math.sqrt(kernel.offset))], 1)
         system = x[is_train].mT @ (x[is_train] * weights[:, None])
         right, others, each = x[is_train].mT @ (weights * targets), x[~is_train], torch.ones(())
