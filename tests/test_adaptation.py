@@ -17,7 +17,6 @@ from tactslip_torch.training.adaptation import (
     RecordingBins,
     Statistics,
     add,
-    class_scales,
     forget,
     solve,
 )
@@ -100,7 +99,8 @@ def assert_same(one, other, folder, weight=1.0):
 
 def test_machine_and_scores_without_a_recording_are_those_of_refits(old, trained, new):
     after = old.reweighed(dict.fromkeys(new, 2.5), new)
-    solved, scales, everyone = solve(after), class_scales(after), trained | new
+    solved, everyone = solve(after), trained | new
+    scales = after.sums.class_scale(MACHINE.balance)
 
     def refitted_without(name, z):
         kept = {other: own for other, own in everyone.items() if other != name}

@@ -10,8 +10,7 @@ The weights of the machine are redone; features, scaling and bin weights stay. A
 cycle, a material: whatever must not stand on both sides of a validation. With ``G = K +
 diag(1 / (C w))`` and ``beta = G^-1 t`` the residuals of a group under the machine without it are
 ``e_g = ((G^-1)_gg)^-1 beta_g``; in the primal ``e_g = (I - H_gg)^-1 (t - Phi v)_g`` with the hat
-matrix ``H = Phi A^-1 Phi' W``. Either way one Cholesky factor serves all groups. In the primal a
-large group has sums of its own, and what is left of the sums without them is solved.
+matrix ``H = Phi A^-1 Phi' W``. Either way one Cholesky factor serves all groups.
 
 Reference:
     Rasmussen and Williams, Gaussian Processes for Machine Learning, section 5.4.2, and An, Liu and
@@ -128,10 +127,7 @@ def fit_machine(
     bins = bins.double()
     if not _goes_dual(bins, penalty, kernel, route):
         assert isinstance(kernel, Polynomial)
-        layout = ProductSums(bins.features.shape[1], kernel.degree)
-        total = bins.features.new_zeros(layout.num_held)
-        layout.add_(total, bins.features, bins.sample_weight)
-        normal = layout.normal_matrix(total, kernel.offset)
+        normal = _normal_matrix(kernel, bins.features, bins.sample_weight)
         moment = kernel.sum_of_monomials(bins.features, bins.sample_weight * bins.targets)
         return kernel.solve(normal, moment, penalty, bins.features.shape[1])[0]
     gram = gram_matrix(kernel, bins.features)
@@ -148,6 +144,14 @@ def fit_machine(
             machine.cost,
         )
     return machine
+
+
+def _normal_matrix(kernel: Polynomial, z: Tensor, weights: Tensor) -> Tensor:
+    """``X' W X`` of the monomials of bins ``[N, K]``, by way of the sums that are distinct."""
+    layout = ProductSums(z.shape[1], kernel.degree)
+    total = z.new_zeros(layout.num_held)
+    layout.add_(total, z, weights)
+    return layout.normal_matrix(total, kernel.offset)
 
 
 def fit_quadratic(
@@ -305,8 +309,8 @@ class HeldOut:
 
     Through the primal or the dual as ``fit_machine``. The matrix that does not depend on C is kept,
     ``[P, P]`` or ``[N, N]``, and ``at`` takes another one of that size. Beyond the fit it costs
-    about one and a half factorisations in the dual. In the primal a bin of a small group costs
-    ``P^2 / 2`` multiply-adds, and a group of more than ``P / 3`` bins a factorisation.
+    about one and a half factorisations in the dual. In the primal a bin costs ``P^2 / 2``
+    multiply-adds, and a group a factorisation in as many unknowns as it has bins, at most ``P``.
 
     Args:
         bins: scaled training bins; float32 is promoted exactly.
@@ -333,22 +337,14 @@ class HeldOut:
         self._kernel, self._z = kernel, bins.features[self._order]
         self._targets, self._weights = bins.targets[self._order], bins.sample_weight[self._order]
         num_bins, num_features = self._z.shape
-        self._layout: ProductSums | None = None
-        if route == "dual" or (route == "auto" and takes_dual(kernel, num_bins, num_features)):
+        self._is_dual = route == "dual"
+        if route == "auto":
+            self._is_dual = takes_dual(kernel, num_bins, num_features)
+        if self._is_dual:
             self._system = gram_matrix(kernel, self._z)
-            return
-        assert isinstance(kernel, Polynomial)
-        layout = self._layout = ProductSums(num_features, kernel.degree)
-        most = kernel.num_monomials(num_features) // 3
-        self._small = [own for own in self._groups if own.size <= most]
-        few = slice(0, sum(own.size for own in self._small))
-        self._total = self._sums(layout, few)
-        self._large = [
-            (own, self._sums(layout, own.rows)) for own in self._groups[len(self._small) :]
-        ]
-        for _, sums in self._large:
-            self._total += sums
-        self._system = layout.normal_matrix(self._total, kernel.offset)
+        else:
+            assert isinstance(kernel, Polynomial)
+            self._system = _normal_matrix(kernel, self._z, self._weights)
 
     def at(self, penalty: float) -> HeldOutFit:
         """The machine and the held-out scores for one value of C.
@@ -363,10 +359,7 @@ class HeldOut:
                 the machine without a group (named) cannot be told in float64.
         """
         _check_penalty(penalty)
-        if self._layout is None:
-            head, residuals = self._dual(penalty)
-        else:
-            head, residuals = self._primal(penalty, self._layout)
+        head, residuals = self._dual(penalty) if self._is_dual else self._primal(penalty)
         scores = torch.empty_like(residuals)
         scores[self._order] = self._targets - residuals
         return HeldOutFit(head, scores)
@@ -398,33 +391,17 @@ class HeldOut:
         head.solved = report
         return head, residuals
 
-    def _primal(self, penalty: float, layout: ProductSums) -> tuple[Head, Tensor]:
-        kernel = self._kernel
+    def _primal(self, penalty: float) -> tuple[Head, Tensor]:
+        kernel, weights = self._kernel, self._weights
         assert isinstance(kernel, Polynomial)
-        pull = self._weights * self._targets
-        moment = kernel.sum_of_monomials(self._z, pull)
-        num = layout.num_features
-        head, factor = kernel.solve(self._system, moment, penalty, num, MOST_CONDITION)
+        moment = kernel.sum_of_monomials(self._z, weights * self._targets)
+        num_features = self._z.shape[1]
+        head, factor = kernel.solve(self._system, moment, penalty, num_features, MOST_CONDITION)
         assert factor is not None  # as most_condition is given
         residuals = self._targets - head(self._z)
-        residuals = residuals_without(
-            self._small, kernel, factor, self._z, self._weights.sqrt(), residuals
+        return head, residuals_without(
+            self._groups, kernel, factor, self._z, weights.sqrt(), residuals
         )
-        for own, sums in self._large:
-            z = self._z[own.rows]
-            normal = layout.normal_matrix(self._total - sums, kernel.offset)
-            others = moment - kernel.sum_of_monomials(z, pull[own.rows])
-            try:
-                without, _ = kernel.solve(normal, others, penalty, num, MOST_CONDITION)
-            except ValueError as error:
-                raise ValueError(f"without group {own.name}: {error}") from None
-            residuals[own.rows] = self._targets[own.rows] - without(z)
-        return head, residuals
-
-    def _sums(self, layout: ProductSums, rows: slice) -> Tensor:
-        total = self._z.new_zeros(layout.num_held)
-        layout.add_(total, self._z[rows], self._weights[rows])
-        return total
 
 
 def held_out_scores(
@@ -491,10 +468,10 @@ def residuals_without(
     roots: Tensor,
     residuals: Tensor,
 ) -> Tensor:
-    """Residuals of bins of small groups under the machine without their group; others stay.
+    """Residuals of each bin under the machine without its group.
 
     Args:
-        groups: ``ordered_groups`` of the bins, or some of them.
+        groups: ``ordered_groups`` of the bins.
         kernel: of degree 1 or 2.
         factor: the lower Cholesky factor of the normal equations of all bins.
         z: scaled features.
@@ -507,20 +484,27 @@ def residuals_without(
     Raises:
         ValueError: if a group leaves too little.
     """
-    found = residuals.clone()
+    found = torch.empty_like(residuals)
     for some, part in _chunks(groups):
         scaled = kernel.monomials(z[part]) * roots[part, None]
         columns = torch.linalg.solve_triangular(factor, scaled.mT, upper=False)
-        left = torch.eye(columns.shape[1]).to(columns) - columns.mT @ columns  # I - hat
         for own in some:
-            lower, info = torch.linalg.cholesky_ex(own.within(left, part))
+            # (I - b'b)^-1 right = right + b' (I - b b')^-1 b right: whichever matrix is smaller
+            b = columns[:, own.rows.start - part.start : own.rows.stop - part.start]
+            is_long = b.shape[1] > b.shape[0]
+            hat = b @ b.mT if is_long else b.mT @ b
+            lower, info = torch.linalg.cholesky_ex(torch.eye(len(hat)).to(hat) - hat)
             if info or bool((lower.diagonal().square() < _LEAST_EIGENVALUE).any()):
                 raise ValueError(
                     f"the machine without group {own.name} is too far from the machine of all bins "
                     "to be told from it in float64; lower the penalty, or refit without the group"
                 )
             right = (roots * residuals)[own.rows, None]
-            found[own.rows] = torch.cholesky_solve(right, lower)[:, 0] / roots[own.rows]
+            if is_long:
+                right = right + b.mT @ torch.cholesky_solve(b @ right, lower)
+            else:
+                right = torch.cholesky_solve(right, lower)
+            found[own.rows] = right[:, 0] / roots[own.rows]
     return found
 
 
@@ -529,11 +513,6 @@ class Group(NamedTuple):
 
     name: int
     rows: slice
-
-    @property
-    def size(self) -> int:
-        """Number of bins."""
-        return int(self.rows.stop - self.rows.start)
 
     def within(self, products: Tensor, part: slice) -> Tensor:
         """Its own block of a matrix over the bins of a part."""

@@ -234,16 +234,20 @@ class SufficientStats:
         """``X' W X``, ``[P, P]``, and ``X' W t``, ``[P]``; arguments and errors as ``solve``."""
         if not 0 <= offset < math.inf:
             raise ValueError(f"offset (the kernel's c) must be 0 or more, got {offset}")
-        if balance not in ("weights", "none"):
-            raise ValueError(f"balance must be 'weights' or 'none', got {balance!r}")
         for name, num in zip(_CLASSES, self.count.tolist(), strict=True):
             if num == 0:
                 raise ValueError(f"there is no {name} bin in these sums; add bins of both classes")
-        weight = self.weight
-        scale = weight.sum() / (2 * weight) if balance == "weights" else torch.ones_like(weight)
+        scale = self.class_scale(balance)
         rest, slip = self.sums[0] * scale[0], self.sums[1] * scale[1]
         moment = self._layout.moment_vector(slip - rest, offset, num_features)
         return self._layout.normal_matrix(rest.add_(slip), offset, num_features), moment
+
+    def class_scale(self, balance: str = "weights") -> Tensor:
+        """What a balance, as ``solve`` has it, multiplies weights of either class with, ``[2]``."""
+        if balance not in ("weights", "none"):
+            raise ValueError(f"balance must be 'weights' or 'none', got {balance!r}")
+        weight = self.weight
+        return weight.sum() / (2 * weight) if balance == "weights" else torch.ones_like(weight)
 
     def _checked(
         self, batch_id: str, z: Tensor, is_slip: Tensor, weights: Tensor | None

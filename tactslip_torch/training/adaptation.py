@@ -260,9 +260,7 @@ class Statistics:
             sample.recording_names,
             tuple(materials[name] for name in sample.recording_names),
         )
-        balance: Literal["weights", "none"]
-        balance = "weights" if plan.recipe.balance == "weights" else "none"
-        machine = Machine(plan.penalty, plan.kernel.offset, balance)
+        machine = Machine(plan.penalty, plan.kernel.offset, plan.balance)
         return cls(sums, machine, dict(labels), rehearsal, detector_digest(detector))
 
     def weight_of(self, recording: str) -> float:
@@ -528,20 +526,13 @@ def solve(statistics: Statistics) -> Solved:
     assert factor is not None  # as most_condition is given
     order, groups = ordered_groups(known.recording)
     z, is_slip = known.z[order], known.is_slip[order]
-    roots = (class_scales(statistics)[is_slip.long()] * known.weight[order]).sqrt()
+    scale = sums.class_scale(machine.balance)
+    roots = (scale[is_slip.long()] * known.weight[order]).sqrt()
     targets = torch.where(is_slip, 1.0, -1.0).double()
     residuals = residuals_without(groups, kernel, factor, z, roots, targets - head(z))
     scores = torch.empty_like(residuals)
     scores[order] = targets - residuals
     return Solved(head, known, scores)
-
-
-def class_scales(statistics: Statistics) -> Tensor:
-    """What the balance multiplies the weight of non-slip and of slip with, ``[2]``."""
-    weight = statistics.sums.weight
-    if statistics.machine.balance == "none":
-        return torch.ones_like(weight)
-    return weight.sum() / (2 * weight)
 
 
 def mean_recall(says_slip: Tensor, is_slip: Tensor) -> float:
@@ -812,7 +803,8 @@ def refitted(
     """
     new, known, machine = copy.deepcopy(detector), solved.known, statistics.machine
     new.head = solved.head
-    weights = class_scales(statistics)[known.is_slip.long()] * known.sample_weight
+    scale = statistics.sums.class_scale(machine.balance)
+    weights = scale[known.is_slip.long()] * known.sample_weight
     bins = TrainingBins(known.z, known.is_slip, weights)
     gaussians = ClassGaussians.fit(bins.features, bins.is_slip, weights)
     new.imputation.copy_(gaussians.mean.mean(0))  # both classes counting alike

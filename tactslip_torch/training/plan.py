@@ -666,6 +666,12 @@ class Plan:
         return self.num_bins > self.kernel.num_monomials(self.selection.size)
 
     @property
+    def balance(self) -> Literal["weights", "none"]:
+        """Of the classes in the solve; weights of scenes are balanced already."""
+        is_weighted = self.recipe.balance == "weights" and not self.scene_weights
+        return "weights" if is_weighted else "none"
+
+    @property
     def calibration(self) -> dict[str, Any] | None:
         """By held-out scores of the choice that was taken; None if there was nothing to choose."""
         chosen = (row.get("calibration") for row in self.validation if row.get("chosen"))
@@ -893,15 +899,12 @@ class TrainingPass:
             ValueError: if a class is absent, or the system cannot be told in float64.
         """
         plan = self.plan
-        balance: Literal["weights", "none"] = "none"
-        if plan.recipe.balance == "weights" and not plan.scene_weights:  # which are balanced
-            balance = "weights"
         if self.stats is not None:
             assert isinstance(plan.kernel, Polynomial)
-            return self.stats.solve(plan.penalty, plan.kernel.offset, balance=balance)
+            return self.stats.solve(plan.penalty, plan.kernel.offset, balance=plan.balance)
         columns = zip(*(self.bins[name] for name in sorted(self.bins)), strict=True)
         z, is_slip, weights = map(torch.cat, columns)
-        if balance == "weights":
+        if plan.balance == "weights":
             counts = torch.bincount(is_slip.long(), minlength=2).clamp(min=1)
             weights = weights * (len(z) / (2 * counts.double()))[is_slip.long()]
         return fit_machine(TrainingBins(z, is_slip, weights), plan.penalty, plan.kernel)
