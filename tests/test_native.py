@@ -16,6 +16,7 @@ from engine_bins import KINDS, assert_equals_reference, bins_of, some_hand
 from small_detector import raw_bins, small_detector
 
 from tactslip_torch import FeaturePool, HandLayout, native
+from tactslip_torch.features.bank import make_plan
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import build
 
@@ -174,6 +175,11 @@ def test_leading_axes_strides_copies_and_modes(backend):
     assert torch.equal(inside(bins), flat)
     with torch.device("meta"):
         assert torch.equal(made(POOL, [5, 90, 17])(bins), flat)
+
+
+def test_a_feature_that_is_not_there_is_named():
+    with pytest.raises(ValueError, match="unknown feature 'PVDF3 A9 freq kurtosis', exp"):
+        make_plan(HAND, 4, ["PVDF3 A9 freq kurtosis"])
 
 
 # Built and found ---------------------------------------------------------------------------------

@@ -228,6 +228,9 @@ def test_a_long_gap_ends_the_stream_and_begins_another(within, caplog):
         "the stream begins anew at 0.7005 s, behind a gap",
         "the stream begins anew at 3601.0505 s, behind a gap",
     ]
+    stream.reset()
+    assert stream.num_gaps == 0
+    assert_same(in_pieces(stream, samples), in_pieces(stream_of(), samples))
 
 
 @pytest.mark.parametrize(
