@@ -9,7 +9,7 @@ by piece, for streams and whole recordings alike; ``answer_of`` is what a bin sa
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -36,6 +36,9 @@ from tactslip_torch.signals.filtering import ChannelFilter, extended
 
 KEY = "alarm"
 """Under which ``SlipDetector.info`` keeps the settings."""
+
+
+Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -167,9 +170,6 @@ def calibration_of(detector: SlipDetector) -> tuple[Calibration, float] | None:
     if KEY in detector.info:
         AlarmSettings.of(detector)
     return detector.calibration
-
-
-Array = NDArray[Any]
 
 
 class Scorer(Protocol):
@@ -329,6 +329,7 @@ class Decider:
         bin_samples: length of a bin.
         look_ahead: samples behind its bin that a decision waits for.
         frame_samples: that must have come before any decision on a bin.
+        end_s: when so many samples had come, ``[m]``; by default by the sample rate.
 
     Example:
         >>> from tactslip_torch.model.calibration import Platt
@@ -347,9 +348,12 @@ class Decider:
         bin_samples: int,
         look_ahead: int,
         frame_samples: int = 0,
+        *,
+        end_s: Callable[[Array], Array] | None = None,
     ) -> None:
         self.settings = settings
         self._rate = sample_rate_hz
+        self._end_s = end_s or (lambda samples: samples / sample_rate_hz)
         self._first, self._frame = bin_samples + look_ahead, frame_samples
         self._latch_times = settings.latch_times(sample_rate_hz)
         self.reset()
@@ -413,12 +417,15 @@ class Decider:
         runs = np.maximum.accumulate(runs, -1)
         self._state = of_rule, latches, runs[..., -1] if len(number) else run
         self._number += len(number)
-        available_s = self._available_s(number)
-        began_s = self._available_s(np.minimum(runs, number)) - settings.lead_s
+        samples = number * settings.hop_samples + self._first
+        if settings.onset is None:  # else ``join`` says when
+            samples = samples.clip(min=self._frame)
+        available_s = self._end_s(samples)
+        lasted_s = (number - np.minimum(runs, number)) * settings.hop_samples / self._rate
         return Decisions(
             torch.from_numpy(number),
             torch.from_numpy(available_s),
-            torch.from_numpy(np.minimum(began_s, available_s)),
+            torch.from_numpy(available_s - np.maximum(lasted_s + settings.lead_s, 0.0)),
             score,
             llr,
             probability(llr, settings.slip_share),
@@ -465,7 +472,7 @@ class Decider:
         is_high = by_onset | (of_bin[3] >= of_bin.dtype.type(settings.threshold))
         rows = is_high.reshape(len(self._latches), len(number)).tolist()
         is_alarm, is_on, self._latches = self._latched(rows, 1.0, self._latches)
-        available_s = samples / self._rate
+        available_s = self._end_s(samples)
         onset_s = np.where(by_onset, available_s - onset.lead_s, began_s)
         return Decisions(
             torch.from_numpy(number),
@@ -494,11 +501,6 @@ class Decider:
             torch.from_numpy(np.array([of_row[part] for of_row in made], bool)) for part in (0, 1)
         )
         return alarms, standing, [state for _, _, state in made]
-
-    def _available_s(self, number: Array) -> Array:
-        samples = number * self.settings.hop_samples + self._first
-        times_s: Array = samples / self._rate
-        return times_s
 
 
 def is_usable(score: Tensor, is_missing: Tensor, needed_index: Tensor) -> Tensor:

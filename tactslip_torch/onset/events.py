@@ -463,46 +463,39 @@ def pooled_metrics(
 
 def _summary(events: Sequence[RecordingEvents], level: float, num_resamples: int) -> dict[str, Any]:
     """The numbers of ``pooled_metrics`` but for its groups."""
-    names = {name: place for place, name in enumerate(dict.fromkeys(map(_name, events)))}
-    bootstrap = Bootstrap(len(names), level, num_resamples)
+    places = {name: place for place, name in enumerate(dict.fromkeys(map(_name, events)))}
+    bootstrap = Bootstrap(len(places), level, num_resamples)
+    sums = {
+        name: [0.0] * len(places) for name in (*_OUTCOMES, "onsets", "alarms", "false", "hours")
+    }
+    found: list[tuple[int, LatencyParts, OnsetEvent]] = []
+    for one in events:
+        place = places[_name(one)]
+        sums["false"][place] += len(one.false_alarms_s)
+        sums["hours"][place] += one.quiet_s / 3600
+        for onset in one.onsets:
+            sums["onsets"][place] += 1
+            sums["alarms"][place] += onset.num_alarms
+            sums[onset.outcome][place] += 1
+            if onset.outcome == "found":
+                found.append((place, one.latency, onset))
+    recordings = torch.tensor([place for place, _, _ in found])
 
-    def total(of: Callable[[RecordingEvents], float]) -> list[float]:
-        """Of every recording, by its place."""
-        sums = [0.0] * len(names)
-        for one in events:
-            sums[names[_name(one)]] += of(one)
-        return sums
-
-    def of(outcome: str) -> list[float]:
-        return total(lambda one: sum(onset.outcome == outcome for onset in one.onsets))
-
-    outcomes = {outcome: of(outcome) for outcome in _OUTCOMES}
-    onsets = total(lambda one: len(one.onsets))
-    alarms = total(lambda one: sum(onset.num_alarms for onset in one.onsets))
-    false = total(lambda one: len(one.false_alarms_s))
-    hours = total(lambda one: one.quiet_s / 3600)
-    found = [
-        (names[_name(one)], one.latency, onset)
-        for one in events
-        for onset in one.onsets
-        if onset.outcome == "found"
-    ]
-    places = torch.tensor([place for place, _, _ in found])
-
-    def known(of: Callable[[OnsetEvent], float]) -> tuple[Tensor, Tensor]:
+    def known(name: str, factor: float) -> tuple[Tensor, Tensor]:
         """What is known of the onsets found, and the place of their recordings."""
-        values = torch.tensor([of(onset) for _, _, onset in found], dtype=torch.float64)
-        return values[~values.isnan()], places[~values.isnan()]
+        values = [factor * getattr(onset, name) for _, _, onset in found]
+        tensor = torch.tensor(values, dtype=torch.float64)
+        return tensor[~tensor.isnan()], recordings[~tensor.isnan()]
 
-    def spread(of: Callable[[OnsetEvent], float]) -> dict[str, Any] | None:
-        values, own = known(of)
+    def spread(name: str, factor: float = 1000) -> dict[str, Any] | None:
+        values, own = known(name, factor)
         shares = {"median": 0.5, "p95": 0.95} if len(values) else {}
         return {n: bootstrap.quantile(values, own, share) for n, share in shares.items()} or None
 
-    delay_ms, latency_ms, error_ms = spread(lambda onset: 1000 * onset.delay_s), None, None
+    delay_ms, latency_ms, error_ms = spread("delay_s"), None, None
     if delay_ms:
         steps = torch.linspace(0, 1, _STEPS + 1, dtype=torch.float64)
-        delay, _ = known(lambda onset: 1000 * onset.delay_s)
+        delay, _ = known("delay_s", 1000)
         delay_ms["quantiles"] = delay.quantile(steps).tolist()
         parts = {
             "look_ahead": [latency.look_ahead_s for _, latency, _ in found],
@@ -515,26 +508,26 @@ def _summary(events: Sequence[RecordingEvents], level: float, num_resamples: int
             name: 1000 * math.fsum(seconds) / len(seconds) if seconds else None
             for name, seconds in parts.items()
         }
-        error, recording = known(lambda onset: 1000 * onset.error_s)
+        error, recording = known("error_s", 1000)
         if len(error):
             error_ms = {
                 "median": bootstrap.quantile(error, recording, 0.5),
                 "sd": bootstrap.deviation(error, recording),
                 "mean_abs": bootstrap.mean(error.abs(), recording),
             }
+    shares = {name: bootstrap.share(sums[name], sums["onsets"]) for name in _OUTCOMES}
     return {
-        "num_recordings": len(names),
-        "num_onsets": int(sum(onsets)),
-        **{f"num_{outcome}": int(sum(counts)) for outcome, counts in outcomes.items()},
-        "num_false_alarms": int(sum(false)),
-        "quiet_hours": sum(hours),
-        **{outcome: bootstrap.share(counts, onsets) for outcome, counts in outcomes.items()},
-        "alarms_per_slip": bootstrap.ratio(alarms, onsets),
-        "false_alarms_per_minute": bootstrap.rate(false, hours, per=1 / 60),
-        "false_alarms_per_hour": bootstrap.rate(false, hours),
+        "num_recordings": len(places),
+        **{f"num_{name}": int(sum(sums[name])) for name in ("onsets", *_OUTCOMES)},
+        "num_false_alarms": int(sum(sums["false"])),
+        "quiet_hours": sum(sums["hours"]),
+        **shares,
+        "alarms_per_slip": bootstrap.ratio(sums["alarms"], sums["onsets"]),
+        "false_alarms_per_minute": bootstrap.rate(sums["false"], sums["hours"], per=1 / 60),
+        "false_alarms_per_hour": bootstrap.rate(sums["false"], sums["hours"]),
         "delay_ms": delay_ms,
-        "delay_first_ms": spread(lambda onset: 1000 * onset.delay_first_s),
-        "slid_mm": spread(lambda onset: onset.slid_mm),
+        "delay_first_ms": spread("delay_first_s"),
+        "slid_mm": spread("slid_mm", 1),
         "latency_ms": latency_ms,
         "onset_error_ms": error_ms,
     }

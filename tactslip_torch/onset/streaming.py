@@ -93,7 +93,7 @@ class StreamingDetector:
         self._whole = self._before + pool.bin_samples + detector.context_after
         self._first = pool.bin_samples + detector.look_ahead
         parts = (pool.sample_rate_hz, pool.bin_samples, detector.look_ahead, self._frame)
-        self._decider = Decider(self.settings, *parts)
+        self._decider = Decider(self.settings, *parts, end_s=self._clock.end_s)
         self._start()
 
     def __repr__(self) -> str:
@@ -184,7 +184,7 @@ class StreamingDetector:
             future = past_of(ends, detector.channel_filter, detector.needed_index.tolist())
             if self._onset is None:  # else every decision is there with its last sample
                 self._append(future.flip(-1)[:, : detector.context_after].numpy())
-                decisions = self._timed(self._decide(last_start))
+                decisions = self._decide(last_start)
         self._start()
         return decisions
 
@@ -207,23 +207,19 @@ class StreamingDetector:
 
     def _read(self, samples: ArrayLike | Tensor) -> Array:
         """Samples ``[n, C]`` as a copy ``[C, n]`` in the stream's dtype."""
-        if not isinstance(samples, Tensor):
-            array = np.asarray(samples)
-            self._check(array.shape, array.dtype, array.dtype.kind == "f")
-            with np.errstate(over="ignore"):  # beyond float32 is Inf, which is flagged
-                return np.array(array.T, _NUMPY[self.dtype], order="C")
-        self._check(tuple(samples.shape), samples.dtype, samples.is_floating_point())
-        return samples.detach().T.to("cpu", self.dtype, copy=True).numpy()
-
-    def _check(self, shape: tuple[int, ...], dtype: object, is_floating: bool) -> None:
-        names = self.detector.pool.hand.names
-        if len(shape) != 2 or shape[1] != len(names):
+        if isinstance(samples, Tensor):  # NumPy does not know all of their dtypes
+            kind = self.dtype if samples.is_floating_point() else samples.dtype
+            samples = samples.detach().to("cpu", kind).numpy()
+        array, names = np.asarray(samples), self.detector.pool.hand.names
+        if array.ndim != 2 or array.shape[1] != len(names):
             raise ValueError(
                 f"expected samples [n, {len(names)}] (instants, channels {names[0]} to "
-                f"{names[-1]}), got {shape}"
+                f"{names[-1]}), got {array.shape}"
             )
-        if not is_floating:
-            raise ValueError(f"expected samples in volts, floating numbers, got {dtype}")
+        if array.dtype.kind != "f":
+            raise ValueError(f"expected samples in volts, floating numbers, got {array.dtype}")
+        with np.errstate(over="ignore"):  # beyond float32 is Inf, which is flagged
+            return np.array(array.T, _NUMPY[self.dtype], order="C")
 
     def _begin_anew(self, time_s: float) -> Decisions:
         """Another stream behind a gap."""
@@ -252,12 +248,12 @@ class StreamingDetector:
         if num_samples >= max(start + self._first, self._frame):
             bins = self._decide(num_samples - self._first)
         if self._onset is None:
-            return self._timed(bins)
+            return bins
         with torch.no_grad():
             score = self._onset.push(torch.from_numpy(x), self._mask)
         if not len(score) and not len(bins.number):
             return self._nothing
-        return self._timed(self._decider.join(bins, score))
+        return self._decider.join(bins, score)
 
     def _append(self, x: Array) -> None:
         self._held = np.concatenate([self._held, x], -1, dtype=self._held.dtype)
@@ -301,19 +297,6 @@ class StreamingDetector:
         self._number += count
         self._drop()
         return decisions
-
-    def _timed(self, decisions: Decisions) -> Decisions:
-        """The same by the times of the samples, and no earlier than the first frame."""
-        if not self._clock.is_timed and self._frame <= self._first:
-            return decisions
-        number, frame = decisions.number.numpy(), self._frame
-        if (onset := self.settings.onset) is None:
-            samples = (number * self.settings.hop_samples + self._first).clip(min=frame)
-        else:
-            samples = (number + 1) * onset.evidence.hop_samples
-        available_s = torch.from_numpy(self._clock.end_s(samples))
-        onset_s = available_s - (decisions.available_s - decisions.onset_s)
-        return decisions._replace(available_s=available_s, onset_s=onset_s)
 
 
 class SampleClock:
