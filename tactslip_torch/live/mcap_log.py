@@ -221,10 +221,7 @@ def foxglove_layout(hand: HandLayout, settings: AlarmSettings, units: str = "V")
     panels["Plot!probability"] = _plot(
         "Probability of slip", [("/slip/probability.data", "probability")], least=0, most=1
     )
-    scores = {"statistic": settings.threshold}
-    if settings.onset is not None:
-        scores["onset_score"] = settings.onset.threshold
-    for name, threshold in scores.items():
+    for name, threshold in settings.thresholds.items():
         lines = [(f"/slip/{name}.data", name.replace("_", " "))]
         lines += [(repr(float(threshold)), "threshold")] if math.isfinite(threshold) else []
         panels[f"Plot!{name}"] = _plot(name.replace("_", " ").capitalize(), lines)

@@ -85,9 +85,7 @@ class RerunLog(FileSink):
         super().__init__(path, ".rrd", detector.pool.sample_rate_hz, is_live=is_live)
         self._rr: Any = needs("rerun", "writing .rrd", "rerun")
         self._detector, self._hand = detector, detector.pool.hand
-        self._thresholds = {"statistic": settings.threshold}
-        if settings.onset is not None:
-            self._thresholds["onset_score"] = settings.onset.threshold
+        self._thresholds = settings.thresholds
         self._waiting: list[tuple[Array, Array]] = []  # times and samples
         self._last_sent_s = -math.inf
         self._whole = detector.context_before + detector.pool.bin_samples + detector.look_ahead

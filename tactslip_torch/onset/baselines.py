@@ -9,7 +9,8 @@ threshold on it is one on the amplitude, and calibration and sequential rules ta
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal, get_args
@@ -64,13 +65,7 @@ def film_band_power(
     Raises:
         ValueError: if there is no film, or no line of a bin's spectrum lies in the band.
     """
-    lines = _band_lines(bins.shape[-1], float(sample_rate_hz))
-
-    def amplitude(x: Tensor) -> Tensor:
-        power = (x @ lines.to(x).T).square().sum(-1)
-        return power.clamp(min=torch.finfo(x.dtype).tiny).sqrt()
-
-    return _log_of_largest(bins, films, amplitude)
+    return _log_of_largest(bins, films, _band_lines(bins.shape[-1], float(sample_rate_hz)), 2)
 
 
 def largest_detail(
@@ -95,12 +90,7 @@ def largest_detail(
         ValueError: if there is no film, or bins are too short for so many levels.
     """
     details = branch_matrix(bins.shape[-1], wavelet, level)[1::2].flatten(0, 1)  # D1, D2, ..
-
-    def amplitude(x: Tensor) -> Tensor:
-        branches = x @ details.to(x).T  # all samples of all levels
-        return torch.maximum(branches.amax(-1), -branches.amin(-1))
-
-    return _log_of_largest(bins, films, amplitude)
+    return _log_of_largest(bins, films, details, math.inf)
 
 
 @dataclass(frozen=True)
@@ -173,12 +163,11 @@ class BaselineDetector:
 
 
 def _log_of_largest(
-    bins: Tensor, films: Sequence[int] | Tensor, amplitude: Callable[[Tensor], Tensor]
+    bins: Tensor, films: Sequence[int] | Tensor, rows: Tensor, order: float
 ) -> Tensor:
-    """Log of the largest amplitude among films.
+    """Log of the largest amplitude among films: the norm of an order of rows times the signal.
 
-    Amplitudes pass over a constant and are in proportion to the signal, which is brought to where
-    squares neither overflow nor vanish.
+    Rows pass over a constant; the signal is brought to where squares neither overflow nor vanish.
     """
     x = bins[..., torch.as_tensor(films, device=bins.device), :] if len(films) else bins[..., :0, :]
     if not x.shape[-2]:
@@ -186,7 +175,8 @@ def _log_of_largest(
     magnitude = torch.maximum(x.amax(-1), -x.amin(-1)).detach()
     unit = power_of_two_below(magnitude)
     x = x / unit[..., None]
-    largest = amplitude(x - x[..., :1].detach()) * unit  # exact on a large constant
+    products = (x - x[..., :1].detach()) @ rows.to(x).T  # exact on a large constant
+    largest = torch.linalg.vector_norm(products, order, -1) * unit
     largest = torch.where(magnitude.isfinite(), largest, torch.nan)
     return largest.amax(-1).clamp(min=FLOOR_V).log()
 

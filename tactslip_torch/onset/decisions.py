@@ -108,6 +108,12 @@ class AlarmSettings:
         """Distance of two decisions: that of the onset classifier, if there is one."""
         return self.hop_samples if self.onset is None else self.onset.evidence.hop_samples
 
+    @property
+    def thresholds(self) -> dict[str, float]:
+        """That of the statistic and, with an onset classifier, of its score."""
+        of_onset = {} if self.onset is None else {"onset_score": self.onset.threshold}
+        return {"statistic": self.threshold} | of_onset
+
     def decisions(self, seconds: float, sample_rate_hz: float) -> int:
         """A length of time in decisions, rounded up."""
         return -(-round(seconds * sample_rate_hz) // self.decision_samples)

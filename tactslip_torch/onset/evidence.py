@@ -53,6 +53,8 @@ STEPS_S = (
 """Length of the latest stretch, that of the one it is compared with, and how far back it ends."""
 MEAN_HOPS = 3
 """Over which the score is averaged: a knock is over sooner than a slip begins."""
+_NUMBERS: Mapping[str, Any] = {"hop_samples": int, "mains_hz": float, "comb_periods": int}
+_KNEES = ("fast_knee", "slow_knee")
 _LEAST_RISE = 1e-6  # of a floor over that of silence; below, a channel is stuck
 
 
@@ -180,11 +182,6 @@ class OnsetEvidence:
             row[len(row) - back - length : len(row) - back] -= 1 / length
         return torch.from_numpy(matrix)
 
-    @cached_property
-    def _power_of_silence(self) -> Array:
-        """Of each filter, ``[B]``."""
-        return np.square(self.fast_knee)
-
     def blocks(self, samples: Tensor) -> Blocks:
         """Of every whole block that has its context.
 
@@ -200,7 +197,7 @@ class OnsetEvidence:
         frames = x[list(self.hand.fast)].unfold(-1, context + hop, hop)  # [F, k, context + hop]
         heard = (frames - frames[..., :1]) @ torch.from_numpy(self.filter_matrix).flatten(1)
         square = heard.unflatten(-1, (len(self.fast_knee), hop)).square().mean(-1)  # [F, k, B]
-        power = square.mT + torch.from_numpy(self._power_of_silence)[:, None]
+        power = square.mT + torch.from_numpy(np.square(self.fast_knee))[:, None]
         mean = x[list(self.hand.slow), context:].unfold(-1, hop, hop).mean(-1)
         return Blocks(power, mean)
 
@@ -261,26 +258,21 @@ class OnsetEvidence:
         rises = loudness - floor.unsqueeze(1)
         is_finite = rises.sum(1).sum(1).isfinite()
         in_use = ((floor - silence).amax(1) > _LEAST_RISE) & is_finite & fast  # [k, F]
-        rows = in_use.unsqueeze(1).unsqueeze(1)
-        num = rows.type_as(level).sum(-1).clamp(min=1.0)
-        columns = _over_channels(rises, rows, num)[: 3 if len(self.hand.fast) > 1 else 1]
+        columns = _over_channels(rises, in_use, len(self.hand.fast))
         columns = [torch.cat(columns, 1).flatten(-2)]
         if num_slow := len(self.hand.slow):
             knee = torch.tensor(self.slow_knee, dtype=torch.float64)[:, None]
             size = (steps.abs() + knee).log()
             way = steps.sign() * (size - knee.log())
             both = torch.cat([size.unsqueeze(1), way.unsqueeze(1)], 1)  # [k, 2, D, S]
-            told = size.sum(1).isfinite() & slow
-            rows = told.unsqueeze(1).unsqueeze(1)
-            num = rows.type_as(size).sum(-1).clamp(min=1.0)
-            pools = _over_channels(both, rows, num)[: 3 if num_slow > 1 else 1]
+            pools = _over_channels(both, size.sum(1).isfinite() & slow, num_slow)
             columns.append(torch.cat(pools, -1).flatten(-2))
         return torch.cat(columns, -1), in_use.any(-1)
 
     def to_dict(self) -> dict[str, Any]:
         """All but the hand and the sample rate, which are the detector's."""
-        plain = {name: getattr(self, name) for name in ("hop_samples", "mains_hz", "comb_periods")}
-        return plain | {"fast_knee": list(self.fast_knee), "slow_knee": list(self.slow_knee)}
+        plain = {name: getattr(self, name) for name in _NUMBERS}
+        return plain | {name: list(getattr(self, name)) for name in _KNEES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,16 +340,9 @@ class OnsetClassifier:
         def tensor(name: str) -> Tensor:
             return torch.tensor(plain[name], dtype=torch.float64)
 
-        evidence = OnsetEvidence(
-            hand,
-            sample_rate_hz,
-            int(plain["hop_samples"]),
-            tuple(map(float, plain["fast_knee"])),
-            tuple(map(float, plain["slow_knee"])),
-            float(plain["mains_hz"]),
-            int(plain["comb_periods"]),
-        )
-        num = len(plain["linear"])
+        numbers = {name: kind(plain[name]) for name, kind in _NUMBERS.items()}
+        numbers |= {name: tuple(map(float, plain[name])) for name in _KNEES}
+        evidence, num = OnsetEvidence(hand, sample_rate_hz, **numbers), len(plain["linear"])
         quadratic = tensor("quadratic") if plain["quadratic"] else torch.zeros(0, 0).double()
         head = QuadraticForm(quadratic, tensor("linear"), tensor("constant"))
         scaler = FeatureScaler(tensor("minimum"), tensor("maximum"))
@@ -466,11 +451,16 @@ def _engine_of(classifier: OnsetClassifier) -> OnsetEngine:
     )
 
 
-def _over_channels(values: Tensor, in_use: Tensor, num: Tensor) -> list[Tensor]:
-    """Over the last axis, of the entries in use, mean, largest and smallest; 0 of none."""
-    mean = torch.where(in_use, values, 0.0).sum(-1) / num
-    known = torch.where(in_use, values, mean.unsqueeze(-1))
-    return [mean, known.amax(-1), known.amin(-1)]
+def _over_channels(values: Tensor, in_use: Tensor, num_channels: int) -> list[Tensor]:
+    """Mean, largest and smallest over channels in use, 0 of none; of one channel itself alone.
+
+    Shape:
+        - values: ``[k, *, *, C]``; in_use: ``[k, C]``; output: ``[k, *, *]`` each
+    """
+    rows = in_use.unsqueeze(1).unsqueeze(1)
+    mean = torch.where(rows, values, 0.0).sum(-1) / rows.type_as(values).sum(-1).clamp(min=1.0)
+    known = torch.where(rows, values, mean.unsqueeze(-1))
+    return [mean, known.amax(-1), known.amin(-1)] if num_channels > 1 else [mean]
 
 
 def _mean_of_hops(score: Array) -> Array:
