@@ -214,8 +214,8 @@ def surface(mu_s, mu_ratio):
 REFUSED = [
     (lambda: Scene("M7"), r"unknown material 'M7'; known are M1, .*wood"),
     (scene(fidelity="lugre"), r"unknown fidelity 'lugre'; known are kinematic, bristles$"),
-    (scene(sample_rate_hz=0), r"sample_rate_hz must be positive and finite, got 0"),
-    (scene(tail_s=-1), r"tail_s must be finite and not negative, got -1"),
+    (scene(sample_rate_hz=0), r"sample_rate_hz must be a positive finite number, got 0"),
+    (scene(tail_s=-1), r"tail_s must be a finite number of at least 0, got -1"),
     (scene(strokes=()), r"a scene needs a stroke, or a tail_s to rest for; it has neither"),
     (scene(strokes=(Stroke(9, 2),)), r"stroke 1 of 2 mm is too short to slip surely"),
     (scene(contact=Contact(mu_k=2.0)), r"mu_k must not exceed mu_s, got 2\.0 above M1's 0\.8"),
@@ -273,8 +273,11 @@ REFUSED = [
     (recording(dtype=torch.int64), r"dtype must be floating, got torch\.int64"),
     (lambda: paper_scenes(burst_rate=1), r"unknown override burst_rate; a scene has .*strokes"),
     (lambda: paper_scenes(cycles=0), r"cycles must be a whole number of at least 1, got 0"),
-    (lambda: SimulatedRecordings(sessions=0), r"data\.sessions must be at least 1, got 0"),
-    (lambda: simulate_many([], at_once=0), r"at_once must be at least 1, got 0"),
+    (
+        lambda: SimulatedRecordings(sessions=0),
+        r"data\.sessions must be a positive .*, got 0",
+    ),
+    (lambda: simulate_many([], at_once=0), r"at_once must be a positive whole number, got 0"),
     (lambda: simulate_many([], windows=[None]), r"expected windows of each of 0 scenes, got 1"),
     (
         lambda: extreme_bins("quiet", (100,), torch.Generator()),

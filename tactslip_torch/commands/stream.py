@@ -125,10 +125,9 @@ def _page(
     config: DictConfig, watching: StreamingDetector, source: Source, counts: Counts
 ) -> PageServer:
     """The page, served."""
-    port = config.port
+    port, place = config.port, hosts_dir()
     if type(port) is not int or not 0 <= port < 1 << 16:
         raise ValueError(f"port must be a whole number from 0 to 65535, got {port!r}")
-    place = hosts_dir()
     return PageServer(
         {"": place / "web", "node": place / "node"},
         page_facts(watching.detector, watching.settings),

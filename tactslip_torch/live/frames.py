@@ -93,10 +93,9 @@ class Frames:
         }
         for key, known in choices.items():
             check_choice(f"frame.{key}", getattr(self, key), known)
-        if type(self.skip) is not int or self.skip < 0:
-            raise ValueError(f"frame.skip must be a number of bytes, got {self.skip!r}")
-        if self.length is not None and (type(self.length) is not int or self.length < 1):
-            raise ValueError(f"frame.length must be a number of bytes, got {self.length!r}")
+        check_number("frame.skip", self.skip, least=0, whole=True)
+        if self.length is not None:
+            check_number("frame.length", self.length, whole=True)
         if self.header is not None and not self.start:
             raise ValueError(
                 f"frame.header must be bytes in hexadecimal and in quotes, such as 'AA 55', "

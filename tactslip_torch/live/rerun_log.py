@@ -127,9 +127,8 @@ class RerunLog(FileSink):
         states = torch.stack([decisions.is_on, decisions.is_valid], 1).double().numpy()
         self._send("slip/state", times_s, states)
         for alarm in decisions.alarms:
-            self._log(
-                "slip/events", alarm.alarm_s, self._rr.TextLog(alarm_text(alarm), level="WARN")
-            )
+            entry = self._rr.TextLog(alarm_text(alarm), level="WARN")
+            self._log("slip/events", alarm.alarm_s, entry)
 
     def event(self, kind: str, text: str) -> None:
         """Log it at the time of the last sample."""

@@ -21,6 +21,7 @@ from torch import Tensor
 from tactslip_torch.features.ops import is_nowhere, power_of_two_below
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.missing_channels import Prediction
+from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.wavelet import (
     Wavelet,
@@ -111,10 +112,7 @@ class BaselineDetector:
     channel_filter: ChannelFilter
 
     def __post_init__(self) -> None:
-        if self.name not in get_args(BaselineName):
-            raise ValueError(
-                f"no baseline {self.name!r}; take one of {', '.join(get_args(BaselineName))}"
-            )
+        check_choice("baseline", self.name, get_args(BaselineName))
         if not self.pool.hand.fast:
             raise ValueError(_NO_FILM)
 

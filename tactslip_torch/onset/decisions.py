@@ -32,6 +32,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import Prediction
 from tactslip_torch.onset.evidence import OnsetClassifier
 from tactslip_torch.onset.rules import NEUTRAL, NOTHING_YET, Latch, Rule, latch, rule_from_dict
+from tactslip_torch.runtime import check_number
 from tactslip_torch.signals.filtering import ChannelFilter, extended
 
 KEY = "alarm"
@@ -79,20 +80,18 @@ class AlarmSettings:
     onset: OnsetClassifier | None = None
 
     def __post_init__(self) -> None:
-        if self.hop_samples < 1:
-            raise ValueError(f"hop_samples must be at least 1, got {self.hop_samples}")
+        check_number("hop_samples", self.hop_samples, whole=True)
         if not 0 < self.slip_share < 1:
             raise ValueError(f"slip_share must lie between 0 and 1, got {self.slip_share}")
-        if self.target_per_hour is not None and not self.target_per_hour > 0:
-            raise ValueError(f"target_per_hour must be positive, got {self.target_per_hour}")
+        if self.target_per_hour is not None:
+            check_number("target_per_hour", self.target_per_hour)
         if math.isfinite(self.threshold) and self.threshold > self.rule.ceiling:
             raise ValueError(
                 f"threshold {self.threshold:g} lies above {self.rule.ceiling:g}, the most that the "
                 f"statistic of {self.rule.name} can be: no alarm would ever come; lower it"
             )
         for name in ("rearm_s", "refractory_s"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+            check_number(name, getattr(self, name), least=0)
 
     def __repr__(self) -> str:
         rate = self.target_per_hour

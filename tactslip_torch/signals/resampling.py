@@ -68,9 +68,7 @@ def resample(samples: Tensor, from_hz: float, to_hz: float) -> Tensor:
     from scipy.signal import resample_poly  # takes half a second to import
 
     resampled = resample_poly(padded, up, down, axis=-1)
-    resampled = (
-        resampled[:, blocks * up : blocks * up + num] + offset
-    )  # which would ripple a little
+    resampled = resampled[:, blocks * up :][:, :num] + offset  # which would ripple a little
     for row in np.flatnonzero(~is_good.all(-1)):
         resampled[row, _is_reached(~is_good[row], num, up, down)] = np.nan
     return torch.from_numpy(resampled).to(samples)

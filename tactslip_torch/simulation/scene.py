@@ -24,6 +24,7 @@ from typing import Any, Literal, cast, get_args
 import numpy as np
 
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.runtime import check_number
 from tactslip_torch.simulation._blocks import Array, Grid, Key
 
 # --- calibrated parameters ----------------------------------------------------------------------
@@ -691,11 +692,8 @@ class Scene:
             if value not in known:
                 raise ValueError(f"unknown {what} {value!r}; known are {', '.join(known)}")
         for name in ("sample_rate_hz", "acceleration_m_s2"):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise ValueError(f"{name} must be positive and finite, got {value}")
-        if not 0 <= self.tail_s < math.inf:
-            raise ValueError(f"tail_s must be finite and not negative, got {self.tail_s}")
+            check_number(name, getattr(self, name))
+        check_number("tail_s", self.tail_s, least=0)
         if not self.strokes and self.tail_s == 0:
             raise ValueError("a scene needs a stroke, or a tail_s to rest for; it has neither")
         longest_mm = MAX_PRESLIDING_FACTOR * self.contact.presliding_mm[1]
@@ -819,8 +817,7 @@ def paper_scenes(
         >>> scenes[0].disturbances.burst_rate_hz
         0.1
     """
-    if not isinstance(cycles, int) or cycles < 1:
-        raise ValueError(f"cycles must be a whole number of at least 1, got {cycles!r}")
+    check_number("cycles", cycles, least=1, whole=True)
     values = _grouped(overrides)
     known = {f.name for f in fields(Scene)} - {"material", "hand", "seed", "cycle"}
     if unknown := sorted(set(values) - known):

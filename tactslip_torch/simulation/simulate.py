@@ -27,6 +27,7 @@ from tactslip_torch.data.recording import Recording, RecordingId, Stretch
 from tactslip_torch.data.recording import Timeline as _Timeline
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.native import BackendName
+from tactslip_torch.runtime import check_number
 from tactslip_torch.simulation._blocks import Array, Grid, generator
 from tactslip_torch.simulation._bristles import integrator
 from tactslip_torch.simulation._contact import (
@@ -163,8 +164,7 @@ def simulate_many(
         [3, 3]
     """
     scenes = list(scenes)
-    if at_once < 1:
-        raise ValueError(f"at_once must be at least 1, got {at_once}")
+    check_number("at_once", at_once, whole=True)
     if windows is not None and len(windows) != len(scenes):
         raise ValueError(f"expected windows of each of {len(scenes)} scenes, got {len(windows)}")
     wanted = [None] * len(scenes) if windows is None else list(windows)
@@ -349,8 +349,7 @@ class SimulatedRecordings:
         extra_scenes: Mapping[str, Mapping[str, Any]] | None = None,
         sessions: int = 1,
     ) -> None:
-        if sessions < 1:
-            raise ValueError(f"data.sessions must be at least 1, got {sessions}")
+        check_number("data.sessions", sessions, whole=True)
         self.hand = HandLayout.paper24() if channels is None else HandLayout.from_rows(channels)
         base = {"fidelity": fidelity, "name": PAPER, **(scene or {})}
         kinds = [{**base, "cycles": cycles}]
