@@ -179,9 +179,8 @@ template <class T> struct Describe {
       auto is_near = sorted[i] - sorted[i - 1] <= tolerance;
       start = is_near ? start : sorted[i];
       run = is_near ? run + (T)1 : V{};
-      auto is_longer = run > longest;
-      best = is_longer ? start : best;
-      longest = is_longer ? run : longest;
+      best = run > longest ? start : best;
+      longest = larger(longest, run);
     }
     return best;
   }
@@ -227,6 +226,8 @@ template <class T> struct Describe {
     V total = {};
     total += (T)(n * gain[0]);
     constexpr int together = VECTOR_BYTES / W;  // samples in a vector of bytes
+    uint8_t ones[2 * VECTOR_BYTES] = {};        // and zeros behind them
+    memset(ones, 255, VECTOR_BYTES);
     for (int64_t r = 1; r < n; ++r) {
       V count = {};
       for (int64_t from = r; from < n; from += 248) {  // sums of bytes stay below 256
@@ -235,11 +236,8 @@ template <class T> struct Describe {
         int64_t i = from;
         for (; i + together <= to; i += together)
           equal -= (Bytes)(load(levels + i * W) == load(levels + (i - r) * W));
-        if (i < to) {
-          Bytes rest = (Bytes)(load(levels + i * W) == load(levels + (i - r) * W));
-          memset((uint8_t*)&rest + (to - i) * W, 0, VECTOR_BYTES - (to - i) * W);
-          equal -= rest;
-        }
+        Bytes rest = (Bytes)(load(levels + i * W) == load(levels + (i - r) * W));
+        equal -= rest & load(ones + VECTOR_BYTES - (to - i) * W);
         fold<VECTOR_BYTES>((uint8_t*)&equal);
         Few few;
         memcpy(&few, &equal, W);
@@ -317,6 +315,7 @@ template <class T> struct Group : Describe<T> {
   V *raw, *d, *few, *lines, *total;
   uint8_t* levels;
   V other;             // sum of squares of raw
+  D unknown[H];       // NaN for what is broken, if that is not told otherwise, or 0
   D is_constant[H], centre[H];
   D values[MAX_BRANCHES][H];
   uint32_t need[2 * MAX_BRANCHES + 1];
@@ -366,20 +365,8 @@ template <class T> struct Group : Describe<T> {
       const X* from = (const X*)bins.samples + bin[k] * bins.bin_stride +
                       channel[k] * bins.channel_stride + filter.start;
       int64_t span = n + filter.length - 1;
-      double most = 0;
-      bool finite = true;
-      for (int64_t i = 0; i < span; ++i) {
-        double size = fabs((double)from[i]);
-        finite &= size <= LARGEST;
-        most = size > most ? size : most;
-      }
-      bool usual = most == 0 || (SMALLEST_USUAL <= most && most <= LARGEST_USUAL);
-      is_broken[k] = !finite;
-      loudest[k] = most;
-      bins.is_odd[bin[k]] |= finite && !usual;
-      bool is_read = finite && usual;
       double* to = (double*)window[k / DL] + k % DL;
-      for (int64_t i = 0; i < span; ++i) to[i * DL] = is_read ? (double)from[i] : 0;
+      for (int64_t i = 0; i < span; ++i) to[i * DL] = (double)from[i];
       for (int64_t i = span; i < n + most_taps - 1; ++i) to[i * DL] = 0;
       to = (double*)weights[k / DL] + k % DL;
       for (int64_t i = 0; i < most_taps; ++i)
@@ -387,6 +374,7 @@ template <class T> struct Group : Describe<T> {
       taps = filter.length > taps ? filter.length : taps;
     }
     for (int h = 0; h < H; ++h) {
+      settle(h);
       convolve(window[h], weights[h], y[h], taps);
       Extent e = extent(y[h], n);
       span[h] = e.high - e.low;
@@ -397,6 +385,28 @@ template <class T> struct Group : Describe<T> {
       for (int64_t i = 0; i < n; ++i) y[h][i] -= first[h];
     }
     if (bins.is_missing) note_channels();
+  }
+
+  // The size of what was read; lanes that are broken or odd become zeros.
+  void settle(int h) {
+    D most = {}, finite = D{} + 1;
+    for (int64_t i = 0; i < n + most_taps - 1; ++i) {
+      D size = magnitude(window[h][i]);
+      finite = size <= LARGEST ? finite : D{};
+      most = larger(size, most);
+    }
+    auto is_usual = (most == 0) | ((SMALLEST_USUAL <= most) & (most <= LARGEST_USUAL));
+    auto is_read = (finite > 0) & is_usual;
+    if (any(~is_read))
+      for (int64_t i = 0; i < n + most_taps - 1; ++i)
+        window[h][i] = is_read ? window[h][i] : D{};
+    for (int k = 0; k < DL; ++k) {
+      int64_t lane = h * DL + k;
+      is_broken[lane] = !(finite[k] > 0);
+      loudest[lane] = most[k];
+      bins.is_odd[bin[lane]] |= !is_broken[lane] && !is_usual[k];
+    }
+    unknown[h] = bins.is_missing ? D{} : finite > 0 ? D{} : D{} + (double)NAN;
   }
 
   void convolve(const D* x, const D* weight, D* out, int64_t taps) {
@@ -422,18 +432,25 @@ template <class T> struct Group : Describe<T> {
 
   // Features of the group's row to their columns.
   void write(int64_t row_number) {
-    for (int k = 0; k < num; ++k) {
-      int64_t at = channel[k] * (2 * num_branches + 1) + row_number;
-      int64_t base = (bin[k] - first_bin) * plan.num_features;
-      for (int64_t w = plan.first[at]; w < plan.first[at + 1]; ++w) {
-        double v = ((const double*)values[plan.descriptor[w]])[k];
-        v = clamped(v, limit);
-        v = is_broken[k] && !bins.is_missing ? (double)NAN : v;
-        if (out_is_float)
-          ((float*)out)[base + plan.column[w]] = (float)v;
-        else
-          ((double*)out)[base + plan.column[w]] = v;
-      }
+    for (int i = 0; i < MAX_BRANCHES; ++i)
+      for (int h = 0; h < H && need[row_number] >> i & 1; ++h)
+        values[i][h] = clamped(values[i][h], limit) + unknown[h];
+    for (int k = 0, end; k < num; k = end) {  // lanes of one channel, whose bins follow each other
+      for (end = k; end < num && channel[end] == channel[k];) ++end;
+      if (out_is_float)
+        write((float*)out, row_number, k, end);
+      else
+        write((double*)out, row_number, k, end);
+    }
+  }
+
+  template <class X> void write(X* to, int64_t row_number, int start, int end) {
+    int64_t at = channel[start] * (2 * num_branches + 1) + row_number;
+    to += (bin[start] - first_bin) * plan.num_features;
+    for (int64_t w = plan.first[at]; w < plan.first[at + 1]; ++w) {
+      const double* from = (const double*)values[plan.descriptor[w]];
+      X* next = to + plan.column[w];
+      for (int k = start; k < end; ++k, next += plan.num_features) *next = (X)from[k];
     }
   }
 
