@@ -214,15 +214,16 @@ template <class T> struct Describe {
   static D energy(const Half& s) { return s.energy; }
   // Levels of sorted values as bytes; how many are equal to the one r places before is how often a
   // cell holds more than r, and gain[r] what that adds. `levels` has VECTOR_BYTES to spare.
-  static V entropy(const V* sorted, const double* gain, uint8_t* levels, int64_t n) {
+  static V entropy(
+      const V* sorted, const double* gain, int32_t* wholes, uint8_t* levels, int64_t n) {
     constexpr T half = 0.5 + (sizeof(T) == 4 ? 0x1p-13 : 1e-6);
     V last = {}, low = sorted[0], factor = (T)LEVELS / (sorted[n - 1] - low);
     for (int64_t i = 0; i < n; ++i) {
       V level = (sorted[i] - low) * factor + half;
       last = level < (T)LEVELS ? level : last;  // the second highest level joins the highest
-      Whole whole = __builtin_convertvector(last, Whole);
-      *(Few*)(levels + i * W) = __builtin_convertvector(whole, Few);
+      *(Whole*)(wholes + i * W) = __builtin_convertvector(last, Whole);
     }
+    for (int64_t i = 0; i < n * W; ++i) levels[i] = (uint8_t)wholes[i];
     V total = {};
     total += (T)(n * gain[0]);
     constexpr int together = VECTOR_BYTES / W;  // samples in a vector of bytes
@@ -258,9 +259,7 @@ template <class T> struct Describe {
     D value = s.both / root(s.second * s.other);
     return (s.span > 0) & (s.other > 0) ? value : D{};
   }
-  static V spectral_centroid(const V* amplitude, V total, const double* frequency_hz, int64_t n) {
-    V moment = {};
-    for (int64_t i = 0; i < n; ++i) moment += amplitude[i] * (T)frequency_hz[i];
+  static V spectral_centroid(V moment, V total) {
     V value = moment / total;
     return total > 0 ? value : V{};
   }
@@ -313,6 +312,7 @@ template <class T> struct Group : Describe<T> {
   D *window[H], *weights[H];  // samples that the filter takes in, and its weights
   D *y[H], *approximation[H], *coefficients[H], *row[H];
   V *raw, *d, *few, *lines, *total;
+  int32_t* wholes;
   uint8_t* levels;
   V other;             // sum of squares of raw
   D unknown[H];       // NaN for what is broken, if that is not told otherwise, or 0
@@ -352,6 +352,7 @@ template <class T> struct Group : Describe<T> {
     d = (V*)take(most * sizeof(V));
     lines = (V*)take(spectrum * sizeof(V));
     total = (V*)take(spectrum * sizeof(V));
+    wholes = (int32_t*)take(most * W * sizeof(int32_t));
     levels = (uint8_t*)take(most * W + VECTOR_BYTES);
     return at - start;
   }
@@ -486,7 +487,7 @@ template <class T> struct Group : Describe<T> {
     order[0] = Base::median(d, count);
     if (wanted & 1u << MODE) order[1] = Base::mode(d, tolerance, count);
     order[2] = Base::iqr(d, count);
-    if (wanted & 1u << ENTROPY) order[3] = Base::entropy(d, gain, levels, count);
+    if (wanted & 1u << ENTROPY) order[3] = Base::entropy(d, gain, wholes, levels, count);
     for (int h = 0; h < H; ++h) {
       D centre = halves[h].centre, span = halves[h].span;
       values[MEDIAN][h] = centre + span * get(order + 0, h);
@@ -566,17 +567,18 @@ template <class T> struct Group : Describe<T> {
     }
     for (int h = 0; h < H; ++h) energies[h] = get(&energy, h);
     if (!wanted) return;
-    V inverse = 1 / most, low = V{} + 1, high = {}, sum = {};
+    V inverse = 1 / most, low = V{} + 1, high = {}, sum = {}, moment = {};
     inverse = most > 0 ? inverse : V{};
     for (int64_t i = 0; i < count; ++i) {
       V amplitude = root(d[i] * inverse);
       d[i] = amplitude;
       sum += amplitude;
+      moment += amplitude * (T)plan.frequency_hz[i];
       low = smaller(low, amplitude);
       high = larger(high, amplitude);
     }
     if (wanted & WEIGHTED) {
-      V centroid = Base::spectral_centroid(d, sum, plan.frequency_hz, count), spread = {};
+      V centroid = Base::spectral_centroid(moment, sum), spread = {};
       if (wanted & 1u << SPECTRAL_SPREAD)
         spread = Base::spectral_spread(d, sum, centroid, plan.frequency_hz, count);
       for (int h = 0; h < H; ++h) {
