@@ -28,6 +28,7 @@ from torch import Tensor
 from tactslip_torch.features.descriptors import (
     COMMON_DESCRIPTORS,
     DESCRIPTORS,
+    SORTED,
     SPECTRUM_DESCRIPTORS,
     STEPPED,
     TIME_DESCRIPTORS,
@@ -192,8 +193,9 @@ _LEAST_LENGTH = 16 * torch.finfo(torch.float64).eps / 0.35
 """Of a row less its mean, as a part of its bin's magnitude; below it is rounding. A span of 16 eps:
 that of 100 centred values of length 1 lies between .2 (two levels) and 1.41."""
 _CHUNK_BINS = 32  # what fits the cache of a processor
-_OWN_ROWS = ("median", "mode", "iqr", "entropy", "correlation", "spectral_spread")
-"""Descriptors of so much work that they are taken of the rows that want them alone."""
+_OWN_ROWS = (*SORTED, "entropy", "correlation", "spectral_spread")
+"""Descriptors of so much work that they are taken of the rows that want them alone, those that share
+sorted values of the rows that want any of them."""
 
 
 @dataclass(frozen=True)
@@ -384,8 +386,8 @@ class Bank:
         self._sets: list[_RowSet] = []
         for is_freq in (False, True):
             own = {row: names for row, names in wanted.items() if (row.kind == "freq") == is_freq}
-            steps = {row: names.intersection(STEPPED) for row, names in own.items()}
-            rest = {row: names.difference(STEPPED) for row, names in own.items()}
+            steps = {row: names.intersection(_steps(names)) for row, names in own.items()}
+            rest = {row: names - steps[row] for row, names in own.items()}
             sets = [(own, dtype)]
             if dtype != torch.float64:
                 sets = [(steps, torch.float64), (rest, dtype)]
@@ -588,14 +590,20 @@ class _RowSet:
                 num_owners += len(family.channels)
         self._cells, self._owners = torch.tensor(cells), torch.tensor(owners)
         names = {name for own in wanted.values() for name in own}
+        ordered = [name for name in DESCRIPTORS if name in names]
+        self._is_sorted = not names.isdisjoint(("mode", "iqr"))
+        shared = [name for name in ordered if self._is_sorted and name in SORTED]
+        groups = [[name for name in ordered if name not in _OWN_ROWS], shared]
+        groups += [[name] for name in ordered if name in _OWN_ROWS and name not in shared]
         self.made: list[tuple[Row, str]] = []
-        self._chosen: list[tuple[str, Tensor | None]] = []
-        for name in (n for n in DESCRIPTORS if n in names):
+        self._groups: list[tuple[list[str], Tensor | None]] = []
+        for group in filter(None, groups):
+            is_of_all = group[0] not in _OWN_ROWS
             chosen = [
-                i for i, row in enumerate(rows) if name not in _OWN_ROWS or name in wanted[row]
+                i for i, row in enumerate(rows) if is_of_all or not wanted[row].isdisjoint(group)
             ]
-            self.made += [(rows[i], name) for i in chosen]
-            self._chosen.append((name, _index(chosen, len(rows))))
+            self.made += [(rows[i], name) for name in group for i in chosen]
+            self._groups.append((group, _index(chosen, len(rows))))
         of_film = families[-1].channels
         correlated = [row.channel for row in rows if "correlation" in wanted[row]]
         self._film = torch.tensor([of_film.index(channel) for channel in correlated])
@@ -603,11 +611,11 @@ class _RowSet:
     def __call__(self, families: Sequence[_Coordinates]) -> list[Tensor]:
         rows = self._rows(families)
         made = []
-        for name, index in self._chosen:
+        for names, index in self._groups:
             own = rows.take(index)
-            if name == "correlation":
+            if names == ["correlation"]:
                 own = replace(own, film=taken(families[-1].films(self._dtype), self._film, -2))
-            made.append(DESCRIPTORS[name](own))
+            made += [DESCRIPTORS[name](own) for name in names]
         return made
 
     def _rows(self, families: Sequence[_Coordinates]) -> Rows:
@@ -643,6 +651,7 @@ class _RowSet:
             scale / length,
             amplitude=amplitude,
             frequency_hz=self._maps.frequency_hz if is_freq else None,
+            is_sorted=self._is_sorted,
         )
 
     def _of_cells(self, tables: Sequence[Tensor]) -> Tensor:
@@ -672,6 +681,11 @@ class _Ratios:
         parts = (x @ like(self._into, x)).double()  # whose squares may leave float32
         ratios = band_energy_ratios((parts * parts) @ like(self._of_branch, parts))
         return ratios.flatten(-2)
+
+
+def _steps(names: set[str]) -> tuple[str, ...]:
+    """What is made of float64 rows; with the mode all that its sorted values serve."""
+    return (*STEPPED, *SORTED) if "mode" in names else STEPPED
 
 
 def _index(chosen: Sequence[int], num: int) -> Tensor | None:

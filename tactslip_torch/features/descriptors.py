@@ -50,6 +50,7 @@ class Rows:
         film: what ``correlation`` correlates with: the filtered bin less its mean, of order one.
         amplitude: of spectra, the values with their mean.
         frequency_hz: of the lines of spectra.
+        is_sorted: whether ``ascending`` is asked for, so that ``ranked`` may take it.
 
     Shape:
         - values, film, amplitude: ``[*, R, n]``; mean, unit, scale: ``[*, R]``;
@@ -64,6 +65,7 @@ class Rows:
     film: Tensor | None = None
     amplitude: Tensor | None = None
     frequency_hz: Tensor | None = None
+    is_sorted: bool = False
 
     def take(self, index: Tensor | None) -> Rows:
         """Some of the rows, by their places; all of them for ``None``."""
@@ -87,9 +89,9 @@ class Rows:
     def ranked(self, first: int, count: int) -> Tensor:
         """Values at ``count`` places of the ascending order, from ``first`` on, ``[*, R, count]``.
 
-        A graph has no sort, and selects quicker than it sorts.
+        A graph selects quicker than it sorts.
         """
-        if isinstance(self.values, Tensor):
+        if self.is_sorted or isinstance(self.values, Tensor):
             return self.ascending[..., first : first + count]
         return self.values.ranked(first, count)
 
@@ -220,7 +222,7 @@ def entropy(x: Rows) -> Tensor:
     level = ((values - least) * levels + (0.5 + HALF_SLACK[torch.float64])).floor()
     # the maximum always has the top level, which joins the second highest
     second = torch.where(level < float(ENTROPY_LEVELS), level, 0.0).amax(-1, keepdim=True)
-    cell = torch.where(level < second, level, second)
+    cell = torch.where(level < second, level, second)  # of a NaN too one of the numbers
     bits = looked_up(_entropy_terms(x.num), counted(cell.long(), ENTROPY_LEVELS)).sum(-1)
     return bits * (span.squeeze(-1) > 0.0).double()
 
@@ -304,7 +306,9 @@ Of every signal those up to the peak factor; correlation of branches; the others
 COMMON_DESCRIPTORS = tuple(DESCRIPTORS)[:13]
 TIME_DESCRIPTORS = (*COMMON_DESCRIPTORS, "correlation")
 SPECTRUM_DESCRIPTORS = (*COMMON_DESCRIPTORS, *tuple(DESCRIPTORS)[14:])
-ORDERED = ("median", "mode", "iqr", "entropy")
+SORTED = ("median", "mode", "iqr")
+"""Descriptors of sorted values."""
+ORDERED = (*SORTED, "entropy")
 """Descriptors of the distribution of the values of a row."""
 STEPPED = ("mode", "entropy")
 """Descriptors that step where a value moves; of float64 values, whatever the dtype of others."""
