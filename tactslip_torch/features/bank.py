@@ -194,8 +194,8 @@ _LEAST_LENGTH = 16 * torch.finfo(torch.float64).eps / 0.35
 that of 100 centred values of length 1 lies between .2 (two levels) and 1.41."""
 _CHUNK_BINS = 32  # what fits the cache of a processor
 _OWN_ROWS = (*SORTED, "entropy", "correlation", "spectral_spread")
-"""Descriptors of so much work that they are taken of the rows that want them alone, those that share
-sorted values of the rows that want any of them."""
+"""Descriptors of so much work that they are taken of the rows that want them alone; those of sorted
+values together, of the rows that want any of them."""
 
 
 @dataclass(frozen=True)
