@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import lru_cache
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -147,7 +148,7 @@ def check_number(name: str, value: Any, *, least: float | None = None, whole: bo
         Traceback (most recent call last):
         ValueError: tries must be a positive whole number, got 0
     """
-    is_number = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+    is_number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
     is_finite = is_number and abs(value) < (2**63 if whole else math.inf)
     if is_finite and (value > 0 if least is None else value >= least):
         return

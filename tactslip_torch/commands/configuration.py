@@ -860,9 +860,10 @@ def check_folder(composed: Composed, *, is_sweep: bool = False) -> None:
         Mistake: that says why.
 
     Example:
-        >>> check_folder(Composed("evaluate", ["hydra.run.dir=/dev/null/recordings"]))
+        >>> composed = Composed("evaluate", ["hydra.run.dir=/dev/null/a"])
+        >>> check_folder(composed)  # doctest: +ELLIPSIS
         Traceback (most recent call last):
-        Mistake: cannot write to hydra.run.dir=/dev/null/recordings: Not a directory at /dev/null
+        tactslip_torch.commands.configuration.Mistake: cannot write to hydra.run.dir=/dev/null/a: ...
     """
     of = "sweep" if is_sweep else "run"
     where: Any = OmegaConf.to_container(composed.whole.hydra[of])
