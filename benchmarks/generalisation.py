@@ -91,7 +91,7 @@ class Generalisation(Benchmark):
         "(../benchmarks/results/realism.json): `python -m benchmarks.realism`)"
     )
     page, is_page = "docs/generalisation.md", True
-    quick = "unseen4=[0] deploy=[] hard=[0] overrides=[data.cycles=5]"
+    quick = "unseen4=[0] deploy=[] hard=[0] overrides=[data.cycles=3,split.train_fraction=0.5]"
     unseen4: tuple[int, ...] = (0, 1, 2, 3, 4)
     deploy: tuple[int, ...] = (0, 1, 2, 3, 4)
     hard: tuple[int, ...] = (0, 1, 2, 3, 4)

@@ -863,7 +863,7 @@ def check_folder(composed: Composed, *, is_sweep: bool = False) -> None:
         >>> composed = Composed("evaluate", ["hydra.run.dir=/dev/null/a"])
         >>> check_folder(composed)  # doctest: +ELLIPSIS
         Traceback (most recent call last):
-        tactslip_torch.commands.configuration.Mistake: cannot write to hydra.run.dir=/dev/null/a: ...
+        tactslip_torch.commands.configuration.Mistake: cannot write to hydra.run.dir=/dev/null...
     """
     of = "sweep" if is_sweep else "run"
     where: Any = OmegaConf.to_container(composed.whole.hydra[of])
