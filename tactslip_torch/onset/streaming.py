@@ -364,6 +364,8 @@ class SampleClock:
 
         It must be one of the samples that the last ``take`` counted, or a later one.
         """
+        if not self.is_timed:
+            return num_samples / self.sample_rate_hz
         last = np.searchsorted(self._places, num_samples - 1, side="right") - 1
         since = num_samples - self._places[last]
         end_s: Array = self._times_s[last] + since / self.sample_rate_hz
