@@ -8,7 +8,7 @@ from statistics import mean, median, quantiles, stdev
 from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from tactslip_torch.report import style
 
@@ -178,7 +178,7 @@ def bars(
         names: of the groups of bars.
         series: values by their meaning, one a name; ``None`` leaves a bar out.
         about: labels the axis of values.
-        is_log: whether that axis is logarithmic.
+        is_log: whether that axis is logarithmic where values differ by more than a factor of 20.
     """
     height = 0.8 / len(series)
     for step, (label, values) in enumerate(series.items()):
@@ -193,11 +193,15 @@ def bars(
                 size=7,
             )  # fmt: skip
     style.lanes(axes, names)
+    every = [of for values in series.values() for of in values if of]
+    is_log &= bool(every) and max(every) > 20 * min(every)
     if is_log:
         axes.set_xscale("log")
+        is_narrow = max(every) < 100 * min(every)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if is_narrow else (1,)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.margins(x=0.12)
-    axes.set_xlabel(about)
+    axes.set_xlabel(f"{about} (logarithmic axis)" if is_log else about)
     if len(series) > 1:
         axes.legend()
