@@ -222,8 +222,9 @@ def choose(
     def apart(wanted: str | int, what: str) -> Sequence[Array]:
         """Arrays that are not the samples; none of what is a column of a matrix."""
         if isinstance(wanted, int):
-            return [] if is_matrix else [columns[_position(None, len(columns), wanted, what)]]
-        if any(wanted in labels for array in several for labels in array.labels):
+            is_there = columns and not is_matrix
+            return [columns[_position(None, len(columns), wanted, what)]] if is_there else []
+        if is_matrix and any(wanted in labels for array in several for labels in array.labels):
             return []
         return _named(wanted, several, refused)
 
@@ -232,13 +233,14 @@ def choose(
         times = [array for array in columns if _is_time_name(array.leaf)]
     speeds = [] if how.speed is None else apart(how.speed, "speed")
     how = replace(how, speed=None) if speeds else how  # of the columns
-    singles = [a for a in columns if a in within and a not in (*times, *speeds)]
+    inside = [array for array in columns if array in within]
+    singles = [array for array in inside if array not in (*times, *speeds)]
     if is_matrix:
         if len(matrices) > 1:
             raise Refused(f"holds several arrays, {_listed(matrices)}; say reading.samples")
         opened, near = _of_matrix(path, matrices[0], times, how), matrices[0]
-    elif singles:
-        opened, near = _of_columns(path, singles, columns, how)
+    elif singles or (inside and how.channels is not None):
+        opened, near = _of_columns(path, singles, inside, columns, how)
     else:
         whys = "; ".join([f"{name!r} {why}" for name, why in refused.items()][:3])
         reasons = f" ({whys})" if whys else " but times" if times else ""
@@ -290,15 +292,22 @@ def _time_axis(matrix: Array, lengths: set[int], how: Reading) -> int:
 
 
 def _of_columns(
-    path: str | os.PathLike[str], singles: Sequence[Array], columns: Sequence[Array], how: Reading
+    path: str | os.PathLike[str],
+    singles: Sequence[Array],
+    inside: Sequence[Array],
+    columns: Sequence[Array],
+    how: Reading,
 ) -> tuple[Opened, Array]:
-    """Arrays of one column each, and the first of them; numbers count all such of the file."""
+    """Arrays of one column each, and the first of them.
+
+    Names are those of ``reading.samples``; numbers count all such arrays of the file.
+    """
     chosen = list(singles)
     if how.channels is not None:
         chosen = [
             columns[_position(None, len(columns), wanted, "channels")]
             if isinstance(wanted, int)
-            else _named(wanted, singles, {})[0]
+            else _named(wanted, inside, {})[0]
             for wanted in how.channels
         ]
     if len({column.length for column in chosen}) > 1:

@@ -211,7 +211,7 @@ def _rows_of(table: Path, number: int, columns: Sequence[str], num_numbers: int)
 def _flat(table: Any, name: str, count: int) -> NDArray[Any]:
     """The numbers of a column, ``[count, T]``; lists may be nested."""
     values = table.column(name).combine_chunks()
-    while hasattr(values, "flatten") and values.type.num_fields:  # a list, of any kind
+    while hasattr(values, "values"):  # a list, of any kind
         values = values.flatten()
     numbers = np.asarray(values.to_numpy(zero_copy_only=False))
     if numbers.size != len(table) * count or numbers.dtype.kind not in "iufb":
