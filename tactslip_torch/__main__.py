@@ -53,8 +53,8 @@ def run(command: str, arguments: list[str]) -> None:
     Raises:
         SystemExit: with another status than 0 if it failed.
     """
-    from tactslip_torch.commands.configuration import Composed, Mistake, checked, help_text
-    from tactslip_torch.commands.stopping import stopping
+    from tactslip_torch.commands.configuration import Composed, checked, help_text
+    from tactslip_torch.commands.stopping import errors_in_one_line, stopping
 
     with stopping():
         if command in OF_THEIR_OWN:
@@ -62,11 +62,8 @@ def run(command: str, arguments: list[str]) -> None:
             import_module(f"{__package__}.commands.{command}").main()
             return
         asked = [each for each in arguments if each not in ("-h", "--help")]
-        try:
+        with errors_in_one_line():
             found = checked(command, asked)
-        except Mistake as mistake:
-            print(f"error: {mistake}", file=sys.stderr)
-            raise SystemExit(2) from None
         if len(asked) < len(arguments):
             composed = found.composed or Composed(command)
             print(help_text(command, COMMANDS[command], composed))

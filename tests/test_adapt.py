@@ -12,7 +12,7 @@ from test_commands import TINY, TinyRecordings, composed
 from tactslip_torch import SlipDetector
 from tactslip_torch.commands import adapt as module
 from tactslip_torch.commands.adapt import adapt
-from tactslip_torch.commands.entry import one_line
+from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.folder import RecordingFolder, write_manifest
 from tactslip_torch.deploy.export import export_detector

@@ -8,7 +8,7 @@ from torch.utils.data import DataLoader
 
 from tactslip_torch.commands import configuration
 from tactslip_torch.commands.configuration import conf_dir, unknown_choice
-from tactslip_torch.commands.entry import errors_in_one_line, one_line
+from tactslip_torch.commands.stopping import errors_in_one_line, one_line
 
 # Where the configuration lives -----------------------------------------------------------------
 

@@ -27,6 +27,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 from statistics import median, median_high
 from typing import Any, NamedTuple
@@ -248,12 +249,22 @@ def time_in_fresh_process(
 ) -> Timing:
     """``time_detector`` of a saved detector in a process that has done nothing else.
 
+    That process imports the program that calls this, whose own work must therefore stand behind
+    ``if __name__ == "__main__":``.
+
     Raises:
-        Exception: what that process raised.
+        ValueError: if that process ends without a result.
+        Exception: what it raised.
     """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, context) as process:
-        return process.submit(_time_saved, path, calls, backend).result()
+        try:
+            return process.submit(_time_saved, path, calls, backend).result()
+        except BrokenProcessPool:
+            raise ValueError(
+                f"the process that was to time {os.fspath(path)} ended; is there memory for it, "
+                'and does the program call this behind if __name__ == "__main__":?'
+            ) from None
 
 
 def _time_saved(path: str | os.PathLike[str], calls: int, backend: BackendName) -> Timing:

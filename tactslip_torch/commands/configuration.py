@@ -498,6 +498,8 @@ def _apart(command: str, arguments: Sequence[str]) -> tuple[Namespace, list[str]
         options, unknown = parser.parse_known_intermixed_args(arguments)
     except ArgumentError as error:
         raise Mistake(f"{error}; {_LIST_KEYS.format(command)}") from None
+    if "--" in arguments:
+        raise Mistake(f"{command} has no option --; write KEY=VALUE, without dashes")
     if unknown:
         option, found, value = unknown[0].partition("=")
         key = option.lstrip("-").replace("-", "_")

@@ -17,7 +17,8 @@ import numpy as np
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig
 
-from tactslip_torch.commands.entry import entry_point, fail, one_line
+from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.commands.stopping import fail, one_line
 from tactslip_torch.data.file_recordings import FileRecordings, Inspected
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest, write_template
 from tactslip_torch.data.manifest import Problem

@@ -72,7 +72,7 @@ def main() -> None:
         help="a new folder for what is written (default: %(default)s)",
     )  # fmt: skip
     given = parser.parse_args()
-    from tactslip_torch.commands.entry import errors_in_one_line
+    from tactslip_torch.commands.stopping import errors_in_one_line
 
     with errors_in_one_line():
         demo(given.out)

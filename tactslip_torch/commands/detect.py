@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from tactslip_torch.commands.entry import entry_point, one_line, save_config
+from tactslip_torch.commands.entry import entry_point, save_config
+from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.data.file_recordings import hand_file
 from tactslip_torch.data.folder import file_facts, recording_files
 from tactslip_torch.data.formats import Reading, open_file, pieces

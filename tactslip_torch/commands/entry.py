@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,10 +12,8 @@ from typing import Any, NamedTuple, TextIO
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import InstantiationException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from tactslip_torch.commands.configuration import (
     Checked,
@@ -26,25 +22,12 @@ from tactslip_torch.commands.configuration import (
     conf_dir,
     with_lists,
 )
-from tactslip_torch.commands.stopping import Stopped
-from tactslip_torch.runtime import is_first_process, process_number, whole_file, write_json
+from tactslip_torch.commands.stopping import Stopped, errors_in_one_line
+from tactslip_torch.runtime import is_first_process, whole_file, write_json
 
 log = logging.getLogger(__name__)
 
 NOTHING_SAVED = "no result is written (features made so far stay in the cache); start it again"
-
-EXIT_BAD_INPUT = 2
-BAD_INPUT = (
-    ValueError,
-    LookupError,
-    OverflowError,
-    EOFError,
-    TypeError,
-    OSError,
-    InstantiationException,
-    OmegaConfBaseException,
-)
-"""What bad input raises, here or in the libraries that read it."""
 
 
 def entry_point(
@@ -70,11 +53,14 @@ def entry_point(
     def main(given: Checked | None = None) -> None:
         with errors_in_one_line():
             arguments, options, composed = given or checked(command, sys.argv[1:])
+            is_sweep, words_typed = options.multirun, list(sys.argv)
             if composed:
-                check_folder(composed, is_sweep=options.multirun)
+                is_sweep |= composed.whole.hydra.mode == RunMode.MULTIRUN
+                check_folder(composed, is_sweep=is_sweep)
             runs: list[_Run] = []
 
             def in_folder(config: DictConfig) -> None:
+                sys.argv[:] = words_typed  # by which Lightning starts further processes
                 with _kept_in_log(), errors_in_one_line():
                     if composed is not None:
                         with_lists(config, composed)
@@ -94,7 +80,7 @@ def entry_point(
                         runs.append(_Run(words, returned, folder.parent, "simulation" in source))
 
             in_folder.__module__ = f"{__package__}.{name}"  # Hydra names job and log file by it
-            if composed and not (options.multirun or options.cfg or options.resolve):
+            if composed and not (is_sweep or options.cfg or options.resolve):
                 composed.run(in_folder)
             else:
                 sys.argv[1:] = arguments
@@ -179,44 +165,3 @@ class _Copied:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
-
-
-@contextmanager
-def errors_in_one_line() -> Iterator[None]:
-    """Turn what bad input raises into one line and exit status 2; other errors keep their trace.
-
-    Raises:
-        SystemExit: instead of the error.
-    """
-    try:
-        yield
-    except BAD_INPUT as error:
-        if os.environ.get("TACTSLIP_TRACEBACK"):
-            raise
-        fail(one_line(error))
-
-
-def fail(message: str) -> None:
-    """Print one line, with the number of the process if there are several, exit with status 2.
-
-    Raises:
-        SystemExit: always.
-    """
-    who = "" if is_first_process() else f" in process {process_number()}"
-    print(f"error{who}: {' '.join(message.split())}", file=sys.stderr, flush=True)
-    raise SystemExit(EXIT_BAD_INPUT)
-
-
-def one_line(error: BaseException) -> str:
-    """What went wrong, without Hydra's wrapping, behind the section of the configuration."""
-    section = ""
-    while isinstance(error, InstantiationException) and error.__cause__ is not None:
-        place = re.search(r"full_key: (\S+)", str(error))
-        section = f"{place[1]}: " if place else ""
-        error = error.__cause__
-    if isinstance(error, MissingMandatoryValue):
-        return f"no value for {error.full_key}; give {error.full_key}=..."
-    text = str(error.args[0] if isinstance(error, KeyError) and error.args else error).strip()
-    if "Original Traceback" in text:  # from a worker: the last line is what was raised there
-        text = text.splitlines()[-1].partition(": ")[2]
-    return section + (text or type(error).__name__)

@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("name", help=f"one of {', '.join(host_names())}")
     parser.add_argument("folder", type=Path, help="where its folder is put")
     given = parser.parse_args()
-    from tactslip_torch.commands.entry import errors_in_one_line  # of no need for --help
+    from tactslip_torch.commands.stopping import errors_in_one_line
 
     with errors_in_one_line():
         copied = copy_host(given.name, given.folder)

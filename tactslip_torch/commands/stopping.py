@@ -1,8 +1,12 @@
-"""Stopped by a signal: one line that says what is saved and how to go on, and the exit status."""
+"""How a command ends early: by a signal or by bad input, in one line, with its exit status.
+
+Nothing here imports torch, so that a mistake in a command line is told at once.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from collections.abc import Iterator
@@ -10,7 +14,22 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
+from hydra.errors import InstantiationException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+EXIT_BAD_INPUT = 2
+BAD_INPUT = (
+    ValueError,
+    LookupError,
+    OverflowError,
+    EOFError,
+    TypeError,
+    OSError,
+    InstantiationException,
+    OmegaConfBaseException,
+)
+"""What bad input raises, here or in the libraries that read it."""
 
 
 class Stopped(BaseException):
@@ -63,10 +82,57 @@ def stopping() -> Iterator[None]:
     except Stopped as end:
         name = signal.Signals(end.number).name
         told = f"; {end.text}" if end.text else " before anything was written; start it again"
-        if int(os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0"))) == 0:
+        if _rank() == 0:
             print(f"\nstopped by {name}{told}", file=sys.stderr, flush=True)
         raise SystemExit(128 + end.number) from None
     finally:
         if os.getpid() == first:
             for own, handler in before.items():
                 signal.signal(own, handler)
+
+
+def _rank() -> int:
+    """``runtime.process_number``, without torch."""
+    names = ("RANK", "SLURM_PROCID", "LOCAL_RANK")
+    return int(next((os.environ[name] for name in names if name in os.environ), 0))
+
+
+@contextmanager
+def errors_in_one_line() -> Iterator[None]:
+    """Turn what bad input raises into one line and exit status 2; other errors keep their trace.
+
+    Raises:
+        SystemExit: instead of the error.
+    """
+    try:
+        yield
+    except BAD_INPUT as error:
+        if os.environ.get("TACTSLIP_TRACEBACK"):
+            raise
+        fail(one_line(error))
+
+
+def fail(message: str) -> None:
+    """Print one line, with the number of the process if there are several, exit with status 2.
+
+    Raises:
+        SystemExit: always.
+    """
+    who = f" in process {rank}" if (rank := _rank()) else ""
+    print(f"error{who}: {' '.join(message.split())}", file=sys.stderr, flush=True)
+    raise SystemExit(EXIT_BAD_INPUT)
+
+
+def one_line(error: BaseException) -> str:
+    """What went wrong, without Hydra's wrapping, behind the section of the configuration."""
+    section = ""
+    while isinstance(error, InstantiationException) and error.__cause__ is not None:
+        place = re.search(r"full_key: (\S+)", str(error))
+        section = f"{place[1]}: " if place else ""
+        error = error.__cause__
+    if isinstance(error, MissingMandatoryValue):
+        return f"no value for {error.full_key}; give {error.full_key}=..."
+    text = str(error.args[0] if isinstance(error, KeyError) and error.args else error).strip()
+    if "Original Traceback" in text:  # from a worker: the last line is what was raised there
+        text = text.splitlines()[-1].partition(": ")[2]
+    return section + (text or type(error).__name__)

@@ -468,7 +468,7 @@ def residuals_without(
     roots: Tensor,
     residuals: Tensor,
 ) -> Tensor:
-    """Residuals of each bin under the machine without its group.
+    """Residuals of each bin under the machine without its group; a group's monomials are in memory.
 
     Args:
         groups: ``ordered_groups`` of the bins.
