@@ -13,7 +13,7 @@ from test_commands import BAD_INPUT, TinyRecordings, composed
 
 from tactslip_torch.analysis.raw_bins import draw_bins
 from tactslip_torch.commands.certify import certify, main
-from tactslip_torch.commands.entry import one_line
+from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.data.labels import LabelRule, label_bins
 from tactslip_torch.deploy.check import EXTREMES
 from tactslip_torch.features.cache import cache_key

@@ -14,8 +14,8 @@ from hydra.errors import InstantiationException
 
 from tactslip_torch import HandLayout, Recording, SlipDetector
 from tactslip_torch.commands.configuration import conf_dir
-from tactslip_torch.commands.entry import one_line
 from tactslip_torch.commands.evaluate import evaluate
+from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import RecordingId
 

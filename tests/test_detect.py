@@ -14,7 +14,7 @@ from test_commands import composed as composed_of
 from tactslip_torch import HandLayout, Recording
 from tactslip_torch.commands import detect as module
 from tactslip_torch.commands.detect import detect, main
-from tactslip_torch.commands.entry import one_line
+from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.data.formats import FORMATS, Samples
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, score_stream

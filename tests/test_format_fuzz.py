@@ -33,8 +33,8 @@ from small_set import SmallSet, small_maker, small_recipe
 from test_learner import trainer
 
 from tactslip_torch import HandLayout, Recording, SlipDetector, StreamingDetector
-from tactslip_torch.commands.entry import BAD_INPUT as ONE_LINE
-from tactslip_torch.commands.entry import one_line
+from tactslip_torch.commands.stopping import BAD_INPUT as ONE_LINE
+from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.data.formats import FORMATS, pieces
 from tactslip_torch.data.manifest import read_manifest
 from tactslip_torch.data.splits import random_bins

@@ -13,8 +13,8 @@ from test_commands import BAD_INPUT, TinyRecordings, composed
 
 from tactslip_torch import HandLayout, simulate
 from tactslip_torch.commands import generate as module
-from tactslip_torch.commands.entry import one_line
 from tactslip_torch.commands.generate import generate
+from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.data.formats import FORMATS
 from tactslip_torch.simulation.scene import Scene
 

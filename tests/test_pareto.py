@@ -38,7 +38,7 @@ from tactslip_torch.analysis.pareto import (
     worth_naming,
     worth_timing,
 )
-from tactslip_torch.commands.entry import one_line
+from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.data.splits import seen6, unseen4
 from tactslip_torch.features.bank import make_plan, pool_names
 from tactslip_torch.features.groups import allowed
