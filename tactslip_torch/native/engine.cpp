@@ -45,7 +45,6 @@ template <> struct Lanes<float> {
 typedef uint8_t Bytes __attribute__((vector_size(VECTOR_BYTES)));
 
 // NaN stays NaN.
-INLINE double clamped(double x, double most) { return x > most ? most : x < -most ? -most : x; }
 INLINE D clamped(D x, double most) { return x > most ? D{} + most : x < -most ? D{} - most : x; }
 
 // -- Sorting -------------------------------------------------------------------------------------

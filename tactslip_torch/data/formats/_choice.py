@@ -233,14 +233,15 @@ def choose(
         times = [array for array in columns if _is_time_name(array.leaf)]
     speeds = [] if how.speed is None else apart(how.speed, "speed")
     how = replace(how, speed=None) if speeds else how  # of the columns
-    inside = [array for array in columns if array in within]
-    singles = [array for array in inside if array not in (*times, *speeds)]
+    singles = [array for array in columns if array in within]
+    if how.channels is None:
+        singles = [array for array in singles if array not in (*times, *speeds)]
     if is_matrix:
         if len(matrices) > 1:
             raise Refused(f"holds several arrays, {_listed(matrices)}; say reading.samples")
         opened, near = _of_matrix(path, matrices[0], times, how), matrices[0]
-    elif singles or (inside and how.channels is not None):
-        opened, near = _of_columns(path, singles, inside, columns, how)
+    elif singles:
+        opened, near = _of_columns(path, singles, columns, how)
     else:
         whys = "; ".join([f"{name!r} {why}" for name, why in refused.items()][:3])
         reasons = f" ({whys})" if whys else " but times" if times else ""
@@ -292,22 +293,15 @@ def _time_axis(matrix: Array, lengths: set[int], how: Reading) -> int:
 
 
 def _of_columns(
-    path: str | os.PathLike[str],
-    singles: Sequence[Array],
-    inside: Sequence[Array],
-    columns: Sequence[Array],
-    how: Reading,
+    path: str | os.PathLike[str], singles: Sequence[Array], columns: Sequence[Array], how: Reading
 ) -> tuple[Opened, Array]:
-    """Arrays of one column each, and the first of them.
-
-    Names are those of ``reading.samples``; numbers count all such arrays of the file.
-    """
+    """Arrays of one column each, and the first of them; numbers count all such of the file."""
     chosen = list(singles)
     if how.channels is not None:
         chosen = [
             columns[_position(None, len(columns), wanted, "channels")]
             if isinstance(wanted, int)
-            else _named(wanted, inside, {})[0]
+            else _named(wanted, singles, {})[0]
             for wanted in how.channels
         ]
     if len({column.length for column in chosen}) > 1:
