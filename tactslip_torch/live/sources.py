@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -410,7 +410,9 @@ def source_of(
     *,
     baud: int = 115200,
     reading: Reading | None = None,
-    **of_file: Any,
+    tare_s: Sequence[float] | None = None,
+    speed: float | None = 1.0,
+    repeat: bool = False,
 ) -> Source:
     """The source that a text names.
 
@@ -421,7 +423,9 @@ def source_of(
         frames: how samples are written, but of a file.
         baud: of ``SerialPort``.
         reading: of ``FileInTime`` and ``RosTopic``.
-        of_file: ``tare_s``, ``speed`` and ``repeat`` of ``FileInTime``.
+        tare_s: of ``FileInTime``, as are ``speed`` and ``repeat``.
+        speed: times faster than real time; ``None``: as fast as it is taken.
+        repeat: whether the file begins again at its end.
 
     Raises:
         FileNotFoundError: if it names none.
@@ -444,4 +448,4 @@ def source_of(
     path = Path(text)
     if not path.exists():
         raise FileNotFoundError(f"no file at {text}; source is {KINDS}")
-    return FileInTime(path, detector, reading, **of_file)
+    return FileInTime(path, detector, reading, tare_s=tare_s, speed=speed, repeat=repeat)

@@ -12,14 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Literal, get_args
+from functools import cached_property, lru_cache
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from tactslip_torch.features.ops import is_nowhere, power_of_two_below
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.missing_channels import Prediction
 from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -130,7 +131,8 @@ class BaselineDetector:
     def predict_raw(self, samples: Tensor, *, given: torch.dtype | None = None) -> Prediction:
         """Filter and score raw bins that come with their context.
 
-        A film that is missing counts as silent, and the score as not valid.
+        A film that is missing counts as silent, and the score as not valid. Other channels are not
+        looked at, and never missing.
 
         Args:
             samples: in volts.
@@ -143,21 +145,38 @@ class BaselineDetector:
         Raises:
             ValueError: if the number of channels or samples is another.
         """
-        given, films = given or samples.dtype, self.needed_index.tolist()
-        bins = self.channel_filter.valid(samples, films)
-        self.pool.check(bins)
-        is_missing = self.pool.is_missing(bins)
-        raw_magnitude = self.channel_filter.raw_magnitude(samples, films)
-        is_trusted = self.pool.is_alive(bins, given, raw_magnitude) & ~is_missing
+        given, films, (pool, own) = given or samples.dtype, self.needed_index, self._of_films
+        self.channel_filter.check(samples)
+        first = self.channel_filter.context_before - own.context_before
+        rest = samples.shape[-1] - 2 * self.channel_filter.context + 2 * own.context
+        raw = samples[..., films, first : first + rest]
+        bins = own.valid(raw)
+        pool.check(bins)
+        is_silent = pool.is_missing(bins)
+        is_alive = pool.is_alive(bins, given, own.raw_magnitude(raw))
         bins = bins.to(given)
-        if not is_nowhere(is_missing):
-            bins = torch.where(is_missing[..., None], 0.0, bins)
+        if not is_nowhere(is_silent):
+            bins = torch.where(is_silent[..., None], 0.0, bins)
         if self.name == "film_band_power":
-            score = film_band_power(bins, films, self.pool.sample_rate_hz)
+            score = film_band_power(bins, pool.hand.fast, pool.sample_rate_hz)
         else:
-            score = largest_detail(bins, films, self.pool.wavelet, self.pool.level)
-        is_valid = is_trusted[..., films].all(-1)
+            score = largest_detail(bins, pool.hand.fast, pool.wavelet, pool.level)
+        is_missing = is_silent.new_zeros(samples.shape[:-1])
+        is_missing[..., films] = is_silent
+        is_valid = (is_alive & ~is_silent).all(-1)
         return Prediction(score, is_valid, is_missing, torch.zeros_like(score))
+
+    @cached_property
+    def _of_films(self) -> tuple[FeaturePool, ChannelFilter]:
+        """Pool and filter of the films alone."""
+        channels, lengths = self.pool.hand.channels, self.channel_filter.window_lengths
+        hand = HandLayout(tuple(channels[film] for film in self.pool.hand.fast))
+        frames = [lengths[film] for film in self.pool.hand.fast]
+        settings: dict[str, Any] = self.channel_filter.config() | {
+            "window_lengths": frames,
+            "kernels": {k: v for k, v in self.channel_filter.kernels.items() if k in frames},
+        }
+        return FeaturePool(hand, **self.pool.facts(), backend="torch"), ChannelFilter(**settings)
 
 
 def _log_of_largest(
@@ -174,7 +193,10 @@ def _log_of_largest(
     unit = power_of_two_below(magnitude)
     x = x / unit[..., None]
     products = (x - x[..., :1].detach()) @ rows.to(x).T  # exact on a large constant
-    largest = torch.linalg.vector_norm(products, order, -1) * unit
+    if order == math.inf:  # as vector_norm, in an eighth of its time
+        largest = torch.maximum(products.amax(-1), -products.amin(-1)) * unit
+    else:
+        largest = torch.linalg.vector_norm(products, order, -1) * unit
     largest = torch.where(magnitude.isfinite(), largest, torch.nan)
     return largest.amax(-1).clamp(min=FLOOR_V).log()
 
