@@ -74,12 +74,6 @@ def alarming_detector(with_onset: bool = False) -> SlipDetector:
     return detector
 
 
-@cache
-def score_std() -> float:
-    """Of the detector's scores on the stream."""
-    return float(np.std([row["score"] for row in truth(slipping_stream())]))
-
-
 def saved(path: Path, samples: np.ndarray) -> Path:
     """A recording as ``.npy``."""
     np.save(path, samples)
@@ -179,10 +173,14 @@ def _refuse(word: str) -> None:
 
 
 def truth(
-    samples: np.ndarray, threshold: float | None = None, *, with_onset: bool = False
+    samples: np.ndarray,
+    threshold: float | None = None,
+    *,
+    with_onset: bool = False,
+    detector: SlipDetector | None = None,
 ) -> list[dict[str, Any]]:
-    """Every decision of the detector on samples ``[T, C]``, as a host is to print it."""
-    detector = alarming_detector(with_onset)
+    """Every decision of a detector on samples ``[T, C]``, as a host is to print it."""
+    detector = detector or alarming_detector(with_onset)
     settings = AlarmSettings.of(detector)
     if threshold is not None and settings.onset:
         settings = replace(settings, onset=replace(settings.onset, threshold=threshold))
@@ -191,7 +189,7 @@ def truth(
     decisions = StreamingDetector(detector, settings, dtype=torch.float64).push(samples)
     columns = [getattr(decisions, field).tolist() for field in STREAM_OUTPUTS.values()]
     rows = [dict(zip(STREAM_OUTPUTS, row, strict=True)) for row in zip(*columns, strict=True)]
-    if with_onset:
+    if settings.onset:
         kinds = {alarm.alarm_s: alarm.raised_by for alarm in decisions.alarms}
         for row, score in zip(rows, decisions.onset_score.tolist(), strict=True):
             row |= {"onset_score": score, "raised_by": kinds.get(row["time_s"])}
@@ -208,7 +206,8 @@ def assert_same(ran: Ran, expected: list[dict[str, Any]], *, exact: bool = False
     deviation (float32), or 1e-9 (``exact``: a model in float64).
     """
     close = 1e-9 if exact else 1e-3
-    bounds = {"score": close * score_std(), "probability": close, "statistic": close * 8.0}
+    spread = np.std([row["score"] for row in expected])
+    bounds = {"score": close * spread, "probability": close, "statistic": close * 8.0}
     assert ran.status == 0, ran.stderr
     assert len(ran.lines) == len(expected)
     for line, row in zip(ran.lines, expected, strict=True):

@@ -4,6 +4,7 @@ import json
 import math
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -42,60 +43,61 @@ def false_alarms(*args, rules=RULES, **more):
     return recording_events(watched(*args, **more), rules, LATENCY).false_alarms_s
 
 
-# ------------------------------------------------------------------------------------ by loops
+# By loops ----------------------------------------------------------------------------------------
+
+
 def random_recording(rng, number=0):
     """Everything in whole milliseconds: slides apart, alarms anywhere, stretches or the whole."""
     duration = 4000
-    edges = np.sort(rng.choice(np.arange(100, duration - 100), 6, replace=False))
-    slides = [(int(a), int(b)) for a, b in edges.reshape(3, 2)][: rng.integers(0, 4)]
-    alarms = sorted(rng.choice(duration, rng.integers(0, 14), replace=False).tolist())
+    edges = np.sort(rng.choice(np.arange(100, duration - 100), 6, replace=False)).tolist()
+    slides = [(edges[2 * i], edges[2 * i + 1]) for i in range(rng.integers(0, 4))]
+    alarms = set(rng.choice(duration, rng.integers(0, 14), replace=False).tolist())
     if slides and rng.random() < 0.5:
-        near = slides[0][0] + int(rng.integers(-250, 600))
-        alarms = sorted({*alarms, max(near, 0)})
-    ends = None
+        alarms.add(max(slides[0][0] + int(rng.integers(-250, 600)), 0))
+    alarms, ends, stretches = sorted(alarms), None, None
     if rng.random() < 0.6:
         later = [*alarms, 10**6][1:]
-        ends = [
-            int(rng.integers(a + 1, min(b, a + 900) + 1))
-            for a, b in zip(alarms, later, strict=True)
-        ]
-    stretches = None
+        latest = [min(b, a + 900) for a, b in zip(alarms, later, strict=True)]
+        ends = [int(rng.integers(a + 1, b + 1)) for a, b in zip(alarms, latest, strict=True)]
     if rng.random() < 0.5:
         cuts = np.sort(rng.choice(duration, 4, replace=False)).tolist()
         stretches = [(cuts[0], cuts[1]), (cuts[2], cuts[3])]
-    speeds = rng.choice([20.0, 40.0, 60.0], len(slides)).tolist()
     firsts = [start for start, _ in slides]
-    if told := rng.random() < 0.5:
-        firsts = [start - int(rng.integers(0, 50)) for start in firsts]
-        firsts = [max(first, end) for first, end in zip(firsts, [0, *edges[1::2]], strict=False)]
-    made = {"alarms": alarms, "ends": ends, "slides": slides, "stretches": stretches}
-    made |= {"firsts": [int(first) for first in firsts], "told": told}
-    return made | {"duration": duration, "speeds": speeds, "number": number}
+    if told := rng.random() < 0.5:  # when the first element lets go, behind the slide before
+        earlier = [start - int(rng.integers(0, 50)) for start in firsts]
+        firsts = [max(first, end) for first, end in zip(earlier, [0, *edges[1::2]], strict=False)]
+    speeds = rng.choice([20.0, 40.0, 60.0], len(slides)).tolist()
+    return SimpleNamespace(
+        number=number,
+        duration=duration,
+        alarms=alarms,
+        ends=ends,
+        slides=slides,
+        firsts=firsts,
+        told=told,
+        speeds=speeds,
+        stretches=stretches,
+    )
 
 
-def as_watched(made, shift_s=0.0):
+def as_watched(made):
     def s(times):
-        return tuple(time / 1000 + shift_s for time in times)
+        return tuple(time / 1000 for time in times)
 
+    released = zip(made.firsts, made.slides, strict=True) if made.told else ()
     return Watched(
-        recording=f"{made['number']}",
-        material=f"M{made['number'] % 3}",
+        recording=f"{made.number}",
+        material=f"M{made.number % 3}",
         scene="paper",
-        duration_s=made["duration"] / 1000,
-        alarms_s=s(made["alarms"]),
-        onset_estimates_s=s(
-            [alarm - 7 * (place % 3) for place, alarm in enumerate(made["alarms"])]
-        ),
-        onsets_s=s([start for start, _ in made["slides"]]),
-        sliding_s=tuple(s(slide) for slide in made["slides"]),
-        speeds_mm_s=tuple(made["speeds"]),
-        watched_s=tuple(s(stretch) for stretch in made["stretches"] or ()),
-        alarm_ends_s=() if made["ends"] is None else s(made["ends"]),
-        released_s=tuple(
-            s((first, start + 30))
-            for first, (start, _) in zip(made["firsts"], made["slides"], strict=True)
-            if made["told"]
-        ),
+        duration_s=made.duration / 1000,
+        alarms_s=s(made.alarms),
+        onset_estimates_s=s(alarm - 7 * (place % 3) for place, alarm in enumerate(made.alarms)),
+        onsets_s=s(start for start, _ in made.slides),
+        sliding_s=tuple(s(slide) for slide in made.slides),
+        speeds_mm_s=tuple(made.speeds),
+        watched_s=tuple(s(stretch) for stretch in made.stretches or ()),
+        alarm_ends_s=s(made.ends or ()),
+        released_s=tuple(s((first, start + 30)) for first, (start, _) in released),
     )
 
 
@@ -103,16 +105,15 @@ def by_loops(made, found=500, early=200, settle=100):
     """The definitions, word by word, in whole milliseconds."""
 
     def is_seen(t):
-        return made["stretches"] is None or any(a <= t <= b for a, b in made["stretches"])
+        return made.stretches is None or any(a <= t <= b for a, b in made.stretches)
 
-    firsts = made["firsts"]
+    firsts = made.firsts
     windows = [
-        (first - early, stop + settle)
-        for first, (_, stop) in zip(firsts, made["slides"], strict=True)
+        (first - early, stop + settle) for first, (_, stop) in zip(firsts, made.slides, strict=True)
     ]
     alarms = [
-        (alarm, None if made["ends"] is None else made["ends"][place])
-        for place, alarm in enumerate(made["alarms"])
+        (alarm, None if made.ends is None else made.ends[place])
+        for place, alarm in enumerate(made.alarms)
         if is_seen(alarm)
     ]
     of, false = Counter(), []
@@ -123,7 +124,7 @@ def by_loops(made, found=500, early=200, settle=100):
         else:
             false.append(alarm)
     told = []
-    for i, (onset, _) in enumerate(made["slides"]):
+    for i, (onset, _) in enumerate(made.slides):
         if not is_seen(onset):
             continue
         before = [(alarm, end) for alarm, end in alarms if alarm < firsts[i]]
@@ -141,8 +142,8 @@ def by_loops(made, found=500, early=200, settle=100):
         outcome = "early" if is_early else "found" if hits else "missed"
         told.append((outcome, of[i], hits[0] - onset if outcome == "found" else None))
     quiet = 0
-    for t in range(made["duration"]):  # the millisecond from t to t + 1
-        inside = made["stretches"] is None or any(a <= t < b for a, b in made["stretches"])
+    for t in range(made.duration):  # the millisecond from t to t + 1
+        inside = made.stretches is None or any(a <= t < b for a, b in made.stretches)
         quiet += inside and not any(a <= t < b for a, b in windows)
     return told, false, quiet
 
@@ -203,7 +204,9 @@ def test_the_settling_time_is_of_bin_and_look_ahead_unless_it_is_given():
     assert false_alarms([3.3], rules=EventRules(settle_s=0.4)) == ()
 
 
-# ----------------------------------------------------------------------------------- the numbers
+# The numbers -------------------------------------------------------------------------------------
+
+
 def test_nothing_to_say_is_none_and_never_a_quotient_of_zeros():
     no_time = watched([1.1], watched_s=((0.9, 2.0),))
     metrics = event_metrics([no_time], RULES, LATENCY)
@@ -275,7 +278,9 @@ def test_the_same_recording_of_two_detectors_is_drawn_as_one():
     assert twice["alarms_per_slip"] == pytest.approx(once["alarms_per_slip"])
 
 
-# ---------------------------------------------------------------------------------------- errors
+# Errors ------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -36,9 +36,6 @@ def ridge(bins, penalty, kernel=PAPER_KERNEL):
     return model.fit(bins.features.numpy(), bins.targets.numpy(), sample_weight=weights)
 
 
-# Balance -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("is_slip", "weights", "message"),
     [
@@ -51,9 +48,6 @@ def ridge(bins, penalty, kernel=PAPER_KERNEL):
 def test_bins_that_do_not_fit_together_are_refused(is_slip, weights, message):
     with pytest.raises(ValueError, match=message):
         TrainingBins(torch.zeros(5, 2), is_slip, weights)
-
-
-# Fit -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -99,15 +93,10 @@ def test_a_bin_that_weighs_1e14_does_not_drown_the_others(degree, rng, monkeypat
 
 
 @pytest.mark.parametrize("kernel", KEEPING, ids=str)
-def test_a_kernel_that_does_not_fold_says_what_it_costs_and_has_no_primal(kernel, rng, caplog):
-    bins = draw(rng, 60)
+def test_a_kernel_that_does_not_fold_says_what_it_costs(kernel, rng, caplog):
     with caplog.at_level("INFO"):
-        machine = fit_machine(bins, 0.3, kernel)
+        machine = fit_machine(draw(rng, 60), 0.3, kernel)
     assert f"all 60 training bins are kept, {machine.cost}" in caplog.text
-    with pytest.raises(ValueError, match="route must be 'auto', 'primal' or 'dual', got 'back'"):
-        fit_machine(bins, 0.3, route="back")
-    with pytest.raises(ValueError, match="has no primal of fixed size; take route='dual'"):
-        fit_machine(bins, 0.3, kernel, route="primal")
 
 
 @pytest.mark.parametrize("route", ["primal", "dual"])
@@ -126,10 +115,21 @@ def test_an_infinite_penalty_is_least_squares(num_bins, degree, route, rng):
     np.testing.assert_allclose(machine(bins.features).numpy(), fitted, rtol=1e-7, atol=1e-7)
 
 
-def test_no_bins_are_no_machine():
-    none = TrainingBins(torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool))
-    with pytest.raises(ValueError, match=r"^a machine needs training bins, got none; add"):
-        fit_machine(none, 1.0)
+NONE = TrainingBins(torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool))
+SOME = TrainingBins(torch.eye(3), torch.tensor([True, False, True]))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((NONE, 1.0), r"^a machine needs training bins, got none; add"),
+        ((SOME, 0.3, PAPER_KERNEL, "back"), "route must be 'auto', 'primal' or 'dual', got 'back'"),
+        ((SOME, 0.3, KEEPING[0], "primal"), "has no primal of fixed size; take route='dual'"),
+    ],
+)
+def test_what_makes_no_machine_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        fit_machine(*given)
 
 
 # Differentiable fits ---------------------------------------------------------------------------

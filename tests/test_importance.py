@@ -1,16 +1,13 @@
 """Which sensors matter: sets whose answer is known, machines refitted the slow way, the command."""
 
-import shutil
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 from small_detector import HAND, raw_bins, small_detector
-from test_commands import TINY
-from test_commands import composed as composed_train
+from test_commands import BAD_INPUT, TINY, composed
 
 from tactslip_torch.analysis.importance import (
     HELD_OUT,
@@ -23,8 +20,8 @@ from tactslip_torch.analysis.importance import (
     score_gradients,
     without,
 )
-from tactslip_torch.commands.importance import main
-from tactslip_torch.commands.train import train
+from tactslip_torch.commands.importance import sensors
+from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.selection import ClassMoments, t_scores
 from tactslip_torch.model.fit import TrainingBins, fit_machine
@@ -200,27 +197,15 @@ def test_what_no_first_order_can_be_told_of_is_refused(change, words):
 
 
 # The command -----------------------------------------------------------------------------------
-SMALL = ("bins=20", "scored_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    train(composed_train(*TINY, "recipe=robust", "cache=off"), folder)
-    return folder
-
-
-# The command -------------------------------------------------------------------------------------
-
-
-def refused(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["importance", *SMALL, "cache=off", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 2
-    errors = [x for x in capsys.readouterr().err.splitlines() if x.startswith("error")]
-    assert len(errors) == 1
-    return errors[0]
+def refused(folder, *overrides):
+    """What is wrong, in a line."""
+    config = composed("num_workers=0", "cache=off", *overrides, name="importance")
+    with pytest.raises(BAD_INPUT) as caught:
+        sensors(config, folder)
+    assert not list(folder.glob("sensors.*"))
+    return one_line(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -231,32 +216,20 @@ def refused(monkeypatch, capsys, *arguments):
         ("reselect=equal", "reselect must be ranked or shared, got 'equal'"),
     ],
 )
-def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, override, words):
-    here, model = f"hydra.run.dir={tmp_path / 'out'}", "model=nothing.pt"
-    assert words in refused(monkeypatch, capsys, here, model, override)
+def test_bad_input_is_one_line(tmp_path, override, words):
+    assert words in refused(tmp_path, "model=nothing.pt", override)
 
 
-def moved(run, folder, *, change=None):
-    """The detector of a run with its configuration beside it, changed; or none."""
-    folder.mkdir(parents=True)
-    shutil.copy(run / "detector.pt", folder)
-    if change is not None:
-        text = (run / "config.yaml").read_text()
-        assert change[0] in text
-        (folder / "config.yaml").write_text(text.replace(*change))
-    return f"model={folder / 'detector.pt'}"
-
-
-@pytest.mark.slow
-def test_a_detector_without_its_run_is_refused(monkeypatch, capsys, run, tmp_path):
-    here = f"hydra.run.dir={tmp_path / 'out'}"
-    alone = moved(run, tmp_path / "far" / "away")
-    assert "no config.yaml beside" in refused(monkeypatch, capsys, here, alone)
-    other = moved(run, tmp_path / "other", change=("seed: 0", "seed: 1"))
-    wrong = refused(monkeypatch, capsys, here, other)
+def test_a_detector_without_its_run_is_refused(tmp_path):
+    detector, model = small_detector(), tmp_path / "run" / "deep" / "detector.pt"
+    detector.info |= {"split": "unseen4", "train_recordings": []}
+    detector.save(model)
+    assert "no config.yaml beside" in refused(tmp_path, f"model={model}")
+    config = composed(*TINY)
+    OmegaConf.save(config, model.with_name("config.yaml"))
+    wrong = refused(tmp_path, f"model={model}")
     assert "are not those that detector.pt was trained on" in wrong
-    bare = moved(run, tmp_path / "bare", change=("recipe:", "recept:"))
-    assert "has no recipe; give the config.yaml of a training" in refused(
-        monkeypatch, capsys, here, bare
-    )
-    assert not Path(tmp_path / "out" / "sensors.json").exists()
+    del config.recipe
+    OmegaConf.save(config, model.with_name("config.yaml"))
+    wrong = refused(tmp_path, f"model={model}")
+    assert "has no recipe; give the config.yaml of a training" in wrong

@@ -14,13 +14,8 @@ from tactslip_torch import FeaturePool, HandLayout, Scene, SlipDetector, Streami
 PACKAGE = "tactslip_torch"
 REPLACED_NEXT = ("features/", "deploy/")
 """Of the package, what the issue behind this one replaces; not counted in ``modules.py``."""
-ENGINES = ("torch", "auto")
+BACKENDS = ("torch", "auto")
 """Of ``FeaturePool``: the definitions, and the fastest there is."""
-
-
-def FeatureExtractor(pool, selected=None, *, engine="auto"):
-    return pool.select(range(len(pool.names)) if selected is None else selected, backend=engine)
-
 
 # Commands --------------------------------------------------------------------------------------
 

@@ -2,66 +2,72 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import hosts
 import numpy as np
 import pytest
 import torch
+from hosts import EXPORT, altered, copied, run_host, saved, sidecar_of, truncated, truth
 
 from . import names
 from .recordings import samples_of
-from .running import ROOT
 
 pytestmark = pytest.mark.onnx
 
-EXPORT = ROOT / "export"
 BROWSER = Path(os.environ.get("CHROMIUM", "/usr/bin/chromium"))
-NEEDS = {"python": [], "c": ["gcc", "make"], "node": ["node", "npm"], "web": ["node", "npm"]}
-COMMAND_LINE_HOSTS = ["python", "c", pytest.param("node", marks=pytest.mark.slow)]
-ALL_HOSTS = [*COMMAND_LINE_HOSTS, pytest.param("web", marks=pytest.mark.slow)]
+NEEDS = {"python": [], "c": ["gcc", "make"], "node": ["node"], "web": ["node"]}
 SAMPLES = samples_of("D", 1)[1500:5500]
 BROKEN = SAMPLES.copy()
 BROKEN[2500:2510, 1:3] = np.nan
-
-
-def run(words, folder=None):
-    return subprocess.run(
-        [str(word) for word in words],
-        cwd=folder,
-        env=os.environ | {"CHROMIUM": str(BROWSER)},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
+EVERY, CHUNK, THRESHOLD, RATE = (
+    names.HOST_OPTIONS[word] for word in ("every", "chunk", "threshold", "rate")
+)
 
 
 @pytest.fixture(scope="module")
-def host_of(tmp_path_factory):
-    """By name the words of a host's command; built or installed when first asked for."""
-    made = {}
-    places = {"python": sys.executable, "export": EXPORT, "build": tmp_path_factory.mktemp("c")}
+def places(tmp_path_factory):
+    """What stands for the words in braces of the hosts' commands."""
+    return {"python": sys.executable, "export": EXPORT, "build": tmp_path_factory.mktemp("c")}
 
-    def host(name):
-        missing = [program for program in NEEDS[name] if shutil.which(program) is None]
-        if name == "web" and not BROWSER.exists():
-            missing.append(f"the browser {BROWSER}")
-        if missing:
-            pytest.skip(f"not installed: {', '.join(missing)}")
-        if name not in made:
-            if name == "c":
-                done = run(names.BUILD_C_HOST.format(**places).split())
-                assert done.returncode == 0, done.stderr
-            if name in ("node", "web") and not (EXPORT / name / "node_modules").exists():
-                done = run(names.INSTALL_HOST.split(), EXPORT / name)
-                assert done.returncode == 0, done.stderr
-            made[name] = names.HOSTS[name].format(**places).split()
-        return made[name]
 
-    return host
+@pytest.fixture(scope="module")
+def build(places):
+    """Runs ``make`` for the C host with more words of a command line; what it prints."""
+
+    def run(*words):
+        command = [*names.BUILD_C_HOST.format(**places).split(), *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+def words_of(name, places, build):
+    """The words of a host's command; built or installed before."""
+    missing = [program for program in NEEDS[name] if shutil.which(program) is None]
+    if name == "web" and not BROWSER.exists():
+        missing.append(f"the browser {BROWSER}")
+    if missing:
+        pytest.skip(f"not installed: {', '.join(missing)}")
+    if name == "c":
+        build()
+    if name in ("node", "web"):
+        hosts.installed(EXPORT / name)
+    return names.HOSTS[name].format(**places).split()
+
+
+@pytest.fixture(
+    scope="module", params=["python", "c", pytest.param("node", marks=pytest.mark.slow)]
+)
+def host(request, places, build):
+    """Each host of a command line."""
+    return words_of(request.param, places, build)
 
 
 @pytest.fixture(scope="module")
@@ -69,122 +75,296 @@ def stream(graphs_of):
     return graphs_of("selected") / names.STREAM_GRAPH
 
 
-def saved(folder, samples):
-    path = folder / "recording.npy"
-    np.save(path, samples)
-    return path
+@pytest.fixture(scope="module")
+def fast_stream(tmp_path_factory):
+    """Of a detector with an onset classifier, and of 24 channels."""
+    return hosts.exported(tmp_path_factory, with_onset=True) / names.STREAM_GRAPH
 
 
-def no_constant(word):
-    raise AssertionError(f"{word} is not JSON")
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return saved(tmp_path_factory.mktemp("recording") / "recording.npy", SAMPLES)
 
 
-def decided_by(host, name, stream, recording, *options):
-    """All decisions a host prints, and its summary."""
-    words = [*host, stream, recording, names.HOST_OPTIONS["every"], *options]
-    if name == "web":
-        output = recording.with_name("page.png")
-        pairs = zip(names.WEB_OPTIONS, (stream, recording, output), strict=True)
-        words = [*host, *(word for pair in pairs for word in pair)]
-    done = run(words)
-    assert done.returncode == 0, done.stderr
-    *lines, summary = [
-        json.loads(line, parse_constant=no_constant) for line in done.stdout.splitlines()
-    ]
-    return lines, summary, done.stderr
+@pytest.fixture(scope="module")
+def fast_recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "recording.npy"
+    return saved(path, hosts.slipping_stream())
 
 
-def assert_decided(lines, summary, detector, samples):
-    """Flags and times are those of the package; scores to single precision."""
-    expected = names.StreamingDetector(detector, dtype=torch.float64).push(samples)
-    assert summary["decisions"] == len(lines) == len(expected.score) > 50
-    assert summary["alarms"] == int(expected.is_alarm.sum())
-    assert summary["seconds"] == len(samples) / 2000
-    for name, field in names.STREAM_OUTPUTS.items():
-        truth = getattr(expected, field)
-        found = [line[name] for line in lines]
-        if truth.dtype == torch.bool:
-            assert found == truth.tolist(), name
-        else:
-            spread = 1e-6 if name.endswith("_s") else 1e-3 * max(1.0, float(truth.std()))
-            np.testing.assert_allclose(found, truth.numpy(), rtol=0, atol=spread, err_msg=name)
+# What is right ---------------------------------------------------------------------------------
+
+THRESHOLDS = [
+    ([THRESHOLD, "-1e3"], -1e3),
+    ([f"{THRESHOLD}=4.5"], 4.5),
+    ([f"{RATE}=2e3", f"{CHUNK}=0200", THRESHOLD, "+45E-1"], 4.5),
+    ([THRESHOLD, "1e9"], 1e9),
+]
+"""Options in ways that every host reads, and the threshold they mean."""
 
 
-@pytest.mark.parametrize("name", ALL_HOSTS)
-def test_a_host_decides_what_the_package_decides(name, host_of, stream, selected, tmp_path):
-    recording = saved(tmp_path, SAMPLES)
-    lines, summary, _ = decided_by(host_of(name), name, stream, recording)
-    assert summary["alarms"] > 0
-    assert_decided(lines, summary, selected.detector, SAMPLES)
+@pytest.mark.parametrize(
+    ("options", "threshold"),
+    [([], None), ([CHUNK, "1"], None), ([CHUNK, "333"], None), *THRESHOLDS],
+    ids=str,
+)
+def test_a_host_decides_what_the_package_decides(
+    host, stream, selected, recording, options, threshold
+):
+    """However it is told, and the options before the files or behind."""
+    expected = truth(SAMPLES, threshold, detector=selected.detector)
+    ran = run_host(host, *options, stream, EVERY, recording)
+    hosts.assert_same(ran, expected)
+    assert ran.summary["seconds"] == len(SAMPLES) / 2000
+    assert ran.stderr == ""
+    if threshold is None:
+        assert ran.summary["alarms"] > 0
+    else:
+        assert expected != truth(SAMPLES, detector=selected.detector)
 
 
-@pytest.mark.parametrize("name", COMMAND_LINE_HOSTS)
-@pytest.mark.parametrize("chunk", [1, 333])
-def test_any_chunk_decides_the_same(name, chunk, host_of, stream, selected, tmp_path):
-    options = (names.HOST_OPTIONS["chunk"], chunk)
-    found = decided_by(host_of(name), name, stream, saved(tmp_path, SAMPLES), *options)
-    assert_decided(*found[:2], selected.detector, SAMPLES)
+@pytest.mark.slow
+def test_the_page_decides_what_the_package_decides(places, build, stream, selected, recording):
+    files = (stream, recording, recording.with_name("page.png"))
+    words = [word for pair in zip(names.WEB_OPTIONS, files, strict=True) for word in pair]
+    host = words_of("web", places, build)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CHROMIUM", str(BROWSER))
+        hosts.assert_same(run_host(host, *words), truth(SAMPLES, detector=selected.detector))
 
 
-@pytest.mark.parametrize("name", COMMAND_LINE_HOSTS)
-def test_missing_samples_are_flagged_and_told_once(name, host_of, stream, selected, tmp_path):
-    found = decided_by(host_of(name), name, stream, saved(tmp_path, BROKEN))
-    assert_decided(*found[:2], selected.detector, BROKEN)
-    assert sum(not line["valid"] for line in found[0]) > 0
-    (warning,) = found[2].splitlines()
+def test_missing_samples_are_flagged_and_told_once(host, stream, selected, tmp_path):
+    ran = run_host(host, stream, saved(tmp_path / "recording.npy", BROKEN), EVERY)
+    hosts.assert_same(ran, truth(BROKEN, detector=selected.detector))
+    assert not all(line["valid"] for line in ran.lines)
+    (warning,) = ran.stderr.splitlines()
     assert warning.startswith("warning: ")
 
 
-@pytest.mark.parametrize("name", COMMAND_LINE_HOSTS)
-def test_another_threshold_raises_other_alarms(name, host_of, stream, tmp_path):
-    recording, option = saved(tmp_path, SAMPLES), names.HOST_OPTIONS["threshold"]
-    given = [(), (option, 1e9), (option, -1e9)]
-    found = [decided_by(host_of(name), name, stream, recording, *words)[1] for words in given]
-    assert found[1]["alarms"] == 0
-    assert found[2]["alarms"] == 1
-    assert found[0]["alarms"] >= 1
+@pytest.mark.parametrize(
+    ("options", "threshold"), [([CHUNK, 1], None), ([CHUNK, 333], None), ([THRESHOLD, 1e9], 1e9)]
+)
+def test_an_onset_classifier_raises_alarms_and_is_named(
+    host, fast_stream, fast_recording, options, threshold
+):
+    """The threshold is that of the classifier."""
+    expected = truth(hosts.slipping_stream(), threshold, with_onset=True)
+    raised_by = [row["raised_by"] for row in expected if row["alarm"]]
+    assert set(raised_by) == ({"onset", "status"} if threshold is None else {"status"})
+    ran = run_host(host, fast_stream, fast_recording, EVERY, *options)
+    hosts.assert_same(ran, expected)
+    assert ran.stderr == ""  # nothing is known before the first bin, and nothing is dead
+    alarms = run_host(host, fast_stream, fast_recording, *options).lines
+    assert [list(line) for line in alarms] == [[*hosts.ALARM_KEYS, "raised_by"]] * len(raised_by)
+    assert [line["raised_by"] for line in alarms] == raised_by
 
 
-def whole(folder, stream):
-    """A copy of the stream's graph and sidecar, which may be spoilt."""
-    for path in (stream, stream.with_name(names.SIDECAR.format(stream.name))):
-        shutil.copy(path, folder)
-    return folder / stream.name
+@pytest.mark.slow
+def test_a_graph_in_double_precision_is_fed_in_it(host, graphs_of, selected, tmp_path):
+    precise = graphs_of("selected", "float64") / names.STREAM_GRAPH
+    samples = SAMPLES * (1 + 2.0**-40)  # no float32
+    ran = run_host(host, precise, saved(tmp_path / "recording.npy", samples), EVERY)
+    hosts.assert_same(ran, truth(samples, detector=selected.detector), exact=True)
 
 
-def cut(path):
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+# What is wrong ---------------------------------------------------------------------------------
 
 
-def without_sidecar(path):
-    path.with_name(names.SIDECAR.format(path.name)).unlink()
+def told(**facts):
+    """Changes a sidecar to say other facts, or none of those given as None."""
+
+    def change(path):
+        content = json.loads(path.read_text()) | facts
+        kept = {key: value for key, value in content.items() if value is not None}
+        path.write_text(json.dumps(kept, indent=1))
+
+    return change
 
 
-WRONG = {
-    # what is done to the model, what the recording is, options, words of the line, exit status
-    "no model": (Path.unlink, SAMPLES, (), "stream.onnx", 1),
-    "half a model": (cut, SAMPLES, (), "stream.onnx.json again", 1),
-    "no sidecar": (without_sidecar, SAMPLES, (), "stream.onnx.json", 1),
-    "too few channels": (None, SAMPLES[:, :3].copy(), (), "recording.npy 3 4", 1),
-    "integers": (None, (1000 * SAMPLES).astype("<i2"), (), "recording.npy float32 <i2", 1),
-    "another rate": (None, SAMPLES, (names.HOST_OPTIONS["rate"], 1000), "1000 2000", 1),
-    "no chunk": (None, SAMPLES, (names.HOST_OPTIONS["chunk"], 0), "--chunk 0", 2),
-    "no number": (None, SAMPLES, (names.HOST_OPTIONS["threshold"], "high"), "--threshold high", 2),
-    "no option": (None, SAMPLES, ("--loud",), "--loud", 2),
+def as_array(make):
+    """Changes a recording to another array."""
+    return lambda path: np.save(path, make(np.load(path)))
+
+
+def negative_shape(path):
+    content = path.read_bytes()
+    assert b"(4000, 4), }  " in content
+    path.write_bytes(content.replace(b"(4000, 4), }  ", b"(-4000, 4), } "))
+
+
+WRONG_FILES = {
+    # which file is changed and how, words of the line
+    "no model": ("model", Path.unlink, "stream.onnx"),
+    "truncated model": ("model", truncated, "stream.onnx.json again"),
+    "altered model": ("model", altered, "stream.onnx.json again"),
+    "no sidecar": ("sidecar", Path.unlink, "stream.onnx.json"),
+    "truncated sidecar": ("sidecar", truncated, "stream.onnx.json"),
+    "bin graph": ("sidecar", told(graph="bin"), "bin stream"),
+    **{
+        f"no {key}": ("sidecar", told(**{key: None}), f"stream.onnx.json {key} nothing again")
+        for key in ("onnx_sha256", "channels", "sample_rate_hz", "state_size")
+    },
+    "half precision": (
+        "sidecar",
+        told(precision="float16"),
+        "stream.onnx.json precision float16 float32 float64",
+    ),
+    "rate in words": ("sidecar", told(sample_rate_hz="2 kHz"), 'stream.onnx.json "2 kHz" positive'),
+    "negative tail": (
+        "sidecar",
+        told(tail_samples=-1),
+        "stream.onnx.json tail_samples -1 whole",
+    ),
+    "no recording": ("recording", Path.unlink, "recording.npy"),
+    "truncated recording": ("recording", truncated, "recording.npy cut off"),
+    "negative shape": ("recording", negative_shape, "recording.npy save"),
+    "text": ("recording", lambda path: path.write_text("volts\n"), "recording.npy .npy"),
+    "integers": (
+        "recording",
+        as_array(lambda x: (1000 * x).astype("<i2")),
+        "recording.npy float32 <i2",
+    ),
+    "Fortran order": ("recording", as_array(np.asfortranarray), "Fortran"),
+    "big-endian": ("recording", as_array(lambda x: x.astype(">f4")), ">f4 little-endian"),
+    "three axes": ("recording", as_array(lambda x: x[None]), "4000 4"),
+    "too few channels": ("recording", as_array(lambda x: x[:, :3].copy()), "recording.npy 3 4"),
+}
+WRONG_OPTIONS = {
+    # options, words of the line
+    "--rate 1000": "1000 2000",
+    "--rate 0x7d0": "--rate 0x7d0",
+    "--chunk 0": "--chunk 0",
+    "--chunk 5000": "--chunk 5000 2000",
+    "--chunk 999999999999999999999999999999": "--chunk 999",
+    "--threshold high": "--threshold high",
+    "--threshold 1e400": "--threshold 1e400",
+    "--decisions=1": "--decisions",
+    "--loud": "--loud",
 }
 
 
-@pytest.mark.parametrize("name", COMMAND_LINE_HOSTS)
-@pytest.mark.parametrize("wrong", WRONG)
-def test_a_mistake_is_one_line_and_a_failing_exit(name, wrong, host_of, stream, tmp_path):
-    spoil, samples, options, words, status = WRONG[wrong]
-    model = whole(tmp_path, stream)
-    if spoil is not None:
-        spoil(model)
-    done = run([*host_of(name), model, saved(tmp_path, samples), *options])
-    assert done.returncode == status, done.stderr
-    assert done.stdout == ""
-    (line,) = done.stderr.splitlines()
+def assert_refused(ran, words, status):
+    assert (ran.status, ran.lines) == (status, []), ran.stderr
+    (line,) = ran.stderr.splitlines()
     assert line.startswith("error: ")
     missing = [word for word in words.split() if word not in line]
     assert not missing, line
+
+
+SOME_SLOW = [
+    name if place % 2 == 0 else pytest.param(name, marks=pytest.mark.slow)
+    for place, name in enumerate(WRONG_FILES)
+]
+"""Each starts a host: every second one is for the slow tests."""
+
+
+@pytest.mark.parametrize("wrong", SOME_SLOW)
+def test_a_wrong_file_is_one_line_and_a_failing_exit(host, wrong, stream, recording, tmp_path):
+    which, change, words = WRONG_FILES[wrong]
+    model, own = copied(stream, tmp_path), Path(shutil.copy(recording, tmp_path))
+    change({"model": model, "sidecar": sidecar_of(model), "recording": own}[which])
+    assert_refused(run_host(host, model, own), words, 1)
+
+
+@pytest.mark.parametrize("options", WRONG_OPTIONS)
+def test_a_wrong_option_is_one_line_and_a_failing_exit(host, options, stream, recording):
+    status = 1 if options == "--rate 1000" else 2
+    ran = run_host(host, stream, recording, *options.split())
+    assert_refused(ran, WRONG_OPTIONS[options], status)
+
+
+def test_without_files_the_usage_is_told(host):
+    assert_refused(run_host(host), "recording.npy", 2)
+
+
+@pytest.mark.parametrize("options", [[EVERY], [THRESHOLD, "1e9"]], ids=len)
+def test_lines_that_cannot_be_written_are_an_error(host, stream, recording, options):
+    command = [str(word) for word in (*host, stream, recording, *options)]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=300
+        )
+    assert done.returncode == 1, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: the output cannot be written")
+
+
+# C ---------------------------------------------------------------------------------------------
+
+
+def test_parts_hold_chunks_agree_and_a_push_takes_no_memory(places, build, stream, fast_stream):
+    words_of("c", places, build)
+    for each in (stream, fast_stream):
+        assert "parts and pushes hold" in build("test", f"MODEL={each}")
+
+
+def test_the_example_of_the_page_compiles_and_feels_the_slips(places, build, fast_stream, tmp_path):
+    words_of("c", places, build)
+    source, folder = EXPORT / "c", places["build"]
+    page = (source / "README.md").read_text(encoding="utf-8")
+    example = page.split("<!-- example -->\n```c\n")[1].split("```")[0]
+    raw = tmp_path / "samples.raw"
+    raw.write_bytes(hosts.slipping_stream().tobytes())
+    around = """
+static FILE *file;
+static size_t acquire(float *samples, size_t most) {
+    return fread(samples, 24 * sizeof(float), most, file);
+}
+int main(int count, char **words) {
+    return count == 3 && (file = fopen(words[2], "rb")) ? watch(words[1], acquire) : 2;
+}
+"""
+    (tmp_path / "loop.c").write_text(example + around)
+    command = ["gcc", "-std=c11", "-Wall", "-Wextra", "-Werror", f"-I{source}"]
+    command += [tmp_path / "loop.c", "-o", tmp_path / "loop"]
+    command += [source / f"{name}.c" for name in ("slip", "model", "sidecar", "sha256")]
+    command += [f"-L{folder}", "-lonnxruntime", f"-Wl,-rpath,{folder}"]
+    subprocess.run(command, check=True)
+    words = [tmp_path / "loop", fast_stream, raw]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    found = [float(text) for text in re.findall(r"slip since ([\d.]+) s\n", done.stdout)]
+    expected = truth(hosts.slipping_stream(), with_onset=True)
+    onsets_s = [row["onset_s"] for row in expected if row["alarm"]]
+    assert found == pytest.approx(onsets_s, abs=1e-3)
+
+
+# Python ----------------------------------------------------------------------------------------
+
+
+def test_it_needs_no_torch(stream, recording):
+    code = (
+        "import runpy, sys; sys.modules |= dict.fromkeys(['torch', 'tactslip_torch']); "
+        "sys.argv = sys.argv[1:]; sys.path.insert(0, sys.argv.pop(0)); "
+        "runpy.run_path(sys.argv[0], run_name='__main__')"
+    )
+    folder = EXPORT / "python"
+    without = [sys.executable, "-c", code, folder, folder / "detect.py"]
+    assert run_host(without, stream, recording).summary["alarms"] > 0
+
+
+# Bins by themselves ----------------------------------------------------------------------------
+
+SCORE = [sys.executable, EXPORT / "python" / "score.py"]
+
+
+def test_bins_are_scored_as_the_package_scores_them(stream, selected, tmp_path):
+    detector = selected.detector
+    before, after = detector.context_before, detector.context_after
+    path = saved(tmp_path / "recording.npy", BROKEN)
+    ran = run_host(SCORE, stream.with_name(names.BIN_GRAPH), path)
+    lines = [*ran.lines, ran.summary]  # there is no line of sums
+    starts = [round(line["start_s"] * 2000) for line in lines]
+    assert np.diff(starts).tolist() == [100] * (len(lines) - 1)
+    assert starts[0] <= before
+    assert len(BROKEN) - 100 < starts[-1] + 100 + after <= len(BROKEN)
+    bins = np.stack([BROKEN[s - before : s + 100 + after].T for s in starts[1:-1]])
+    predicted = detector.predict_raw(torch.from_numpy(bins).double())
+    assert [line["valid"] for line in lines[1:-1]] == predicted.is_valid.tolist()
+    assert not predicted.is_valid.all()
+    found = torch.tensor([line["score"] for line in lines[1:-1]], dtype=torch.float64)
+    close = 1e-3 * float(predicted.score.std())
+    torch.testing.assert_close(found, predicted.score, rtol=0, atol=close)
+
+
+def test_a_stream_graph_is_refused_for_bins(stream, recording):
+    assert_refused(run_host(SCORE, stream, recording), "give model.onnx", 1)

@@ -1,15 +1,11 @@
-"""What a fit may depend on, how it goes on after a kill, and folds that are left out."""
+"""What a fit may depend on, and how it goes on after a kill."""
 
 import contextlib
 import os
 import signal
 
-import numpy as np
 import pytest
 import torch
-
-from tactslip_torch import SufficientStats
-from tactslip_torch.model.fit import fit_quadratic, held_out_scores
 
 from . import names
 from .conftest import train
@@ -92,57 +88,3 @@ def test_a_killed_run_goes_on_behind_its_last_pass(command, trained_or_slow, tmp
     )
     for name, scores in trained.metrics[names.SPLITS].items():
         assert resumed.metrics[names.SPLITS][name][names.CONFUSION] == scores[names.CONFUSION], name
-
-
-# Folds in closed form, and sums -------------------------------------------------------------------
-
-
-def draw(rng, num=60, num_features=5):
-    """Scaled features, labels, groups and weights."""
-    z = torch.from_numpy(rng.uniform(-1, 1, (num, num_features)))
-    is_slip = z[:, 0] + 0.5 * z[:, 1] * z[:, 2] > torch.from_numpy(0.2 * rng.standard_normal(num))
-    weights = torch.from_numpy(rng.uniform(0.5, 2, num))
-    return z, is_slip, torch.from_numpy(rng.integers(0, 4, num)), weights
-
-
-def kernel_machine(z, targets, weights, penalty, offset, others):
-    """Scores of others by the kernel machine, in NumPy from its definition."""
-    gram = (z @ z.T + offset) ** 2
-    solved = np.linalg.solve(gram + np.diag(1 / (penalty * weights)), targets)
-    return (others @ z.T + offset) ** 2 @ solved
-
-
-def test_gradients_through_folds_and_fit_are_those_of_differences(rng):
-    z, is_slip, groups, weights = draw(rng, 24, 3)
-    others = draw(rng, 10, 3)[0]
-    z, weights = z.requires_grad_(), weights.requires_grad_()
-    numbers = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (0.7, 0.4)]
-
-    def folds(z, penalty, offset, weights):
-        return held_out_scores(z, is_slip, groups, penalty, offset, weights)
-
-    def fit(z, penalty, offset, weights):
-        return fit_quadratic(z, is_slip, penalty, offset, weights)(others)
-
-    assert torch.autograd.gradcheck(folds, (z, *numbers, weights))
-    assert torch.autograd.gradcheck(fit, (z, *numbers, weights))
-
-
-def test_moments_in_any_order_solve_to_the_machine_of_the_bins(rng, tmp_path):
-    """Batches added, taken out, kept in files and put together; classes of equal weight."""
-    z, is_slip, groups, _ = draw(rng, 200)
-    parts = [SufficientStats(num_features=5), SufficientStats(num_features=5)]
-    for group in (2, 0, 3, 1):
-        own = groups == group
-        parts[group % 2].update(f"batch {group}", z[own], is_slip[own])
-    own = groups == 1
-    parts[1].remove("batch 1", z[own], is_slip[own])
-    parts[1].save(tmp_path / "part")
-    parts[0].merge(SufficientStats.load(tmp_path / "part"))
-    out = groups != 1
-    kept, targets = z[out].numpy(), np.where(is_slip[out], 1.0, -1.0)
-    counts = {sign: (targets == sign).sum() for sign in (-1.0, 1.0)}
-    weights = np.array([len(kept) / (2 * counts[sign]) for sign in targets])
-    expected = kernel_machine(kept, targets, weights, 0.1, 0.5, z.numpy())
-    found = parts[0].solve(penalty=0.1)(z)
-    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-8, atol=1e-8)
