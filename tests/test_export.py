@@ -2,14 +2,14 @@
 
 import hashlib
 import json
-import sys
 
 import onnxruntime
 import pytest
 import torch
 from small_detector import HAND, alarming_detector, certified, small_detector
+from test_commands import composed
 
-from tactslip_torch.commands import export as export_command
+from tactslip_torch.commands.export import export as export_command
 from tactslip_torch.commands.train import export_fold
 from tactslip_torch.deploy import export
 from tactslip_torch.deploy.export import (
@@ -48,27 +48,28 @@ def test_a_model_says_of_itself_what_its_sidecar_says(detector, exported):
         text = session.get_modelmeta().custom_metadata_map
         metadata = {name: json.loads(value) for name, value in text.items()}
         content = path.read_bytes()
-        of_file = {
+        assert read_sidecar(path) == metadata | {
             "file": path.name,
             "onnx_sha256": hashlib.sha256(content).hexdigest(),
             "onnx_bytes": len(content),
         }
-        assert read_sidecar(path) == metadata | of_file
-        assert (metadata["graph"], metadata["precision"]) == (kind, "float32")
-        assert metadata["channels"] == list(HAND.names)
-        assert metadata["kinds"] == ["SG", "SG", "PVDF", "PVDF"]
-        assert metadata["features"] == [str(name) for name in detector.selected_names]
-        assert 0 < metadata["check"]["worst_sd"] < 1e-3
-        assert f"{metadata['check']['worst_sd']:.1e} score deviations" in summary(path)
+        said = {
+            "graph": kind,
+            "precision": "float32",
+            "channels": list(HAND.names),
+            "kinds": ["SG", "SG", "PVDF", "PVDF"],
+            "features": [str(name) for name in detector.selected_names],
+        }
+        assert {name: metadata[name] for name in said} == said
+        worst_sd = metadata["check"]["worst_sd"]
+        assert 0 < worst_sd < 1e-3
+        assert f"{worst_sd:.1e} score deviations" in summary(path)
         assert "no certificate" in summary(path)
-    lines = [line.strip(" ,") for line in sidecar_text(exported[1]).splitlines()]
+    sidecar = exported[1].with_name("stream.onnx.json").read_text()
+    lines = [line.strip(" ,") for line in sidecar.splitlines()]
     for name, value in read_sidecar(exported[1]).items():  # a scalar a line: for hosts in C
         if not isinstance(value, dict | list):
             assert f'"{name}": {json.dumps(value)}' in lines
-
-
-def sidecar_text(path):
-    return path.with_name(f"{path.name}.json").read_text()
 
 
 def test_an_export_of_the_same_detector_gives_the_same_bytes(detector, exported, tmp_path):
@@ -135,16 +136,10 @@ def test_the_certificate_of_this_detector_is_handed_on_and_no_other(tmp_path):
 # What is wrong ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"graphs": ["both"]}, "graphs must be bin or stream, or both, got both"),
-        ({"graphs": []}, "got none"),
-    ],
-)
-def test_another_choice_is_refused(tmp_path, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        export_detector(small_detector(), tmp_path, **arguments)
+@pytest.mark.parametrize(("graphs", "came"), [(["both"], "both"), ([], "none")])
+def test_another_choice_is_refused(tmp_path, graphs, came):
+    with pytest.raises(ValueError, match=f"graphs must be bin or stream, or both, got {came}"):
+        export_detector(small_detector(), tmp_path, graphs)
     assert not list(tmp_path.iterdir())
 
 
@@ -178,39 +173,22 @@ def test_training_tells_of_each_graph_and_loses_nothing(detector, tmp_path, monk
 # The command -----------------------------------------------------------------------------------
 
 
-def command(monkeypatch, capsys, *arguments):
-    """Exit status, what was said, and what was wrong."""
-    monkeypatch.setattr(sys, "argv", ["export", *map(str, arguments)])
-    status = 0
-    try:
-        export_command.main()
-    except SystemExit as stop:
-        status = stop.code
-    said = capsys.readouterr()
-    return status, said.out, said.err
+def command(model, folder, *overrides):
+    """Run it as it is called."""
+    export_command(composed(f"model={model}", *overrides, name="export"), folder)
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_the_command_leaves_what_the_detector_can_give(monkeypatch, capsys, tmp_path, detector):
+def test_the_command_leaves_what_the_detector_can_give(capsys, tmp_path, detector):
     model, out = tmp_path / "detector.pt", tmp_path / "out"
     detector.save(model)
-    status, said, _ = command(monkeypatch, capsys, f"model={model}")
-    assert status == 0
-    assert [line.split(":")[0] for line in said.splitlines()] == [
-        str(tmp_path / name) for name in ("model.onnx", "stream.onnx")
-    ]
-    assert all("kB, float32, within" in line for line in said.splitlines())
-    words = ("graph=stream", "precision=float64", f"output={out}")
-    assert command(monkeypatch, capsys, f"model={model}", *words)[0] == 0
+    command(model, tmp_path)
+    lines = capsys.readouterr().out.splitlines()
+    files = [str(tmp_path / name) for name in ("model.onnx", "stream.onnx")]
+    assert [line.split(":")[0] for line in lines] == files
+    assert all("kB, float32, within" in line for line in lines)
+    command(model, tmp_path, "graph=stream", "precision=float64", f"output={out}")
     assert sorted(path.name for path in out.iterdir()) == ["stream.onnx", "stream.onnx.json"]
     assert read_sidecar(out / "stream.onnx")["precision"] == "float64"
-
-
-def test_a_file_for_a_folder_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
-    small_detector().save(tmp_path / "detector.pt")
-    model = f"model={tmp_path / 'detector.pt'}"
-    status, out, err = command(monkeypatch, capsys, model, "output=small.onnx")
-    assert (status, out) == (2, "")
-    assert err.startswith("error: output must be a folder, got small.onnx")
-    assert err.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["detector.pt"]
+    with pytest.raises(ValueError, match=r"^output must be a folder, got small\.onnx"):
+        command(model, tmp_path, "output=small.onnx")

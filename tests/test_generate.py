@@ -43,12 +43,11 @@ def _fresh(monkeypatch):
     monkeypatch.setattr(CountedRecordings, "fails", "")
 
 
-def run(folder, *overrides, workers=0, figure=False):
+def run(folder, *overrides):
     """What ``generate`` returns for the tiny set, or for the simulated one."""
     own = overrides if any(o.startswith("scene=") for o in overrides) else (*TINY, *overrides)
-    return generate(
-        composed(f"num_workers={workers}", f"figure={figure}", *own, name="generate"), folder
-    )
+    config = composed("num_workers=0", "figure=false", *own, name="generate")
+    return generate(config, folder)
 
 
 def manifest(folder):
@@ -127,14 +126,14 @@ def test_a_run_that_fails_keeps_what_it_finished_and_has_no_manifest(
 ):
     monkeypatch.setattr(CountedRecordings, "fails", "B/0")
     with pytest.raises(ValueError, match="B/0 cannot be read"):
-        run(tmp_path, workers=workers)
+        run(tmp_path, f"num_workers={workers}")
     finished = contents(tmp_path)
     assert {"A_paper_00.npz", "A_paper_01.npz", "A_paper_02.npz"} <= set(finished)
     assert "B_paper_00.npz" not in finished
     assert not (tmp_path / "manifest.csv").exists()
     assert not list(tmp_path.glob(".*"))
     monkeypatch.setattr(CountedRecordings, "fails", "")
-    again = run(tmp_path, workers=workers)
+    again = run(tmp_path, f"num_workers={workers}")
     assert [one.made for one in again[:4]] == [False, False, False, True]
     assert finished.items() <= contents(tmp_path).items()
     assert len(manifest(tmp_path)) == 6
@@ -176,12 +175,8 @@ def test_a_file_that_is_not_ours_is_never_replaced(tmp_path, content):
     ],
 )
 def test_bad_input_is_one_line_and_touches_nothing(tmp_path, overrides, said):
-    if any(o.startswith("scene=") for o in overrides):
-        config = composed(*overrides, name="generate")
-    else:
-        config = composed(*TINY, "figure=false", *overrides, name="generate")
     with pytest.raises(BAD_INPUT) as caught:
-        generate(config, tmp_path)
+        run(tmp_path, *overrides)
     line = one_line(caught.value)
     assert re.search(said, line), line
     assert "\n" not in line
@@ -204,7 +199,7 @@ def drawn(monkeypatch):
 
 
 def test_the_figures_show_each_material_filtered(tmp_path, drawn):
-    run(tmp_path, "cycle=1", "features.frames.SG=31", figure=True)
+    run(tmp_path, "cycle=1", "features.frames.SG=31", "figure=true")
     assert set(drawn) == {"recordings_paper.png", "onset_paper.png"}
     whole, near = drawn["recordings_paper.png"], drawn["onset_paper.png"]
     assert [title for title, _ in whole[0]] == ["A", "B"]

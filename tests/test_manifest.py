@@ -1,5 +1,7 @@
 """Manifests that people write: what they may look like, and that every mistake is named."""
 
+import re
+
 import pytest
 
 from tactslip_torch.data.file_recordings import on_time
@@ -159,10 +161,8 @@ def test_other_columns_are_said_not_to_be_read_and_likely_twins_are_named(root):
     ],
 )
 def test_a_truth_that_cannot_be_is_named(cells, line):
-    _, wrong = truth_of(cells)
-    assert len(wrong) == 1
-    with pytest.raises(ValueError, match=line):
-        raise ValueError(wrong[0])
+    _, (wrong,) = truth_of(cells)
+    assert re.search(line, wrong)
 
 
 @pytest.mark.parametrize(
@@ -205,32 +205,26 @@ def test_what_is_no_text_is_refused(root):
         read_manifest(root / "manifest.csv", root)
 
 
-@pytest.mark.parametrize(
-    ("file", "line"),
-    [
-        ("../outside.csv", "must lie inside the folder"),
-        ("day 2/../../outside.csv", "must lie inside the folder"),
-        ("/etc/passwd", "must lie inside the folder"),
-        (r"C:\data\a.csv", "must lie inside the folder"),
-        (r"\\server\share\a.csv", "must lie inside the folder"),
-        (r"..\outside.csv", "must lie inside the folder"),
-        ("link.csv", "is a link out of the folder"),
-        ("linked/outside.csv", "is a link out of the folder"),
-        ("loop.csv", "no file 'loop.csv'|cannot be opened"),
-        ("x" * 5000, "cannot be opened|no file"),
-        ("day 2/e.csv", "no file 'day 2/e.csv' in the folder; did you mean 'd.csv'"),
-        ("", "no file"),
-    ],
-)
-def test_a_path_out_of_the_folder_is_refused(root, file, line):
+PATHS = {
+    "must lie inside the folder": (
+        *("../outside.csv", "day 2/../../outside.csv", "/etc/passwd", r"..\outside.csv"),
+        *(r"C:\data\a.csv", r"\\server\share\a.csv"),
+    ),
+    "is a link out of the folder": ("link.csv", "linked/outside.csv"),
+    "no file|cannot be opened": ("loop.csv", "x" * 5000, ""),
+    "no file 'day 2/e.csv' in the folder; did you mean 'd.csv'": ("day 2/e.csv",),
+}
+
+
+@pytest.mark.parametrize("line", PATHS)
+def test_a_path_out_of_the_folder_is_refused(root, line):
     (root.parent / "outside.csv").write_text("1\n")
     (root / "link.csv").symlink_to(root.parent / "outside.csv")
     (root / "linked").symlink_to(root.parent)
     (root / "loop.csv").symlink_to(root / "loop.csv")
-    found = problems(root, f'file,material\n"{file}",wood\n')
-    assert len(found) == 1
-    with pytest.raises(ValueError, match=line):
-        raise ValueError(found[0])
+    for file in PATHS[line]:
+        (found,) = problems(root, f'file,material\n"{file}",wood\n')
+        assert re.search(line, found)
 
 
 # On the time of the recording ------------------------------------------------------------------

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from .modules import of_training
 from .names import BIN_GRAPH, DETECTOR, METRICS, STREAM_GRAPH, SlipDetector, settings
 from .recordings import of_set, split_of_set, write_set
 from .running import Runner
@@ -115,3 +116,16 @@ def graphs_of(command, trained_by, tmp_path_factory):
         return made[key]
 
     return graphs
+
+
+class Quick(NamedTuple):
+    """The quick experiment on the simulated hand: its folder, and what it executed."""
+
+    folder: Path
+    modules: list[str]
+
+
+@pytest.fixture(scope="session")
+def quick(tmp_path_factory) -> Quick:
+    folder = tmp_path_factory.mktemp("quick")
+    return Quick(folder, of_training(folder))

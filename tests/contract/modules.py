@@ -18,8 +18,16 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from .names import PACKAGE, REPLACED_NEXT, SlipDetector, StreamingDetector, settings
-from .recordings import samples_of
+import numpy as np
+
+from .names import (
+    PACKAGE,
+    REPLACED_NEXT,
+    SlipDetector,
+    StreamingDetector,
+    sample_recording,
+    settings,
+)
 from .running import ROOT, environment
 
 FOLDER = ROOT / PACKAGE
@@ -28,27 +36,31 @@ FOLDER = ROOT / PACKAGE
 def executed_by(action: Callable[[], Any]) -> list[str]:
     """Paths in the package of modules whose functions run meanwhile, outside of imports."""
     found: set[str] = set()
-    importing = threading.local()
 
     def watch(frame: FrameType, event: str, _: Any) -> None:
-        code = frame.f_code
-        if event not in ("call", "return") or not code.co_filename.startswith(str(FOLDER)):
-            return
-        if code.co_name == "<module>":
-            if frame.f_globals["__name__"] != "__main__":
-                step = 1 if event == "call" else -1
-                importing.depth = getattr(importing, "depth", 0) + step
-        elif event == "call" and not getattr(importing, "depth", 0):
-            found.add(code.co_filename)
+        path = frame.f_code.co_filename
+        if path.startswith(str(FOLDER)) and path not in found and not _is_importing(frame):
+            found.add(path)
 
-    threading.setprofile(watch)
-    sys.setprofile(watch)
+    before = sys.gettrace()
+    threading.settrace(watch)
+    sys.settrace(watch)
     try:
         action()
     finally:
-        sys.setprofile(None)
-        threading.setprofile(None)
+        sys.settrace(before)
+        threading.settrace(before)
     return sorted(Path(path).relative_to(FOLDER).as_posix() for path in found)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Whether a module of the package is being imported, from which this is called or not."""
+    while frame is not None:
+        is_module = frame.f_code.co_name == "<module>"
+        if is_module and frame.f_globals["__name__"].startswith(PACKAGE):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def counted(modules: list[str]) -> list[str]:
@@ -57,7 +69,7 @@ def counted(modules: list[str]) -> list[str]:
 
 
 def of_training(folder: Path) -> list[str]:
-    """Modules that ``train +exp=quick`` executes, in a process of its own."""
+    """Modules that ``train +exp=quick`` executes, in a process of its own; it leaves its run."""
     words = settings(experiment="quick", workers=0, cache=folder / "cache", folder=folder / "run")
     command = [f"{PACKAGE}.train", *words]
     program = f"from contract import modules; modules.print_of({command!r})"
@@ -80,10 +92,9 @@ def print_of(command: list[str]) -> None:
     print(json.dumps(modules))
 
 
-def of_push(detector: SlipDetector) -> list[str]:
-    """Modules that one push of a stream executes which makes decisions."""
+def of_push(detector: SlipDetector, samples: np.ndarray) -> list[str]:
+    """Modules that one push of a stream ``[T, C]`` executes which makes decisions."""
     stream = StreamingDetector(detector)
-    samples = samples_of("D", 1)
     stream.push(samples[:1000])
     decisions = []
     modules = executed_by(lambda: decisions.append(stream.push(samples[1000:1200])))
@@ -93,19 +104,12 @@ def of_push(detector: SlipDetector) -> list[str]:
 
 def main() -> None:
     """Print both lists."""
-    from .conftest import RECIPES, train
-    from .recordings import of_set, split_of_set, write_set
-    from .running import Runner
-
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        lists = {"train +exp=quick": of_training(folder)}
-        overrides = [*of_set(write_set(folder / "set")), *split_of_set(), *RECIPES["selected"]]
-        overrides += settings(onset="debounced", workers=0, cache="off", export=False)
-        runner = Runner()
-        trained = train(runner, folder / "trained", overrides)
-        runner.close()
-        lists["one push of a stream"] = of_push(trained.detector)
+    samples = sample_recording().samples.T.numpy()
+    with tempfile.TemporaryDirectory() as folder:
+        lists = {
+            "train +exp=quick": of_training(Path(folder)),
+            "one push of a stream": of_push(SlipDetector.pretrained(), samples),
+        }
     for title, modules in lists.items():
         print(f"{title}: {len(modules)} modules, {len(counted(modules))} of them counted")
         for module in modules:

@@ -9,7 +9,15 @@ Left: the word the tests use. Right: what it is called now.
 
 from collections.abc import Sequence
 
-from tactslip_torch import FeaturePool, HandLayout, Scene, SlipDetector, StreamingDetector, simulate
+from tactslip_torch import (
+    FeaturePool,
+    HandLayout,
+    Scene,
+    SlipDetector,
+    StreamingDetector,
+    sample_recording,
+    simulate,
+)
 
 PACKAGE = "tactslip_torch"
 REPLACED_NEXT = ("features/", "deploy/")
@@ -114,7 +122,6 @@ HOSTS = {
     "web": "node {export}/web/shot.mjs",
 }
 BUILD_C_HOST = "make -C {export}/c CC=gcc PYTHON={python} BUILD={build}"
-INSTALL_HOST = "npm ci"  # in the folder of the host, of node and web
 HOST_OPTIONS = {"every": "--decisions", "chunk": "--chunk", "threshold": "--threshold"}
 HOST_OPTIONS |= {"rate": "--rate"}
 """Beside model and recording, which the web host takes as options of these names."""

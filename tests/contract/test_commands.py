@@ -143,10 +143,9 @@ def test_detect_does_without_masked_channels(command, selected, recordings, tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("to", ["npz", "h5"])
-def test_converted_recordings_are_the_same_set(command, selected, recordings, to, tmp_path):
+def test_converted_recordings_are_the_same_set(command, selected, recordings, tmp_path):
     told = settings(root_of_data=recordings, channels=CHANNELS, workers=0)
-    command.well(tmp_path, "data", *settings(action=names.CONVERT, format=to, output="to"), *told)
+    command.well(tmp_path, "data", *settings(action=names.CONVERT, format="h5", output="to"), *told)
     data = [*settings(data="files", root="to"), *split_of_set()]
     words = settings(model=selected.file, workers=0, cache="off", folder="run")
     command.well(tmp_path, "evaluate", *data, *words)
@@ -179,18 +178,9 @@ def test_adapt_adds_a_material_and_takes_it_back(command, selected, cache, tmp_p
 # A simulated set, and statistics in shards -------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def quick(command, tmp_path_factory):
-    """The quick experiment on the simulated hand, all of it."""
-    folder = tmp_path_factory.mktemp("quick")
-    told = settings(experiment="quick", workers=0, cache=folder / "cache", folder="run")
-    command.well(folder, "train", *told)
-    return folder
-
-
 @pytest.mark.slow
 def test_the_quick_experiment_trains_exports_and_says_it_is_simulated(quick):
-    metrics = read(quick / "run" / names.METRICS)
+    metrics = read(quick.folder / "run" / names.METRICS)
     assert metrics["simulated"] is True
     assert metrics["num_features_pool"] == 2582
     non_slip = {name: sum(s[names.CONFUSION][0]) for name, s in metrics[names.SPLITS].items()}
@@ -200,16 +190,13 @@ def test_the_quick_experiment_trains_exports_and_says_it_is_simulated(quick):
 
 
 @pytest.mark.slow
-def test_workers_and_a_warm_cache_change_nothing(command, quick, tmp_path):
+def test_workers_change_nothing(command, quick, tmp_path):
     told = settings(experiment="quick", export=False, baselines=False, folder="run")
-    metrics = read(quick / "run" / names.METRICS)
-    for words in (settings(workers=2, cache="off"), settings(workers=0, cache=quick / "cache")):
-        command.well(tmp_path, "train", *told, *words)
-        again = read(tmp_path / "run" / names.METRICS)
-        assert again["selected"] == metrics["selected"]
-        for name, scores in metrics[names.SPLITS].items():
-            assert again[names.SPLITS][name][names.CONFUSION] == scores[names.CONFUSION]
-        shutil.rmtree(tmp_path / "run")
+    command.well(tmp_path, "train", *told, *settings(workers=2, cache="off"))
+    metrics, again = (read(folder / "run" / names.METRICS) for folder in (quick.folder, tmp_path))
+    assert again["selected"] == metrics["selected"]
+    for name, scores in metrics[names.SPLITS].items():
+        assert again[names.SPLITS][name][names.CONFUSION] == scores[names.CONFUSION]
 
 
 @pytest.mark.slow

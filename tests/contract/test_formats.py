@@ -42,19 +42,6 @@ from .names import FORMATS, INSTALL_FORMATS, Reading, named_format, open_file, r
 ENDINGS = ("npz", "csv", "txt", "h5", "mat", "mcap", "parquet", "bag2")
 ALIKE = ("npy", "tsv", "dat", "lvm", "hdf5", "he5")
 KEY = {"scene": {"seed": 3}, "list": [1, None]}
-TRUTH = (
-    "sample_rate_hz",
-    "material",
-    "speeds_mm_s",
-    "onsets_s",
-    "annotated_onsets_s",
-    "sliding_s",
-    "non_slip_s",
-    "slip_s",
-    "released_s",
-    "units",
-    "provenance",
-)
 FLOATS = "std_msgs/msg/Float64MultiArray"
 
 
@@ -99,8 +86,7 @@ def odd_numbers(dtype):
 
 
 def assert_truth(found, wanted, hand):
-    for name in TRUTH:
-        assert getattr(found.recording, name) == getattr(wanted, name), name
+    assert {**vars(found.recording), "samples": None} == {**vars(wanted), "samples": None}
     assert (found.hand, found.key) == (hand, KEY)
 
 
@@ -144,7 +130,8 @@ def test_what_goes_in_comes_out(tmp_path, ending, dtype):
         odd_numbers(dtype),
         torch.empty(2, 0, dtype=dtype),
     ):
-        wanted = recording(samples, sample_rate_hz=1e6 / 3)
+        changes = {} if samples.shape[1] else {"released_s": ()}
+        wanted = recording(samples, sample_rate_hz=1e6 / 3, **changes)
         hand = hand_of(["SG1", "Kraft ü", 'a "b", c'][: len(samples)])
         form.save(path, wanted, hand, KEY)
         found = form.load(path)
@@ -163,18 +150,12 @@ def test_what_goes_in_comes_out(tmp_path, ending, dtype):
             assert bits(part) == bits(samples[:, 1500:1600].contiguous())
 
 
-@pytest.mark.parametrize("ending", ["npz", "csv"])
-def test_a_file_that_says_nothing_of_releases_is_read_as_before(tmp_path, ending):
-    form, path = named_format(ending), tmp_path / f"a.{ending}"
-    wanted, hand = recording(released_s=()), hand_of(["SG1", "SG2"])
+def test_a_table_that_says_nothing_of_releases_is_read_as_before(tmp_path):
+    form, path = named_format("csv"), tmp_path / "a.csv"
+    wanted, hand = recording(released_s=()), hand_of("ab")
     form.save(path, wanted, hand, KEY)
-    if ending == "npz":
-        with np.load(path) as file:
-            assert "released_s" not in file
-    else:
-        text, said = path.read_text("utf-8"), '"released_s": [], '
-        assert text.count(said) == 1
-        path.write_text(text.replace(said, ""), "utf-8")
+    path.write_text(path.read_text("utf-8").replace('"released_s": [], ', "", 1), "utf-8")
+    assert "released_s" not in path.read_text("utf-8")
     assert_truth(form.load(path), wanted, hand)
 
 
@@ -385,11 +366,11 @@ def test_a_text_table_is_found_out(tmp_path, content):
     assert_rows(read(tmp_path / "a.txt"), ("a", "b") if TABLES[content] else None)
 
 
-def test_encodings(tmp_path):
-    for encoding in ("utf-8", "utf-8-sig", "latin-1", "utf-16"):
-        content = "t;Kraft °;b\n0;1,5;-2\n0,5;2,5;4e-3\n1;;5\n"
-        (tmp_path / "a.txt").write_bytes(content.encode(encoding))
-        assert_rows(read(tmp_path / "a.txt"), ("Kraft °", "b"))
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
+def test_encodings(tmp_path, encoding):
+    content = "t;Kraft °;b\n0;1,5;-2\n0,5;2,5;4e-3\n1;;5\n"
+    (tmp_path / "a.txt").write_text(content, encoding)
+    assert_rows(read(tmp_path / "a.txt"), ("Kraft °", "b"))
 
 
 LVM = (
@@ -866,7 +847,7 @@ def test_the_topic_is_the_one_named_or_the_only_one(tmp_path):
 def test_a_cut_mcap_file_is_refused_with_its_remedy(tmp_path):
     path = write_mcap(tmp_path / "a.mcap", [wrenches(120)[0]])
     content = path.read_bytes()
-    for size in [*range(8, 200, 7), *range(200, len(content), 531), len(content) - 1]:
+    for size in (8, 50, 200, len(content) // 2, len(content) - 1):
         path.write_bytes(content[:size])
         said = refused(path)
     assert "mcap recover" in said

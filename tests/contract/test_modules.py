@@ -5,8 +5,9 @@ from functools import cache
 
 import pytest
 
-from .modules import FOLDER, counted, of_push, of_training
+from .modules import FOLDER, counted, of_push
 from .names import PACKAGE
+from .recordings import samples_of
 
 MOST_OF_TRAINING = 40
 MOST_OF_A_PUSH = 8
@@ -37,11 +38,11 @@ def test_no_chain_of_imports_is_longer():
 
 
 @pytest.mark.slow
-def test_a_short_training_executes_so_many_modules(tmp_path):
-    modules = counted(of_training(tmp_path))
+def test_a_short_training_executes_so_many_modules(quick):
+    modules = counted(quick.modules)
     assert 10 < len(modules) <= MOST_OF_TRAINING, modules
 
 
 def test_one_push_executes_so_many_modules(trained):
-    modules = counted(of_push(trained.detector))
+    modules = counted(of_push(trained.detector, samples_of("D", 1)))
     assert 1 < len(modules) <= MOST_OF_A_PUSH, modules
