@@ -26,6 +26,7 @@ import pyarrow.parquet as pq
 import pytest
 import scipy.io
 import torch
+from foreign_files import LVM, stored
 from message_bags import Sent as SentMessages
 from message_bags import json_message, write_mcap
 from small_detector import alarming_detector, small_detector
@@ -126,31 +127,15 @@ def is_read(use, path, is_format=True):
 # Whole files, ours and other people's: what damage begins from ---------------------------------
 
 
-def table(delimiter, header=""):
-    rows = np.column_stack([TIMES, SAMPLES]).tolist()
+def table(delimiter, header="", num=3):
+    rows = np.column_stack([TIMES, SAMPLES[:, :num]]).tolist()
     return header + "".join(delimiter.join(map(repr, row)) + "\n" for row in rows)
 
 
-def write_hdf5(path, **how):
-    with h5py.File(path, "w", **how) as file:
-        group = file.create_group("run")
-        stored = group.create_dataset(
-            "volts", data=SAMPLES, chunks=(16, 3), compression="gzip", shuffle=True
-        )
-        stored.attrs["fs"] = 100.0
-        group["time"] = TIMES
-        group["names"] = ["a", "b", "c"]
-
-
-def write_mat5(path):
-    trial = {"volts": SAMPLES, "time": TIMES, "fs": 100.0, "labels": np.array(["a"], dtype=object)}
-    scipy.io.savemat(path, {"trial": trial}, do_compression=True)
-
-
-def write_mat73(path):
-    write_hdf5(path, userblock_size=512)
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+def write_arrays(path):
+    labels = ["a", "b", "c"]
+    content = {"volts": SAMPLES, "time": TIMES, "fs": 100.0, "labels": labels}
+    stored(path, **{f"run/{name}": values for name, values in content.items()})
 
 
 def write_parquet(path):
@@ -164,10 +149,6 @@ def write_json(path):
     write_mcap(path, [SentMessages("/force", "Force", messages, "json", "jsonschema", "{}")])
 
 
-LVM = (
-    "LabVIEW Measurement\t\nSeparator\tTab\nX_Columns\tOne\n***End_of_Header***\t\n\t\n"
-    "Channels\t3\nDelta_X\t0.01\t0.01\t0.01\n***End_of_Header***\nX_Value\ta\tb\tc\tComment\n"
-)
 THEIRS = {
     "npz": {
         "a.npy": lambda path: np.save(path, SAMPLES),
@@ -178,11 +159,11 @@ THEIRS = {
         "a.csv": lambda path: path.write_text(table(",", 'time_s,"a, b",c,d\n')),
         "b.txt": lambda path: path.write_text(table("\t").replace(".", ",")),
         "c.dat": lambda path: path.write_text(table("  ", "# t a b c\n")),
-        "d.lvm": lambda path: path.write_text(LVM + table("\t")),
+        "d.lvm": lambda path: path.write_text(LVM.format(x="One", point=".") + table("\t", num=2)),
         "e.tsv": lambda path: path.write_text(table("\t", "t\ta\tb\tc\n"), encoding="utf-16"),
     },
-    "hdf5": {"a.h5": write_hdf5},
-    "mat": {"a.mat": write_mat5, "b.mat": write_mat73},
+    "hdf5": {"a.h5": write_arrays},
+    "mat": {"packed.mat": write_arrays, "73.mat": write_arrays},
     "parquet": {"a.parquet": write_parquet},
     "mcap": {"a.mcap": write_json},
 }

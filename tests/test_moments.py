@@ -22,11 +22,11 @@ def make_batches(num=8, seed=0, most=12):
     rng = np.random.default_rng(seed)
     batches = []
     for number in range(num):
-        rows = slice(int(rng.integers(0, most)))
-        z = torch.from_numpy(np.clip(rng.standard_normal((most, NUM)), -1, 1))
-        is_slip = torch.from_numpy(rng.uniform(size=most) < 0.6)
-        weights = torch.from_numpy(rng.uniform(0.1, 3, most))
-        batches.append((f"M{number % 3}/{number}", z[rows], is_slip[rows], weights[rows]))
+        size = int(rng.integers(0, most))
+        z = torch.from_numpy(np.clip(rng.standard_normal((size, NUM)), -1, 1))
+        is_slip = torch.from_numpy(rng.uniform(size=size) < 0.6)
+        weights = torch.from_numpy(rng.uniform(0.1, 3, size))
+        batches.append((f"M{number % 3}/{number}", z, is_slip, weights))
     return batches
 
 
@@ -41,19 +41,6 @@ def assert_same(one, other):
     torch.testing.assert_close(one.sums, other.sums, rtol=1e-12, atol=1e-12)
     assert torch.equal(one.count, other.count)
     assert (one.seen_batches, one.about) == (other.seen_batches, other.about)
-
-
-def joined(batches):
-    parts = [torch.cat([batch[i] for batch in batches]) for i in (1, 2, 3)]
-    return parts[0], parts[1], parts[2]
-
-
-def balanced(is_slip, weights):
-    """Each class with half of the total weight."""
-    out = weights.clone()
-    for of in (is_slip, ~is_slip):
-        out[of] *= weights.sum() / (2 * weights[of].sum())
-    return out
 
 
 # Machines -------------------------------------------------------------------------------------
@@ -110,8 +97,11 @@ def test_the_machine_is_that_of_scikit_learn(penalty, offset, degree, used, bala
     before = stats.sums.clone()
     form = stats.solve(penalty, offset, used, balance)
     assert torch.equal(stats.sums, before)
-    z, is_slip, weights = joined(batches)
-    weights = balanced(is_slip, weights) if balance == "weights" else weights
+    z, is_slip, weights = (torch.cat(parts) for parts in list(zip(*batches, strict=True))[1:])
+    if balance == "weights":  # each class has half of the total
+        total = weights.sum() / 2
+        for own in (is_slip, ~is_slip):
+            weights[own] *= total / weights[own].sum()
     ridge = KernelRidge(alpha=1 / penalty, kernel="poly", degree=degree, gamma=1, coef0=offset)
     ridge.fit(z[:, :used], np.where(is_slip, 1.0, -1.0), sample_weight=weights.numpy())
     at = rng.uniform(-1, 1, (9, used or NUM))
@@ -150,19 +140,16 @@ def test_a_batch_that_is_refused_changes_nothing(place, value, message):
     assert_same(stats, stats_of([("a", *BATCH[1:])]))
 
 
-@pytest.mark.parametrize(
-    ("other", "message"),
-    [
+def test_sums_that_do_not_merge_stay_as_they_are():
+    stats = stats_of(make_batches())
+    for other, message in (
         (SufficientStats(3, ABOUT), "num_features: 4 and 3"),
         (SufficientStats(NUM, ABOUT | {"scaler": "x"}), "scaler: range and x"),
-        (stats_of(make_batches()), "8 batches are in both statistics, such as 'M0/0'"),
-    ],
-)
-def test_sums_that_do_not_merge_stay_as_they_are(other, message):
-    stats = stats_of(make_batches())
-    with pytest.raises(ValueError, match=message):
-        stats.merge(other)
-    assert_same(stats, stats_of(make_batches()))
+        (stats, "8 batches are in both statistics, such as 'M0/0'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            stats.merge(other)
+        assert_same(stats, stats_of(make_batches()))
 
 
 @pytest.mark.parametrize(
@@ -211,15 +198,14 @@ def statistics_of(recordings, sample_bins=3):
 
 def bits_of(statistics):
     """All of a statistics but its moments, as bytes and text, so that 0 and -0 differ."""
-    sample = vars(statistics.sample.bins())
-    tensors = {name: x for name, x in sample.items() if isinstance(x, torch.Tensor)}
-    tensors |= {"minimum": statistics.minimum, "maximum": statistics.maximum}
-    bits = {
-        name: (str(tensor.dtype), tuple(tensor.shape), tensor.numpy().tobytes())
-        for name, tensor in tensors.items()
+    held = vars(statistics.sample.bins()) | {
+        "batches": dict(sorted(statistics.seen_batches.items()))
     }
-    names = sample["group_names"], sample["recording_names"]
-    return sorted(statistics.seen_batches.items()), names, bits
+    held |= {"minimum": statistics.minimum, "maximum": statistics.maximum}
+    return {
+        name: (x.dtype, x.shape, x.numpy().tobytes()) if isinstance(x, torch.Tensor) else x
+        for name, x in held.items()
+    }
 
 
 @given(

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 import scipy.io
 import torch
+from foreign_files import LVM, made_73, made_hdf5, stored
 from mcap.reader import make_reader
 from message_bags import (
     START_NS,
@@ -373,14 +374,6 @@ def test_encodings(tmp_path, encoding):
     assert_rows(read(tmp_path / "a.txt"), ("Kraft °", "b"))
 
 
-LVM = (
-    "LabVIEW Measurement\t\nSeparator\tTab\nDecimal_Separator\t{point}\nX_Columns\t{x}\n"
-    "***End_of_Header***\t\n\t\nChannels\t2\t\nSamples\t3\t3\t\nDate\t2012/06/01\t2012/06/01\t\n"
-    "X_Dimension\tTime\tTime\t\nDelta_X\t0{point}500000\t0{point}500000\t\n"
-    "***End_of_Header***\t\t\t\nX_Value\tUntitled\tUntitled 1\tComment\n"
-)
-
-
 @pytest.mark.parametrize("point", [".", ","])
 @pytest.mark.parametrize("x", ["One", "No"])
 def test_labview_measurements(tmp_path, x, point):
@@ -453,39 +446,6 @@ def test_what_is_wrong_in_text_has_its_line(tmp_path, content, said):
 # Arrays: NumPy, HDF5, MAT, Parquet -------------------------------------------------------------
 
 
-def made_hdf5(path, **datasets):
-    with h5py.File(path, "w") as file:
-        for name, values in datasets.items():
-            file[name] = values
-    return path
-
-
-def made_73(path, **variables):
-    """As MATLAB writes it: rows and columns turned, classes marked, characters as numbers."""
-    kinds = {"f8": "double", "f4": "single", "i2": "int16", "b1": "logical"}
-    with h5py.File(path, "w", userblock_size=512) as file:
-
-        def put(name, values):
-            if isinstance(values, list):
-                references = [put(f"#refs#/{name}{i}", one).ref for i, one in enumerate(values)]
-                kept = file.create_dataset(name, data=[references], dtype=h5py.ref_dtype)
-                kind = "cell"
-            elif isinstance(values, str):
-                codes = np.frombuffer(values.encode("utf-16-le"), "<u2")
-                kept, kind = file.create_dataset(name, data=codes[:, None]), "char"
-            else:
-                kept = file.create_dataset(name, data=np.atleast_2d(values).T)
-                kind = kinds[np.atleast_2d(values).dtype.str[1:]]
-            kept.attrs["MATLAB_class"] = np.bytes_(kind)
-            return kept
-
-        for name, values in variables.items():
-            put(name, values)
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
-    return path
-
-
 @pytest.mark.parametrize("dtype", ["f4", ">f8", "u2", "i4"])
 def test_numpy_arrays(tmp_path, dtype):
     volts = np.random.default_rng(0).integers(0, 99, (60, 3)).astype(dtype)
@@ -499,26 +459,6 @@ def test_numpy_arrays(tmp_path, dtype):
         np.testing.assert_array_equal(samples, volts.T)
         assert samples.dtype == (torch.float32 if is_small else torch.float64)
         assert (names, since, rate) == (None, None, None)
-
-
-def stored(path, **content):
-    """The same content as any format of arrays has it; a stroke in a name is a group."""
-    if path.suffix == ".npz":
-        np.savez(path, **content)
-    elif path.suffix == ".h5":
-        made_hdf5(path, **content)
-    elif path.name == "73.mat":
-        made_73(path, **content)
-    else:
-        whole = {}
-        for name, values in content.items():
-            *groups, leaf = name.split("/")
-            place = whole
-            for group in groups:
-                place = place.setdefault(group, {})
-            place[leaf] = np.array(values, "O") if isinstance(values, list) else values
-        scipy.io.savemat(path, whole, do_compression=path.stem == "packed")
-    return path
 
 
 def of_arrays(*names):

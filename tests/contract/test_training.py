@@ -69,10 +69,9 @@ def test_a_training_recording_does_change_the_fit(selected, with_other_recording
 # Going on after a kill ---------------------------------------------------------------------------
 
 
-def test_a_killed_run_goes_on_behind_its_last_pass(command, trained_or_slow, tmp_path):
+def test_a_killed_run_goes_on_behind_its_last_pass(command, selected, tmp_path):
     """Killed once the first pass is written; what is made then is the detector of a whole run."""
-    trained = trained_or_slow
-    overrides = trained.again(statistics=False)  # which need the first pass in one go
+    overrides = selected.again(statistics=False)  # which need the first pass in one go
     for attempt in ("1", "2", "3"):  # on a busy machine a run may end first
         run = tmp_path / attempt / "run"
         pid = command.start(tmp_path / attempt, "train", *overrides, *settings(folder="run"))
@@ -84,7 +83,7 @@ def test_a_killed_run_goes_on_behind_its_last_pass(command, trained_or_slow, tmp
     assert not (run / names.DETECTOR).exists()
     resumed = train(command, tmp_path / "again", overrides, resume=run)
     torch.testing.assert_close(
-        scores_of(resumed.detector), scores_of(trained.detector), rtol=1e-12, atol=1e-12
+        scores_of(resumed.detector), scores_of(selected.detector), rtol=1e-12, atol=1e-12
     )
-    for name, scores in trained.metrics[names.SPLITS].items():
+    for name, scores in selected.metrics[names.SPLITS].items():
         assert resumed.metrics[names.SPLITS][name][names.CONFUSION] == scores[names.CONFUSION], name
