@@ -1,7 +1,9 @@
 """Fixtures every test file may ask for, and the seed of everything that is generated."""
 
 import os
+import sys
 import zlib
+from typing import Any
 
 import generated
 import numpy as np
@@ -87,6 +89,22 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
     monkeypatch.setattr(Figure, "savefig", keep)
     return figures
+
+
+@pytest.fixture
+def typed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Runs a command's module with arguments: exit status, and what stands on both streams."""
+
+    def run(command: Any, *arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["tactslip", *map(str, arguments)])
+        try:
+            command.main()
+            status = 0
+        except SystemExit as end:
+            status = int(end.code or 0)
+        return status, *capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])

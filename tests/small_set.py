@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import Recording, RecordingId, Timeline
@@ -34,12 +35,45 @@ class SmallTimeline(Timeline):
     speeds_mm_s: tuple[float, ...] = (20.0,)
 
 
-class SmallSet:
-    """A ``RecordingSource``; ``gains`` scales recordings, ``broken`` names one that holds a NaN."""
+class NoiseRecordings:
+    """A ``RecordingSource`` of two channels of noise; a subclass says which, and shapes it."""
 
-    is_simulated = True
+    is_simulated = False
     hand = SMALL_HAND
     sample_rate_hz = RATE_HZ
+    ids: tuple[RecordingId, ...] = ()
+
+    def timeline(self, recording: RecordingId) -> Timeline:
+        return SmallTimeline()
+
+    def key(self, recording: RecordingId) -> dict[str, Any]:
+        return {"id": str(recording)}
+
+    def seed(self, recording: RecordingId) -> int:
+        return sum(str(recording).encode()) * 7919
+
+    def shape(
+        self, noise: Tensor, time_s: Tensor, recording: RecordingId, generator: torch.Generator
+    ) -> None:
+        """Change white noise of size 1 ``[C, T]`` in place."""
+
+    def load(
+        self, recording: RecordingId, windows: Sequence[tuple[float, float]] | None = None
+    ) -> Recording:
+        times, rate_hz = self.timeline(recording), self.sample_rate_hz
+        generator = torch.Generator().manual_seed(self.seed(recording))
+        num_samples = round(times.duration_s * rate_hz)
+        noise = torch.randn(len(self.hand), num_samples, generator=generator)
+        self.shape(noise, torch.arange(num_samples) / rate_hz, recording, generator)
+        truth = times.speeds_mm_s, times.onsets_s, times.sliding_s
+        released_s = times.released_s
+        return Recording(noise, rate_hz, recording.material, *truth, released_s=released_s)
+
+
+class SmallSet(NoiseRecordings):
+    """Its ``gains`` scale recordings, ``broken`` names one that holds a NaN."""
+
+    is_simulated = True
 
     def __init__(
         self,
@@ -53,29 +87,20 @@ class SmallSet:
         self.broken = broken
         self.loads = 0
 
-    def timeline(self, recording: RecordingId) -> SmallTimeline:
-        return SmallTimeline()
-
     def key(self, recording: RecordingId) -> dict[str, Any]:
         gain = self.gains.get(recording, 1.0)
         return {"id": str(recording), "gain": gain, "broken": recording == self.broken}
 
-    def load(
-        self, recording: RecordingId, windows: Sequence[tuple[float, float]] | None = None
-    ) -> Recording:
+    def shape(
+        self, noise: Tensor, time_s: Tensor, recording: RecordingId, generator: torch.Generator
+    ) -> None:
         self.loads += 1
-        times = self.timeline(recording)
-        generator = torch.Generator().manual_seed(sum(str(recording).encode()) * 7919)
-        noise = torch.randn(2, round(times.duration_s * RATE_HZ), generator=generator)
-        onset = round(times.onsets_s[0] * RATE_HZ)
+        onset = round(self.timeline(recording).onsets_s[0] * RATE_HZ)
         noise[:, onset:] *= 1.25 + 0.25 * torch.rand(1, generator=generator)
         noise[0] += 1.0
-        noise = noise * self.gains.get(recording, 1.0)
+        noise *= self.gains.get(recording, 1.0)
         if recording == self.broken:
             noise[1, onset + 300] = torch.nan
-        return Recording(
-            noise, RATE_HZ, recording.material, times.speeds_mm_s, times.onsets_s, times.sliding_s
-        )
 
 
 def small_maker(source: SmallSet, cache: FeatureCache | None = None, **rule: Any) -> FeatureMaker:

@@ -2,59 +2,43 @@
 
 import hashlib
 import json
-import sys
+import re
 
 import pytest
 import torch
 from drawing import assert_png
 from hydra.utils import instantiate
 from small_detector import small_detector
-from test_commands import BAD_INPUT, TinyRecordings, composed
+from test_commands import BAD_INPUT, TINY_DATA, TINY_SPLIT, TinyRecordings, composed
 
 from tactslip_torch.analysis.raw_bins import draw_bins
-from tactslip_torch.commands.certify import certify, main
+from tactslip_torch.commands import certify as command
+from tactslip_torch.commands.certify import certify
 from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.data.labels import LabelRule, label_bins
 from tactslip_torch.deploy.check import EXTREMES
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.training.datamodule import FeatureMaker
 
-TINY = (
-    "data._target_=test_commands.TinyRecordings",
-    "data.materials=[A,B,C]",
-    "data.cycles=4",
-    "split.seen=[A,B]",
-    "split.unseen=[C]",
-    "split.train_fraction=0.5",
-    "bins=60",
-    "scored_bins=40",
-    "extremes=3",
-)
+TOLD = (*TINY_DATA, *TINY_SPLIT, "bins=60", "scored_bins=40", "extremes=3")
 
 
-def source():
-    return TinyRecordings(seed=0, cycles=4, materials=["A", "B", "C"])
+SOURCE = TinyRecordings(seed=0, cycles=4, materials=["A", "B", "C"])
 
 
 def saved(folder, **options):
     detector = small_detector(**options)
-    known = {str(r): cache_key(source().key(r)) for r in source().ids if r.cycle == 0}
+    known = {str(r): cache_key(SOURCE.key(r)) for r in SOURCE.ids if r.cycle == 0}
     detector.info["train_recordings"] = known
     folder.mkdir(exist_ok=True)
     detector.save(folder / "detector.pt")
     return folder / "detector.pt"
 
 
-def written(path, *overrides):
-    content = certify(composed(*TINY, f"model={path}", *overrides, name="certify"))
-    kept = json.loads((path.parent / "certificate.json").read_text())
-    assert content == kept
-    return content
-
-
 def test_the_files_stand_beside_the_detector_and_repeat(tmp_path):
     path = saved(tmp_path)
-    content = written(path)
+    content = certify(composed(*TOLD, f"model={path}", name="certify"))
+    assert json.loads((tmp_path / "certificate.json").read_text()) == content
     assert_png(tmp_path / "certificate.png")
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"certificate.json", "certificate.png", "detector.pt"}
@@ -63,26 +47,22 @@ def test_the_files_stand_beside_the_detector_and_repeat(tmp_path):
     assert content["detector"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
     num_bins = {name: row["bins"] for name, row in content["sets"].items()}
     assert num_bins == {"calibration": 60, "test": 40, "unseen": 40}
-    assert {name: row["bins"] for name, row in content["extremes"].items()} == dict.fromkeys(
-        EXTREMES, 3
-    )
-    drawn = content["data"]["drawn"]
-    assert (drawn["calibration"]["role"], drawn["calibration"]["materials"]) == (
-        "train",
-        ["A", "B"],
-    )
-    assert (drawn["unseen"]["recordings"], drawn["unseen"]["materials"]) == (1, ["C"])
+    extremes = {name: row["bins"] for name, row in content["extremes"].items()}
+    assert extremes == dict.fromkeys(EXTREMES, 3)
+    known, unseen = (content["data"]["drawn"][name] for name in ("calibration", "unseen"))
+    assert (known["role"], known["materials"]) == ("train", ["A", "B"])
+    assert (unseen["recordings"], unseen["materials"]) == (1, ["C"])
 
 
 # The bins it draws -----------------------------------------------------------------------------
 
 
-def drawn(number, role="train", seed=0, fold=None):
-    config = composed(*TINY, "model=x", name="certify")
-    fold = fold or instantiate(config.split, _convert_="all")(source().ids)[0]
+def drawn(number, seed=0):
+    config = composed(*TOLD, "model=x", name="certify")
+    (fold,) = instantiate(config.split, _convert_="all")(SOURCE.ids)
     detector = small_detector()
-    maker = FeatureMaker(source(), detector.pool, detector.channel_filter, LabelRule())
-    bins, _, recordings = draw_bins(maker, fold, role, number, seed)
+    maker = FeatureMaker(SOURCE, detector.pool, detector.channel_filter, LabelRule())
+    bins, _, recordings = draw_bins(maker, fold, "train", number, seed)
     return bins, recordings, fold
 
 
@@ -96,9 +76,9 @@ def test_drawn_bins_are_those_of_the_role_with_their_context(number, num_recordi
     assert len(recordings) == num_recordings
     known = {}
     for recording in fold.having("train"):
-        times = source().timeline(recording)
+        times = SOURCE.timeline(recording)
         own = label_bins(LabelRule(), times.onsets_s, times.sliding_s, times.duration_s, 2000.0)
-        samples = source().load(recording).samples
+        samples = SOURCE.load(recording).samples
         cut = [samples[:, start - 25 : start + 125] for start in own.starts.tolist()]
         known |= dict.fromkeys(keys_of(cut), recording)
     assert {known[key] for key in keys_of(bins)} == set(recordings)
@@ -111,36 +91,17 @@ def test_drawn_bins_are_those_of_the_role_with_their_context(number, num_recordi
 # The command -----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Exit status, output and the lines on standard error that say how it went."""
+def test_the_exit_status_is_0_if_it_holds_and_1_if_not(typed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-    def running(*arguments):
-        monkeypatch.setattr(sys, "argv", ["certify", *TINY, *map(str, arguments)])
-        status = 0
-        try:
-            main()
-        except SystemExit as stop:
-            status = stop.code
-        done = capsys.readouterr()
-        lines = [x for x in done.err.splitlines() if x.startswith(("error", "Does not hold"))]
-        return status, done.out, lines
-
-    return running
-
-
-def test_the_exit_status_is_0_if_it_holds_and_1_if_not(run, tmp_path):
-    status, out, lines = run(f"model={saved(tmp_path)}", "evaluate=[]")
-    assert (status, lines) == (0, [])
+    status, out, _ = typed(command, *TOLD, f"model={saved(tmp_path)}", "evaluate=[]")
+    assert status == 0
     assert out.startswith("Holds: ")
     assert "; no held-out bins were evaluated" in out
     assert str(tmp_path / "certificate.json") in out
-    model = saved(tmp_path / "b", gain=1e39)
-    status, out, (line,) = run(f"model={model}", "evaluate=unseen", "extremes=1")
+    told = f"model={saved(tmp_path / 'b', gain=1e39)}", "evaluate=unseen", "extremes=1"
+    status, out, err = typed(command, *TOLD, *told)
     assert (status, out) == (1, "")
-    assert line.startswith("Does not hold: error of the head")
-    assert line.endswith("certificate.json")
+    assert re.search(r"^Does not hold: error of the head.*certificate\.json$", err, re.MULTILINE)
     content = json.loads((tmp_path / "b" / "certificate.json").read_text())
     assert (content["holds"], list(content["sets"])) == (False, ["calibration", "unseen"])
 
@@ -164,7 +125,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(override, words, tmp_path,
     (tmp_path / "foreign" / "certificate.json").write_text("mine")
     more = ["bins=200"] if "broken" in override else []
     with pytest.raises(BAD_INPUT) as caught:
-        certify(composed(*TINY, f"model={saved(tmp_path)}", *more, override, name="certify"))
+        certify(composed(*TOLD, f"model={saved(tmp_path)}", *more, override, name="certify"))
     assert words in one_line(caught.value)
     assert (tmp_path / "foreign" / "certificate.json").read_text() == "mine"
     assert not list(tmp_path.glob("certificate*"))

@@ -11,26 +11,25 @@ import torch
 from biotac_layout import write_biotac
 from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
+from small_set import NoiseRecordings
 
-from tactslip_torch import HandLayout, Recording, SlipDetector
+from tactslip_torch import HandLayout, SlipDetector
 from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.commands.train import train
-from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.recording import RecordingId, Timeline
 
 BAD_INPUT = (ValueError, KeyError, TypeError, OSError, InstantiationException)
 
 
-class TinyRecordings:
-    """Recordings of a stand-in for real sensors: two strokes, louder while the hand slides.
+class TinyRecordings(NoiseRecordings):
+    """Recordings in the place of real ones: two strokes, louder while the hand slides.
 
     ``scene`` may hold ``slide_s``, ``quiet`` (materials that never slip long enough for a bin) and
     ``rate``; ``channels`` says how many of the four channels there are, ``broken`` which recording
     ends in NaN.
     """
-
-    is_simulated = False
 
     def __init__(self, seed, cycles, materials, channels=None, scene=None, broken="", **simulated):
         rows = [
@@ -39,68 +38,52 @@ class TinyRecordings:
             for i, finger in enumerate(("index", "thumb"), 1)
         ]
         self.hand = HandLayout.from_rows(rows[-channels:] if channels else rows)
-        knobs = {"slide_s": 0.8, "quiet": (), "rate": 2000.0, "broken": broken} | (scene or {})
+        self._options = {"slide_s": 0.8, "quiet": (), "rate": 2000.0} | (scene or {})
         assert not simulated.get("extra_scenes")
-        self.sample_rate_hz = knobs["rate"]
+        self.sample_rate_hz = self._options["rate"]
         self.ids = tuple(RecordingId(m, c) for m in materials for c in range(cycles))
-        self._seed, self._knobs = seed, knobs
+        self._seed, self._broken = seed, broken
 
     def timeline(self, recording):
-        slide_s = 0.02 if recording.material in self._knobs["quiet"] else self._knobs["slide_s"]
-        onsets = (1.1, 3.1)
-        return SimpleNamespace(
+        is_quiet = recording.material in self._options["quiet"]
+        slide_s, onsets = 0.02 if is_quiet else self._options["slide_s"], (1.1, 3.1)
+        return Timeline(
             duration_s=4.5,
             onsets_s=onsets,
             annotated_onsets_s=onsets,
             sliding_s=tuple((onset, onset + slide_s) for onset in onsets),
             speeds_mm_s=(20.0, 40.0),
-            non_slip_s=(),
-            slip_s=(),
-            missing_s=(),
             released_s=tuple((onset - 0.04, onset + 0.02) for onset in onsets),
         )
 
     def key(self, recording):
-        return {"tiny": str(recording), "seed": self._seed, "hand": self.hand.to_rows()} | {
-            name: list(value) if name == "quiet" else value for name, value in self._knobs.items()
-        }
+        own = {"tiny": str(recording), "seed": self._seed, "hand": self.hand.to_rows()}
+        return own | self._options | {"quiet": [*self._options["quiet"]], "broken": self._broken}
 
-    def load(self, recording, windows=None):
-        times = self.timeline(recording)
-        seed = self._seed * 1009 + sum(recording.material.encode()) * 31 + recording.cycle
-        generator = torch.Generator().manual_seed(seed)
-        num_samples = round(times.duration_s * self.sample_rate_hz)
-        noise = torch.randn(len(self.hand), num_samples, generator=generator)
-        time_s = torch.arange(num_samples) / self.sample_rate_hz
-        for start, end in times.sliding_s:
+    def seed(self, recording):
+        return self._seed * 1009 + sum(recording.material.encode()) * 31 + recording.cycle
+
+    def shape(self, noise, time_s, recording, generator):
+        for start, end in self.timeline(recording).sliding_s:
             noise[:, (time_s >= start) & (time_s < end)] *= 1.3
-        if str(recording) == self._knobs["broken"]:
+        if str(recording) == self._broken:
             noise[0, 2000:] = torch.nan
-        return Recording(
-            noise,
-            self.sample_rate_hz,
-            recording.material,
-            times.speeds_mm_s,
-            times.onsets_s,
-            times.sliding_s,
-            released_s=times.released_s,
-        )
 
 
-TINY = (
-    "name=tiny",
+TINY_DATA = (
     "data._target_=test_commands.TinyRecordings",
     "data.materials=[A,B,C]",
     "data.cycles=4",
-    "split.seen=[A,B]",
-    "split.unseen=[C]",
-    "split.train_fraction=0.5",
-    "recipe.num_features=10",
-    "recipe.penalties=[0.1,1.0]",
     "num_workers=0",
-    "export=false",
 )
-TINY_EVALUATE = tuple(o for o in TINY if not o.startswith(("recipe", "export")))
+TINY_SPLIT = ("split.seen=[A,B]", "split.unseen=[C]", "split.train_fraction=0.5")
+TINY_FOLDS = (
+    "split=leave_one_material_out",
+    "split.materials=[A,B,C]",
+    "split.train_fraction=0.5",
+)
+TINY_FIT = ("recipe.num_features=10", "recipe.penalties=[0.1,1.0]", "export=false")
+TINY = (*TINY_DATA, *TINY_SPLIT, *TINY_FIT)
 
 
 def composed(*overrides, name="train"):
@@ -114,17 +97,10 @@ def run_train(folder, *overrides):
     return returned, json.loads((folder / "metrics.json").read_text())
 
 
-def tensors(folder):
-    return SlipDetector.load(folder / "detector.pt").state_dict()
-
-
 def assert_same_detector(folder, other):
-    own, others = tensors(folder), tensors(other)
-    assert set(own) == set(others)
-    for name, value in own.items():
-        torch.testing.assert_close(value, others[name], rtol=1e-9, atol=1e-12)
-    selected = [SlipDetector.load(f / "detector.pt").selected for f in (folder, other)]
-    assert selected[0] == selected[1]
+    own, its = (SlipDetector.load(f / "detector.pt") for f in (folder, other))
+    assert own.selected == its.selected
+    torch.testing.assert_close(own.state_dict(), its.state_dict(), rtol=1e-9, atol=1e-12)
 
 
 # A run on recordings that are not simulated ----------------------------------------------------
@@ -132,9 +108,10 @@ def assert_same_detector(folder, other):
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory):
+    """A run, and the cache of its features."""
     folder, cache = tmp_path_factory.mktemp("tiny"), tmp_path_factory.mktemp("cache")
-    returned, metrics = run_train(folder, *TINY, f"cache={cache}")
-    return SimpleNamespace(folder=folder, cache=cache, returned=returned, metrics=metrics)
+    run_train(folder, *TINY, f"cache={cache}")
+    return SimpleNamespace(folder=folder, cache=cache)
 
 
 def test_a_fast_run_goes_all_the_way_and_caches_in_the_users_folder(tmp_path, monkeypatch):
@@ -149,44 +126,39 @@ def test_a_fast_run_goes_all_the_way_and_caches_in_the_users_folder(tmp_path, mo
 
 
 def test_one_fold_per_material_leaves_a_folder_each(tiny, tmp_path):
-    overrides = [o for o in TINY if not o.startswith("split")]
-    folds = ("split=leave_one_material_out", "split.materials=[A,B,C]", "split.train_fraction=0.5")
-    _, metrics = run_train(tmp_path, *overrides, *folds, f"cache={tiny.cache}", "coverage=0.6")
+    told = (*TINY_DATA, *TINY_FOLDS, *TINY_FIT, f"cache={tiny.cache}", "coverage=0.6")
+    _, metrics = run_train(tmp_path, *told)
+    folds, events = metrics["folds"], metrics["events"]
     answers = metrics["answers"]["unseen"]["recordings"]  # pooled by recording
     assert len(answers) == 3 * 4
-    assert {name.split("/", 1)[0] for name in answers} == set(metrics["folds"])
-    assert list(metrics["folds"]) == ["without_A", "without_B", "without_C"]
-    for name, fold in metrics["folds"].items():
+    assert {name.split("/", 1)[0] for name in answers} == set(folds)
+    assert list(folds) == ["without_A", "without_B", "without_C"]
+    for name, fold in folds.items():
         assert (tmp_path / name / "detector.pt").is_file()
         assert list(fold["splits"]["unseen"]["per_material"]) == [name.removeprefix("without_")]
     total = metrics["splits"]["unseen"]
-    parts = [fold["splits"]["unseen"] for fold in metrics["folds"].values()]
-    assert total["num_bins"] == sum(part["num_bins"] for part in parts)
+    assert total["num_bins"] == sum(f["splits"]["unseen"]["num_bins"] for f in folds.values())
     assert list(total["per_material"]) == ["A", "B", "C"]
-    shared = set.intersection(*(set(fold["selected"]) for fold in metrics["folds"].values()))
+    shared = set.intersection(*(set(fold["selected"]) for fold in folds.values()))
     assert set(metrics["selected"]) == shared
-    for rule, events in metrics["events"]["unseen"].items():
-        own = [fold["events"]["unseen"][rule] for fold in metrics["folds"].values()]
-        for name in ("num_recordings", "num_onsets", "num_found", "num_false_alarms"):
-            assert events[name] == sum(part[name] for part in own), name
-        assert list(events["per_material"]) == ["A", "B", "C"]
-    trained = metrics["events"]["train"]["two_of_three"]  # each by two of the detectors
-    assert trained["num_onsets"] == sum(
-        fold["events"]["train"]["two_of_three"]["num_onsets"] for fold in metrics["folds"].values()
-    )
+    counts = ("num_recordings", "num_onsets", "num_found", "num_false_alarms")
+    for rule, own in events["unseen"].items():
+        of_folds = [fold["events"]["unseen"][rule] for fold in folds.values()]
+        assert [own[n] for n in counts] == [sum(part[n] for part in of_folds) for n in counts]
+        assert list(own["per_material"]) == ["A", "B", "C"]
+    trained = [fold["events"]["train"]["two_of_three"]["num_onsets"] for fold in folds.values()]
+    assert events["train"]["two_of_three"]["num_onsets"] == sum(trained)  # each by two detectors
     assert "recording_events" not in json.dumps(metrics)
 
 
 def test_the_checkpoint_of_a_fold_does_not_reach_another(tiny, tmp_path):
     """Its moments hold bins of the material that the other fold leaves out."""
-    overrides = [o for o in TINY if not o.startswith("split")]
-    overrides += ["split=leave_one_material_out", "split.materials=[A,B,C]"]
-    overrides += [f"cache={tiny.cache}"]
+    told = (*TINY_DATA, *TINY_FOLDS, *TINY_FIT, f"cache={tiny.cache}")
     with pytest.raises(ValueError, match="ended before its second pass"):
-        run_train(tmp_path / "first", *overrides, "trainer.max_epochs=1")
+        run_train(tmp_path / "first", *told, "trainer.max_epochs=1")
     checkpoint = tmp_path / "first" / "without_A" / "last.ckpt"
     with pytest.raises(ValueError, match="gathered from other training bins") as caught:
-        run_train(tmp_path / "second", *overrides, f"ckpt_path={checkpoint}")
+        run_train(tmp_path / "second", *told, f"ckpt_path={checkpoint}")
     assert_one_line(caught.value, "seed it was made with")
     assert (tmp_path / "second" / "without_A" / "detector.pt").is_file()  # its own fold resumed
     assert not (tmp_path / "second" / "without_B" / "detector.pt").exists()
@@ -231,24 +203,19 @@ def test_what_is_no_checkpoint_is_refused_in_one_line(tiny, tmp_path, content, s
 
 
 def test_evaluate_tells_of_recordings_it_was_trained_on(tiny, tmp_path, capsys):
-    overrides = [o for o in TINY_EVALUATE if not o.startswith("split")]
-    swapped = ("split.seen=[B,C]", "split.unseen=[A]", "split.train_fraction=0.5")
-    model = f"model={tiny.folder / 'detector.pt'}"
-    config = composed(*overrides, *swapped, f"cache={tiny.cache}", model, name="evaluate")
-    (found,) = evaluate(config, tmp_path)["overlap"].values()
-    assert len(found["recordings"]) == 2  # half of A's cycles; of B the same ones are tested
-    assert {name.partition("/")[0] for name in found["recordings"]} == {"A"}
-    assert found["unseen_materials"] == ["A"]
+    found = evaluated(tiny, tmp_path, "split.seen=[B,C]", "split.unseen=[A]")
+    (overlap,) = found["overlap"].values()
+    assert len(overlap["recordings"]) == 2  # half of A's cycles; of B the same ones are tested
+    assert {name.partition("/")[0] for name in overlap["recordings"]} == {"A"}
+    assert overlap["unseen_materials"] == ["A"]
     out = capsys.readouterr().out
     assert "note: the detector was trained on 2 recordings" in out
     assert "A/" in out
 
 
 def evaluated(tiny, folder, *overrides):
-    model = f"model={tiny.folder / 'detector.pt'}"
-    return evaluate(
-        composed(*TINY_EVALUATE, "cache=off", model, *overrides, name="evaluate"), folder
-    )
+    told = (*TINY_DATA, *TINY_SPLIT, f"cache={tiny.cache}", f"model={tiny.folder / 'detector.pt'}")
+    return evaluate(composed(*told, *overrides, name="evaluate"), folder)
 
 
 @pytest.mark.parametrize(
@@ -284,7 +251,6 @@ def assert_one_line(error, expected):
         (["+features.misspelt=1"], "misspelt"),
         (["recipe.num_features=0"], "recipe.num_features must be whole numbers of at least 1"),
         (["onset=debounced", "onset.hop_ms=0.3"], "onset.hop_ms=0.3 is 0.6 samples at 2000 Hz"),
-        (["onset=debounced", "onset.k=a"], "onset.k must be a positive whole number, got 'a'"),
         (["+scene.misspelt=1"], "unknown override misspelt"),
         (["data.channels=[{name: film, kind: FSR, finger: index, segment: distal}]"], "FSR"),
     ],
@@ -312,9 +278,10 @@ def test_an_absent_class_is_named(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(path.stem for path in (conf_dir() / "exp").glob("*.yaml")))
-def test_every_experiment_runs_fast(name, tmp_path):
+def test_every_experiment_runs_fast(name, tmp_path, tmp_path_factory):
     """One recording of each pass, or two; the whole set is named, not simulated."""
-    overrides = (f"+exp={name}", "num_workers=0", f"cache={tmp_path / 'cache'}", "export=false")
+    cache = tmp_path_factory.getbasetemp() / "features"  # made by the first experiment of a kind
+    overrides = (f"+exp={name}", "num_workers=0", f"cache={cache}", "export=false")
     # the first recordings of these are of scenes without slip
     num = {"confound": 2, "deploy": 2, "onset": 7, "biotacsp_dos": 2}.get(name, 1)
     told = write_biotac(tmp_path / "biotac") if name == "biotacsp_dos" else []

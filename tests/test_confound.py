@@ -5,28 +5,23 @@ import io
 import json
 
 import pytest
-import torch
-from small_set import RATE_HZ, SMALL_HAND, SmallTimeline
+from small_set import NoiseRecordings, SmallTimeline
 from test_commands import composed
 
 from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.train import train
-from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.data.recording import RecordingId, Timeline
 from tactslip_torch.report.results import confound_table
 
 pytestmark = pytest.mark.slow
 
 
-class SmallScenes:
+class SmallScenes(NoiseRecordings):
     """Two channels: the gauge hums while the arm moves, the film rustles while the hand slides.
 
     ``arm_motion`` has the hum alone, ``pulled`` and ``motor_off`` the rustle alone, all others
     both, as the protocol.
     """
-
-    is_simulated = True
-    hand = SMALL_HAND
-    sample_rate_hz = RATE_HZ
 
     def __init__(self, *, cycles, materials, scene, extra_scenes, **_):
         kinds = (scene["name"], *extra_scenes)
@@ -37,23 +32,14 @@ class SmallScenes:
     def timeline(self, recording):
         if recording.scene != "arm_motion":
             return SmallTimeline()
-        rest = dict.fromkeys(("onsets_s", "annotated_onsets_s", "sliding_s", "speeds_mm_s"), ())
-        return SmallTimeline(**rest, non_slip_s=((1.1, 1.95),))
+        return Timeline(duration_s=2.0, non_slip_s=((1.1, 1.95),))
 
-    def key(self, recording):
-        return {"scenes": str(recording)}
-
-    def load(self, recording, windows=None):
-        generator = torch.Generator().manual_seed(sum(str(recording).encode()) * 7919)
-        gauge, film = torch.randn(2, 4000, generator=generator)
-        moving = slice(2200, 3900)
+    def shape(self, noise, time_s, recording, generator):
+        is_moving = (time_s >= 1.1) & (time_s < 1.95)
         if recording.scene not in ("pulled", "motor_off"):
-            gauge[moving] *= 6.0
+            noise[0, is_moving] *= 6.0
         if recording.scene != "arm_motion":
-            film[moving] *= 1.6
-        times = self.timeline(recording)
-        facts = (times.speeds_mm_s, times.onsets_s, times.sliding_s)
-        return Recording(torch.stack([gauge, film]), RATE_HZ, recording.material, *facts)
+            noise[1, is_moving] *= 1.6
 
 
 SMALL = (

@@ -1,9 +1,6 @@
 """What comes with the package: a detector, a recording, the demo, the hosts."""
 
-from __future__ import annotations
-
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,12 +13,7 @@ from tactslip_torch.pretrained.make import SCENE
 ROOT = Path(__file__).parents[1]
 
 
-def run(monkeypatch: pytest.MonkeyPatch, command: object, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["tactslip", *arguments])
-    command.main()  # type: ignore[attr-defined]
-
-
-def test_the_recording_is_what_its_script_makes_and_the_detector_finds_its_slip() -> None:
+def test_the_recording_is_what_its_script_makes_and_the_detector_finds_its_slip():
     recording, made = sample_recording(), simulate(SCENE)
     torch.testing.assert_close(recording.samples, made.samples)
     assert recording.onsets_s == made.onsets_s
@@ -37,12 +29,9 @@ def test_the_recording_is_what_its_script_makes_and_the_detector_finds_its_slip(
 
 
 @pytest.mark.onnx
-def test_the_demo_says_when_the_slip_began_and_leaves_all_it_names(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_demo_says_when_the_slip_began_and_leaves_all_it_names(typed, tmp_path):
     out = tmp_path / "demo"
-    run(monkeypatch, demo, "--out", str(out))
-    printed = capsys.readouterr().out
+    _, printed, _ = typed(demo, "--out", out)
     (found,) = json.loads((out / "onsets.json").read_text())["recordings"]
     (onset_s,) = sample_recording().onsets_s
     assert f"The slip began at {onset_s:.3f} s" in printed
@@ -52,25 +41,20 @@ def test_the_demo_says_when_the_slip_began_and_leaves_all_it_names(
         "recording_onsets.png model.onnx stream.onnx.json web/page.mjs web/stream.onnx node/npy.mjs"
     )
     assert all((out / name).is_file() for name in files.split())
-    with pytest.raises(SystemExit) as refused:
-        run(monkeypatch, demo, "--out", str(out))
-    assert refused.value.code == 2
-    assert "is there and not empty; give another one, --out DIR" in capsys.readouterr().err
+    status, _, err = typed(demo, "--out", out)
+    assert status == 2
+    assert "is there and not empty; give another one, --out DIR" in err
 
 
 @pytest.mark.parametrize("name", ["c", "node", "python", "web"])
-def test_hosts_are_copied_whole(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
-    run(monkeypatch, hosts, name, str(tmp_path))
-    assert str(tmp_path / name / "README.md") in capsys.readouterr().out
+def test_hosts_are_copied_whole(typed, tmp_path, name):
+    assert str(tmp_path / name / "README.md") in typed(hosts, name, tmp_path)[1]
     for path in (ROOT / "export" / name).glob("*.*"):
         if path.is_file():
             assert (tmp_path / name / path.name).read_bytes() == path.read_bytes()
     if name == "web":  # what it plays when it is started without arguments
         assert all((tmp_path / "web" / own).is_file() for own in ("stream.onnx", "recording.npz"))
     for wrong, words in ((name, "is there already"), ("rust", "no host 'rust'; there are c, node")):
-        with pytest.raises(SystemExit) as refused:
-            run(monkeypatch, hosts, wrong, str(tmp_path))
-        assert refused.value.code == 2
-        assert words in capsys.readouterr().err
+        status, _, err = typed(hosts, wrong, tmp_path)
+        assert status == 2
+        assert words in err
