@@ -2,7 +2,6 @@
 
 import csv
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from test_commands import composed as composed_of
 
 from tactslip_torch import HandLayout, Recording
 from tactslip_torch.commands import detect as module
-from tactslip_torch.commands.detect import detect, main
+from tactslip_torch.commands.detect import detect
 from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.data.formats import FORMATS, Samples
 from tactslip_torch.model.calibration import Platt
@@ -24,10 +23,12 @@ from tactslip_torch.report.onset import COLUMNS
 RATE_HZ = 2000.0
 SETTINGS = AlarmSettings(20, Platt(1.0, 0.0), KOfN(2, 3), 2.0, target_per_hour=1.0, lead_s=0.02)
 QUIET_V, LOUD_V = 0.02, 0.5
+LOUD = ((2.0, 3.0), (5.0, 5.6))
+NOTHING = {"speeds_mm_s": (), "onsets_s": (), "sliding_s": ()}
 SEED = 10  # of a small detector that calls loud films slip and quiet ones not
 
 
-def volts(duration_s=8.0, loud=((2.0, 3.0), (5.0, 5.6)), seed=0):
+def volts(duration_s=8.0, loud=LOUD, seed=0):
     """Quiet noise, loud for some stretches, in float32."""
     generator = torch.Generator().manual_seed(seed)
     samples = torch.randn(4, round(duration_s * RATE_HZ), generator=generator)
@@ -38,21 +39,13 @@ def volts(duration_s=8.0, loud=((2.0, 3.0), (5.0, 5.6)), seed=0):
 
 
 def recording(samples=None, **changes):
-    values = {
-        "samples": volts() if samples is None else samples,
-        "sample_rate_hz": RATE_HZ,
-        "material": "M1",
-        "speeds_mm_s": (20.0, 40.0),
-        "onsets_s": (2.0, 5.0),
-        "sliding_s": ((2.0, 3.0), (5.0, 5.6)),
-        "provenance": {"simulated": True},
-    }
-    return Recording(**(values | changes))
+    truth = {"onsets_s": (2.0, 5.0), "sliding_s": LOUD, "speeds_mm_s": (20.0, 40.0)}
+    values = {"material": "M1", "provenance": {"simulated": True}, "sample_rate_hz": RATE_HZ}
+    return Recording(volts() if samples is None else samples, **(truth | values | changes))
 
 
 def quiet(duration_s=4.0, **changes):
-    nothing = {"speeds_mm_s": (), "onsets_s": (), "sliding_s": ()}
-    return recording(volts(duration_s, ()), **(nothing | changes))
+    return recording(volts(duration_s, ()), **(NOTHING | changes))
 
 
 def save(path, content, hand=HAND):
@@ -108,28 +101,25 @@ def test_the_truth_stands_beside_them(run):
     _, content = run
     first, second = content["recordings"]
     assert (first["material"], first["scene"], first["simulated"]) == ("M1", "taps", True)
-    truth = first["truth"]
-    assert [onset["outcome"] for onset in truth["onsets"]] == ["found", "found"]
-    for onset, slide in zip(truth["onsets"], ((2.0, 3.0), (5.0, 5.6)), strict=True):
-        own = [a for a in first["alarms"] if slide[0] <= a["alarm_s"] <= slide[1]]
-        assert onset["delay_s"] == pytest.approx(own[0]["alarm_s"] - onset["onset_s"], abs=1e-8)
-        assert own[0]["outcome"] == "found"
-        assert own[0]["true_onset_s"] == onset["onset_s"]
-        assert {alarm["outcome"] for alarm in own[1:]} <= {"repeated"}
-        assert onset["error_s"] == pytest.approx(own[0]["onset_s"] - onset["onset_s"], abs=1e-8)
+    for onset, slide in zip(first["truth"]["onsets"], LOUD, strict=True):
+        alarm, *more = [a for a in first["alarms"] if slide[0] <= a["alarm_s"] <= slide[1]]
+        assert onset["outcome"] == alarm["outcome"] == "found"
+        assert alarm["true_onset_s"] == onset["onset_s"]
+        assert onset["delay_s"] == pytest.approx(alarm["alarm_s"] - onset["onset_s"], abs=1e-8)
+        assert onset["error_s"] == pytest.approx(alarm["onset_s"] - onset["onset_s"], abs=1e-8)
+        assert {other["outcome"] for other in more} <= {"repeated"}
         assert 0.0 < onset["delay_s"] < 0.1
     false = [a["alarm_s"] for e in (first, second) for a in e["alarms"] if a["outcome"] == "false"]
     assert false == first["truth"]["false_alarms_s"] + second["truth"]["false_alarms_s"]
     assert second["truth"]["onsets"] == []
-    events = content["events"]
-    assert (events["num_onsets"], events["num_found"]) == (2, 2)
-    assert events["num_false_alarms"] == len(false)
+    counts = [content["events"][f"num_{name}"] for name in ("onsets", "found", "false_alarms")]
+    assert counts == [2, 2, len(false)]
 
 
 def test_an_alarm_behind_the_first_release_is_not_early(model, tmp_path):
-    samples = volts(4.0, ((1.9, 4.0),))
     truth = {"onsets_s": (2.0,), "sliding_s": ((2.0, 4.0),), "speeds_mm_s": (20.0,)}
-    save(tmp_path / "a.npz", recording(samples, released_s=((1.9, 2.1),), **truth))
+    made = recording(volts(4.0, ((1.9, 4.0),)), released_s=((1.9, 2.1),), **truth)
+    save(tmp_path / "a.npz", made)
     (entry,) = detected(model, tmp_path, tmp_path / "out", "threshold=3")["recordings"]
     (onset,), last = entry["truth"]["onsets"], entry["alarms"][-1]
     assert 1.9 < last["alarm_s"] < 2.0
@@ -178,9 +168,8 @@ def test_volts_alone_are_enough_but_have_no_truth(model, tmp_path, kind, capsys)
         np.save(tmp_path / "a.npy", samples.T)
     else:
         np.savez(tmp_path / "a.npz", samples=samples)
-    content = detected(
-        model, tmp_path / f"a.{kind}", tmp_path / "out", "sample_rate_hz=2000", "decisions=true"
-    )
+    told = "sample_rate_hz=2000", "decisions=true"
+    content = detected(model, tmp_path / f"a.{kind}", tmp_path / "out", *told)
     (entry,) = content["recordings"]
     assert [a["alarm_s"] for a in entry["alarms"]] == [a.alarm_s for a in offline(volts()).alarms]
     assert (entry["truth"], entry["simulated"], content["events"]) == (None, None, None)
@@ -193,23 +182,21 @@ def test_volts_alone_are_enough_but_have_no_truth(model, tmp_path, kind, capsys)
 
 def test_a_recording_nobody_annotated_has_no_false_alarms(model, tmp_path):
     """No onset and not simulated: nothing says that there was no slip."""
-    bare = recording(speeds_mm_s=(), onsets_s=(), sliding_s=(), provenance={})
-    save(tmp_path / "a.npz", bare)
-    content = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
-    assert content["recordings"][0]["truth"] is None
-    assert content["recordings"][0]["simulated"] is False
-    told = recording(speeds_mm_s=(), onsets_s=(), sliding_s=(), provenance={}, non_slip_s=((0, 8),))
-    save(tmp_path / "a.npz", told)
-    content = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
-    alarms = content["recordings"][0]["alarms"]
-    assert len(content["recordings"][0]["truth"]["false_alarms_s"]) == len(alarms) > 0
+    entries = []
+    for told in ({}, {"non_slip_s": ((0, 8),)}):
+        save(tmp_path / "a.npz", recording(provenance={}, **NOTHING, **told))
+        found = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
+        entries += found["recordings"]
+    bare, told = entries
+    assert (bare["truth"], bare["simulated"]) == (None, False)
+    assert len(told["truth"]["false_alarms_s"]) == len(told["alarms"]) > 0
 
 
 # Long recordings ---------------------------------------------------------------------------------
 
 
 def test_no_more_than_a_second_is_in_hand(model, tmp_path, monkeypatch):
-    asked, pushed = [], []
+    asked, pushed, held = [], [], []
     read, push = Samples.read, module.StreamingDetector.push
 
     def watched(samples, first, stop):
@@ -223,7 +210,6 @@ def test_no_more_than_a_second_is_in_hand(model, tmp_path, monkeypatch):
         held.append(stream.state_bytes)
         return decisions
 
-    held = []
     monkeypatch.setattr(Samples, "read", watched)
     monkeypatch.setattr(module.StreamingDetector, "push", pushing)
     save(tmp_path / "a.npz", recording())
@@ -236,22 +222,8 @@ def test_no_more_than_a_second_is_in_hand(model, tmp_path, monkeypatch):
 # What goes wrong ---------------------------------------------------------------------------------
 
 
-def command(monkeypatch, capsys, tmp_path, *arguments):
-    """The command as a user runs it: exit status, what it printed, its error line."""
-    monkeypatch.chdir(tmp_path)
-    run_dir = f"hydra.run.dir={tmp_path / 'out'}"
-    monkeypatch.setattr(sys, "argv", ["detect", "backend=auto", run_dir, *map(str, arguments)])
-    status = 0
-    try:
-        main()
-    except SystemExit as stop:
-        status = stop.code
-    out, err = capsys.readouterr()
-    return status, out, [line for line in err.splitlines() if line.startswith("error")]
-
-
-def test_a_damaged_file_in_a_folder_costs_the_others_nothing(model, tmp_path, monkeypatch, capsys):
-    place = tmp_path / "in"
+def test_a_damaged_file_in_a_folder_costs_the_others_nothing(model, tmp_path, capsys):
+    place, out = tmp_path / "in", tmp_path / "out"
     for name in "acd":
         save(place / f"{name}.npz", quiet())
     content = bytearray((place / "c.npz").read_bytes())
@@ -259,27 +231,26 @@ def test_a_damaged_file_in_a_folder_costs_the_others_nothing(model, tmp_path, mo
     (place / "c.npz").write_bytes(content)
     save(place / "b.npz", recording())
     save(place / "e.npz", quiet(sample_rate_hz=1000.0))
-    status, out, lines = command(monkeypatch, capsys, tmp_path, f"model={model}", f"input={place}")
-    assert status == 2
-    (line,) = lines
-    assert "2 of 5 recordings failed, first: " in line
-    assert "c.npz is damaged or no recording of ours (Bad CRC-32" in line
-    assert "; the others are in" in line
-    assert "slips found: 2 of 2" in out
-    written = json.loads((tmp_path / "out" / "onsets.json").read_text())
+    said = (
+        r"2 of 5 recordings failed, first: .*c\.npz is damaged or no recording of ours \(Bad CRC-32"
+        ".*; the others are in"
+    )
+    with pytest.raises(ValueError, match=said):
+        detect(composed(f"model={model}", f"input={place}"), out)
+    assert "slips found: 2 of 2" in capsys.readouterr().out
+    written = json.loads((out / "onsets.json").read_text())
     assert [entry["file"] for entry in written["recordings"]] == ["a.npz", "b.npz", "d.npz"]
     assert [entry["file"] for entry in written["failed"]] == ["c.npz", "e.npz"]
     assert "1000 Hz, the detector of 2000 Hz; resample it" in written["failed"][1]["error"]
-    names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert {"a_onsets.png", "b_onsets.png", "d_onsets.png", "onsets.csv"} <= names
-    assert not [name for name in names if "tmp" in name or name.startswith("c_")]
+    names = {path.name for path in out.iterdir()}
+    figures = {f"{name}_onsets.png" for name in "abd"}
+    assert names == figures | {"onsets.csv", "onsets.json", "config.yaml"}
 
 
 def test_what_was_detected_before_an_interruption_stays(model, tmp_path, monkeypatch):
     save(tmp_path / "a.npz", recording())
     save(tmp_path / "b.npz", quiet())
-    push = module.StreamingDetector.push
-    count = []
+    push, count = module.StreamingDetector.push, []
 
     def stopped(stream, samples):
         count.append(1)
@@ -288,14 +259,12 @@ def test_what_was_detected_before_an_interruption_stays(model, tmp_path, monkeyp
         return push(stream, samples)
 
     monkeypatch.setattr(module.StreamingDetector, "push", stopped)
-    config = composed(f"model={model}", f"input={tmp_path}", "decisions=true")
     with pytest.raises(KeyboardInterrupt):
-        detect(config, tmp_path / "out")
+        detected(model, tmp_path, tmp_path / "out", "decisions=true")
     written = json.loads((tmp_path / "out" / "onsets.json").read_text())
     assert [entry["file"] for entry in written["recordings"]] == ["a.npz"]
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        *("a_decisions.csv", "a_onsets.png", "config.yaml", "onsets.csv", "onsets.json")
-    ]
+    names = ["a_decisions.csv", "a_onsets.png", "config.yaml", "onsets.csv", "onsets.json"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
 
 
 OTHER_NAMES = HandLayout([HAND.channels[i] for i in (0, 2, 1, 3)])
@@ -334,23 +303,19 @@ def test_bad_input_is_one_line(name, model, tmp_path):
 # Files of others ---------------------------------------------------------------------------------
 
 
-def write_table(path, samples, order, times_s=None):
-    """Samples ``[C, T]`` as text, columns in some order and one more that is none of the hand's."""
-    names = [HAND.names[i] for i in order]
-    columns = [samples[i] for i in order] + [torch.zeros(samples.shape[1])]
-    header = [*names, "spare"]
-    if times_s is not None:
-        header, columns = ["time", *header], [times_s, *columns]
-    table = torch.stack([column.double() for column in columns], dim=1).numpy()
-    np.savetxt(path, table, delimiter=",", header=",".join(header), comments="", fmt="%.17g")
+def write_table(path, samples, times_s):
+    """Samples ``[C, T]`` as text, with times and a column more that is none of the hand's."""
+    rows = torch.vstack([times_s, samples.double(), torch.zeros(samples.shape[1])]).T
+    header = ",".join(["time", *HAND.names, "spare"])
+    np.savetxt(path, rows.numpy(), delimiter=",", header=header, comments="", fmt="%.17g")
 
 
 def test_a_gap_in_the_times_is_missing_samples_and_a_clock_a_little_off_is_none(model, tmp_path):
     whole, times_s = volts(3.0, ((2.0, 2.4),)), torch.arange(6000).double() / RATE_HZ
     is_lost = (times_s >= 1.0) & (times_s < 1.02)
-    write_table(tmp_path / "a.csv", whole[:, ~is_lost], [0, 1, 2, 3], times_s[~is_lost])
+    write_table(tmp_path / "a.csv", whole[:, ~is_lost], times_s[~is_lost])
     np.save(tmp_path / "b.npy", whole.where(~is_lost, torch.nan).numpy().T)
-    write_table(tmp_path / "c.csv", whole, [0, 1, 2, 3], times_s / 1.0005)
+    write_table(tmp_path / "c.csv", whole, times_s / 1.0005)
     np.save(tmp_path / "d.npy", whole.numpy().T)
     options = ("figure=false", f"sample_rate_hz={RATE_HZ}")
     found = detected(model, tmp_path, tmp_path / "out", *options)["recordings"]
@@ -371,7 +336,7 @@ def test_a_detector_of_counts_takes_counts_and_what_says_no_units(model, tmp_pat
     detector.save(tmp_path / "counts.pt")
     (tmp_path / "in").mkdir()
     save(tmp_path / "in" / "a.npz", recording(units="counts"))
-    write_table(tmp_path / "in" / "b.csv", volts(), [0, 1, 2, 3], torch.arange(16000) / RATE_HZ)
+    write_table(tmp_path / "in" / "b.csv", volts(), torch.arange(16000).double() / RATE_HZ)
     save(tmp_path / "in" / "c.npz", recording())
     with pytest.raises(ValueError, match=r"1 of 3 .*c\.npz is in V, the detector was .* counts"):
         detected(tmp_path / "counts.pt", tmp_path / "in", tmp_path / "out", "figure=false")
