@@ -1,12 +1,14 @@
 """``adapt`` as a command: what it leaves, takes back and refuses, on files of a tiny hand."""
 
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
+from drawing import assert_png
 from hydra.errors import InstantiationException
-from PIL import Image
 from test_commands import TINY, TinyRecordings, composed
 
 from tactslip_torch import SlipDetector
@@ -29,22 +31,19 @@ from tactslip_torch.training.adaptation import (
 
 TRAINING = (
     *TINY,
-    "recipe=robust",
-    "baselines=false",
-    "export=false",
-    "data.seed=0",
-    "statistics=true",
-    "coverage=0.5",
+    *("recipe=robust", "baselines=false", "data.seed=0", "statistics=true", "coverage=0.5"),
     "cache=off",
 )
 SETTINGS = AlarmSettings(20, Platt(1.0, 0.0), KOfN(2, 3), 2.0, target_per_hour=1.0)
 
 
-def write_files(folder, materials, cycles=4, seed=0):
+def write_files(folder, materials, cycles=4, seed=0, wanted=None):
+    """Recordings in files with their manifest: all, or the named ones."""
     source = TinyRecordings(seed, cycles, materials)
     folder.mkdir()
     files = RecordingFolder(source, folder, "npz", {})
-    write_manifest(folder, [files.write(recording) for recording in source.ids])
+    chosen = [r for r in source.ids if wanted is None or str(r) in wanted]
+    write_manifest(folder, [files.write(recording) for recording in chosen])
     return folder
 
 
@@ -66,15 +65,13 @@ def files(tmp_path_factory):
 @pytest.fixture
 def run(trained, tmp_path):
     """A copy of the run that may be changed."""
-    folder = tmp_path / "run"
-    folder.mkdir()
-    for name in ("detector.pt", "statistics.pt"):
-        (folder / name).write_bytes((trained / name).read_bytes())
-    return folder
+    return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
-def settings(run, *overrides):
-    return composed(f"model={run / 'detector.pt'}", "cache=off", *overrides, name="adapt")
+def act(run, *overrides):
+    """Carry out the command on a run; what it returns."""
+    told = f"model={run / 'detector.pt'}", "cache=off"
+    return adapt(composed(*told, *overrides, name="adapt"), run / "results")
 
 
 def content(run):
@@ -83,7 +80,7 @@ def content(run):
 
 def add_c(run, files, *overrides):
     chosen = f"recordings={files}", "data.materials=[C]", "margin=0.2"
-    return adapt(settings(run, *chosen, *overrides), run / "results")
+    return act(run, *chosen, *overrides)
 
 
 def test_training_leaves_statistics_that_make_its_detector(trained):
@@ -97,25 +94,31 @@ def test_training_leaves_statistics_that_make_its_detector(trained):
     assert sorted(set(found.rehearsal.materials)) == ["A", "B"]
 
 
-def test_a_material_comes_in_and_all_is_said(run, files, trained, capsys):
-    found = add_c(run, files)
+def test_a_material_comes_in_and_all_is_said(run, files, trained, capsys, monkeypatch):
+    written = []
+    monkeypatch.setattr(
+        module,
+        "export_detector",
+        lambda detector, *place, source: written.append((*place, source.read_bytes())),
+    )
+    found = add_c(run, files, "export=true")
+    # both graphs, for an alarm is set
+    assert written == [(run, ["bin", "stream"], (run / "detector.pt").read_bytes())]
     kept = json.loads((run / "results" / "adaptation.json").read_text())
     assert kept == json.loads(json.dumps(found))
-    assert kept["accepted"] is True
-    assert kept["simulated"] is False
+    assert (kept["accepted"], kept["simulated"]) == (True, False)
     assert sorted(kept["old"]["before"]) == ["A", "B"]
-    Image.open(run / "results" / "adaptation.png").verify()
+    assert_png(run / "results" / "adaptation.png")
     assert "C (new)" in capsys.readouterr().out
     old, new = (SlipDetector.load(f / "detector.pt") for f in (trained, run))
     assert not torch.equal(old.head.quadratic, new.head.quadratic)
     assert torch.equal(old.scaler.minimum, new.scaler.minimum)
     assert new.info["train_materials"] == ["A", "B", "C"]
-    assert {name for name in new.info["train_recordings"] if name[0] == "C"} == {
-        f"C/{i}" for i in range(4)
-    }
+    added = [f"C/{cycle}" for cycle in range(4)]
+    assert sorted(n for n in new.info["train_recordings"] if n[0] == "C") == added
     (entry,) = new.info["adaptations"]
     assert entry["weight"] == found["weight"] > 0
-    assert entry["recordings"] == [f"C/{i}" for i in range(4)]
+    assert entry["recordings"] == added
     alarm = AlarmSettings.of(new)
     assert (alarm.threshold, alarm.target_per_hour) == (SETTINGS.threshold, None)
     assert "it stands for no rate; the calibration is made anew" in alarm.metadata["adapted"]
@@ -128,7 +131,7 @@ def test_steps_in_and_out_are_listed_and_taken_back_to_the_bit(
     run, files, trained, capsys, monkeypatch
 ):
     """Graphs beside it are told to be of another detector while they are."""
-    adapt(settings(run, "action=list"), run / "results")
+    act(run, "action=list")
     assert "no step since training" in capsys.readouterr().out
     monkeypatch.setattr("tactslip_torch.deploy.export.check_model", lambda *_: {"worst_sd": 0.0})
     source = run / "detector.pt"
@@ -137,61 +140,36 @@ def test_steps_in_and_out_are_listed_and_taken_back_to_the_bit(
     stale = "model.onnx beside it: of another detector; python -m tactslip_torch export model="
     assert stale in capsys.readouterr().out
     added = (run / "detector.pt").read_bytes()
-    assert len(adapt(settings(run, "action=list"), run / "results")["steps"]) == 1
-    adapt(settings(run, "action=forget", "material=C"), run / "results")
+    assert len(act(run, "action=list")["steps"]) == 1
+    act(run, "action=forget", "material=C")
     old, new = (SlipDetector.load(f / "detector.pt") for f in (trained, run))
     z = Statistics.load(run / "statistics.pt").rehearsal.z
     torch.testing.assert_close(new.head(z), old.head(z), rtol=1e-9, atol=1e-12)
     assert new.info["train_materials"] == ["A", "B"]
-    adapt(settings(run, "action=undo"), run / "results")
+    act(run, "action=undo")
     assert (run / "detector.pt").read_bytes() == added
     # as where writing was cut off between the two files
     (run / "detector.pt").write_bytes((trained / "detector.pt").read_bytes())
     with pytest.raises(ValueError, match=r"one step ahead of .* action=undo"):
-        adapt(settings(run, "action=list"), run / "results")
+        act(run, "action=list")
     capsys.readouterr()
-    adapt(settings(run, "action=undo"), run / "results")
+    act(run, "action=undo")
     assert stale not in capsys.readouterr().out
     assert content(run)[0] == content(trained)[0]
     sums, before = (Statistics.load(each / "statistics.pt").sums for each in (run, trained))
     torch.testing.assert_close(sums.sums, before.sums, rtol=0, atol=1e-11)
     assert sums.seen_batches == before.seen_batches
     with pytest.raises(ValueError, match="nothing to undo"):
-        adapt(settings(run, "action=undo"), run / "results")
+        act(run, "action=undo")
 
 
-def test_graphs_are_written_where_asked_for(run, files, monkeypatch):
-    written = []
-
-    def export(detector, folder, graphs, *, source):
-        written.append((folder, graphs, source.read_bytes()))
-
-    monkeypatch.setattr(module, "export_detector", export)
-    add_c(run, files, "weight=2", "export=true")
-    # an alarm is set
-    assert written == [(run, ["bin", "stream"], (run / "detector.pt").read_bytes())]
-
-
-def test_a_training_material_is_forgotten_from_its_files(run, files):
-    before = Statistics.load(run / "statistics.pt")
-    trained_on = [name for name in before.sums.seen_batches if name.startswith("B")]
-    cycles = f"data.manifest={only(files, trained_on)}"
-    adapt(settings(run, "action=forget", f"recordings={files}", cycles), run / "results")
-    after = Statistics.load(run / "statistics.pt")
-    assert sorted(after.sums.seen_batches) == sorted(
-        set(before.sums.seen_batches) - set(trained_on)
-    )
+def test_a_training_material_is_forgotten_from_its_files(run, tmp_path):
+    before = Statistics.load(run / "statistics.pt").sums.seen_batches
+    of_b = {name for name in before if name.startswith("B")}
+    files = write_files(tmp_path / "files", ["B"], wanted=of_b)
+    act(run, "action=forget", f"recordings={files}")
+    assert {*Statistics.load(run / "statistics.pt").sums.seen_batches} == {*before} - of_b
     assert SlipDetector.load(run / "detector.pt").info["train_materials"] == ["A"]
-
-
-def only(files, recordings):
-    """A manifest of some of the files."""
-    head, *lines = (files / "manifest.csv").read_text().splitlines()
-    wanted = [f"{name.split('/')[0]}_paper_{int(name.split('/')[1]):02d}" for name in recordings]
-    kept = [line for line in lines if any(stem in line for stem in wanted)]
-    assert len(kept) == len(recordings)
-    (files / "some.csv").write_text("\n".join([head, *kept]) + "\n")
-    return "some.csv"
 
 
 def test_what_old_materials_do_not_allow_changes_nothing(run, files, monkeypatch):
@@ -220,7 +198,7 @@ def test_no_recording_comes_in_twice_by_another_name(run, files, tmp_path):
     one, other = sorted(twins.glob("D*.npz"))
     other.write_bytes(one.read_bytes())
     with pytest.raises(ValueError, match="D/1 is the same recording as D/0; give it once"):
-        adapt(settings(run, f"recordings={twins}", "weight=2"), run / "results")
+        act(run, f"recordings={twins}", "weight=2")
     assert content(run) == state
 
 
@@ -234,8 +212,8 @@ def test_two_programs_do_not_change_a_detector_at_once(run, files):
     assert not list(run.glob(".*"))
     (run / ".detector.pt.lock").touch()  # of a program that was killed
     with pytest.raises(ValueError, match=r"if none runs any more, remove .*\.detector\.pt\.lock$"):
-        adapt(settings(run, "action=undo"), run / "results")
-    adapt(settings(run, "action=list"), run / "results")
+        act(run, "action=undo")
+    act(run, "action=list")
 
 
 @pytest.mark.parametrize(
@@ -250,7 +228,7 @@ def test_two_programs_do_not_change_a_detector_at_once(run, files):
 def test_bad_input_is_one_line(run, overrides, message):
     state = content(run)
     with pytest.raises((ValueError, FileNotFoundError, InstantiationException)) as caught:
-        adapt(settings(run, *overrides), run / "results")
+        act(run, *overrides)
     assert message in one_line(caught.value)
     assert content(run) == state
 
@@ -260,10 +238,10 @@ def test_a_detector_without_its_statistics_says_how_to_get_them(run, trained):
     other.head.constant += 1
     other.save(run / "detector.pt")
     with pytest.raises(ValueError, match="belongs to another detector"):
-        adapt(settings(run, "action=list"), run / "results")
+        act(run, "action=list")
     (run / "statistics.pt").unlink()
     with pytest.raises(FileNotFoundError, match="train with recipe=robust statistics=true"):
-        adapt(settings(run, "action=list"), run / "results")
+        act(run, "action=list")
 
 
 @pytest.mark.parametrize(

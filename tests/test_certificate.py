@@ -31,40 +31,37 @@ from tactslip_torch.training.datamodule import FeatureMaker
 
 def test_the_numbers_are_those_of_the_errors():
     detector, held_out = small_detector(arithmetic="native"), raw_bins(30, seed=5)
-    found = certified(detector, held_out={"test": held_out})
-    facts = found.content
-    with torch.no_grad():
-        exact = {n: detector.predict_raw(b).score.numpy() for n, b in bins_of(held_out).items()}
-        single = copy.deepcopy(detector).float()
-        rounded = {
-            n: single.predict_raw(b.float()).score.double().numpy()
-            for n, b in bins_of(held_out).items()
-        }
+    sets = {"calibration": raw_bins(48), "test": held_out}
+    facts = certified(detector, held_out={"test": held_out}).content
+    single = copy.deepcopy(detector).float()
+    exact = {n: detector.predict_raw(b).score.detach().numpy() for n, b in sets.items()}
+    rounded = {n: single.predict_raw(b.float()).score.double().detach() for n, b in sets.items()}
+    errors = {n: np.abs(rounded[n].numpy() - exact[n]) for n in sets}
     sd = np.std(exact["calibration"], ddof=1)
-    worst = np.abs(rounded["calibration"] - exact["calibration"]).max()
-    margin = rounding_bound(detector.head) + FACTOR * worst
+    margin = rounding_bound(detector.head) + FACTOR * errors["calibration"].max()
     assert facts["score_sd"] == pytest.approx(sd, rel=1e-12)
     assert facts["margin"]["score"] == pytest.approx(margin, rel=1e-12)
     assert facts["margin"]["sd"] == pytest.approx(margin / sd, rel=1e-12)
     for name, row in facts["sets"].items():
-        error = np.abs(rounded[name] - exact[name])
+        error = errors[name]
         assert row["bins"] == len(error)
         assert row["error"]["worst"] == error.max()
         assert row["error"]["median"] == np.quantile(error, 0.5, method="higher")
         assert row["error"]["p99"] == np.quantile(error, 0.99, method="higher")
         assert row["error"]["worst_sd"] == pytest.approx(error.max() / sd, rel=1e-12)
         assert row["inside_margin"]["bins"] == (np.abs(exact[name]) <= margin).sum()
-        assert row["outside_range"] == outside_range(detector, bins_of(held_out)[name])
+        assert row["outside_range"] == outside_range(detector, sets[name])
     assert facts["sets"]["calibration"]["outside_range"] == 0
-    raw = raw_bins(48).numpy()
-    gauges, films = (
-        [i for i, c in enumerate(HAND.channels) if c.kind == k] for k in ("SG", "PVDF")
-    )
-    for kind, places in (("SG", gauges), ("PVDF", films)):
-        known = facts["range"]["kinds"][kind]
-        assert (known["low_v"], known["high_v"]) == (raw[:, places].min(), raw[:, places].max())
+    raw = sets["calibration"].numpy()
+    for kind in ("SG", "PVDF"):
+        known, own = facts["range"]["kinds"][kind], raw[:, places_of(kind)]
+        assert (known["low_v"], known["high_v"]) == (own.min(), own.max())
     assert list(facts["range"]["channels"]) == list(HAND.names)
     assert 0 < facts["sets"]["test"]["outside_range"] < 30
+
+
+def places_of(kind):
+    return [place for place, channel in enumerate(HAND.channels) if channel.kind == kind]
 
 
 def outside_range(detector, bins):
@@ -78,16 +75,11 @@ def outside_range(detector, bins):
     used = {name.channel for name in detector.selected_names}
     is_out = np.zeros(len(bins), dtype=bool)
     for kind in ("SG", "PVDF"):
-        places = [i for i, c in enumerate(detector.pool.hand.channels) if c.kind == kind]
-        least = ranges["known"][:, :, places].min((1, 2))
-        for place in places:
-            if detector.pool.hand.names[place] in used:
+        least = ranges["known"][:, :, places_of(kind)].min((1, 2))
+        for place in places_of(kind):
+            if HAND.names[place] in used:
                 is_out |= (ranges["own"][:, :, place] < least[:, None]).any(0)
     return is_out.sum()
-
-
-def bins_of(held_out):
-    return {"calibration": raw_bins(48), "test": held_out}
 
 
 def test_held_out_bins_and_extremes_set_nothing():
@@ -133,31 +125,24 @@ def test_a_sound_detector_holds():
 def test_held_out_bins_that_turn_refute():
     """The lie is met beyond what calibration bins reach alone."""
     samples = raw_bins(200)
-    detector = small_detector()
-    first = compare(*pipelines(detector), samples).scaled[:, 0]
+    first = compare(*pipelines(small_detector()), samples).scaled[:, 0]
     known, new = samples[first <= 0], samples[first > 0]
     assert min(len(known), len(new)) > 5
     liar = lying_detector(0.0)
     found = certify(liar, known, {"test": new}, simulated=True, extremes=2)
-    row = found.content["sets"]["test"]
+    margin = found.content["margin"]["score"]
     exact = liar.predict_raw(new).score.detach().abs()
-    assert row["flips"]["outside_margin"] == int((exact > row_margin(found)).sum()) > 0
+    num_turned = found.content["sets"]["test"]["flips"]["outside_margin"]
+    assert num_turned == int((exact > margin).sum()) > 0
     assert not found.content["holds"]
     assert named(found, "test: flips outside the margin")["holds"] is False
     assert named(found, "test: worst error, sd")["holds"] is False
     assert named(found, "calibration: flips outside the margin")["holds"] is True
-    turned = [c.flips & c.is_valid & (c.exact.abs() > row_margin(found)) for c in kinds_of(found)]
+    kinds = [found.sets[kind] for kind in EXTREMES]
+    turned = [c.flips & c.is_valid & (c.exact.abs() > margin) for c in kinds]
     of_extremes = named(found, "valid extremes: flips outside the margin")
     assert of_extremes["found"] == int(torch.cat(turned).sum()) > 0
     assert of_extremes["holds"] is False
-
-
-def kinds_of(found):
-    return [found.sets[kind] for kind in EXTREMES]
-
-
-def row_margin(found):
-    return found.content["margin"]["score"]
 
 
 def test_errors_beyond_the_limit_do_not_hold():
@@ -210,13 +195,14 @@ def test_a_trained_detector_does_not_turn_outside_its_margin(recipe, tmp_path):
 
 
 def test_a_kernel_sum_has_no_bound_and_says_so():
-    facts = certified(small_detector(head="sum")).content
+    found = certified(small_detector(head="sum"))
+    facts = found.content
     assert facts["head"]["bound"] is None
     assert "no bound for this head" in facts["head"]["note"]
     worst = facts["sets"]["calibration"]["error"]["worst"]
     assert facts["margin"]["score"] == FACTOR * worst
     assert facts["conditions"][0]["holds"] is None
-    ratio = next(r for r in facts["conditions"] if r["name"] == "bound of the head / worst seen")
+    ratio = named(found, "bound of the head / worst seen")
     assert (ratio["found"], ratio["holds"]) == (None, None)
     assert facts["holds"]
 
@@ -226,24 +212,10 @@ def test_a_head_that_overflows_does_not_hold():
     facts = found.content
     assert facts["head"]["overflows"]
     assert facts["margin"]["score"] == math.inf
-    silent = sum(int((~c.rounded.isfinite()).sum()) for c in kinds_of(found))
-    assert named(found, "extremes: scores that are not finite")["found"] == silent > 0
-    assert named(found, "extremes: scores that are not finite")["holds"] is False
-    assert facts["conditions"][0]["holds"] is False
-    assert not found.content["holds"]
-
-
-@pytest.mark.parametrize(
-    ("bins", "message"),
-    [
-        (torch.zeros(0, 4, 150), "expected calibration .* at least one, got"),
-        (torch.full((2, 4, 150), math.nan), "bin 0, channel SG1, sample 0 is nan"),
-        (raw_bins(1), "1 calibration bins have scores of standard deviation 0; give more bins"),
-    ],
-)
-def test_what_cannot_calibrate_is_refused(bins, message):
-    with pytest.raises(ValueError, match=message):
-        certify(small_detector(), bins, simulated=True, extremes=1)
+    silent = sum(int((~found.sets[kind].rounded.isfinite()).sum()) for kind in EXTREMES)
+    row = named(found, "extremes: scores that are not finite")
+    assert row["found"] == silent > 0
+    assert facts["conditions"][0]["holds"] is row["holds"] is facts["holds"] is False
 
 
 def test_a_bound_far_above_the_worst_seen_does_not_hold():
@@ -251,25 +223,23 @@ def test_a_bound_far_above_the_worst_seen_does_not_hold():
     found = certified(small_detector(gain=1e-40))
     head, row = found.content["head"], named(found, "bound of the head / worst seen")
     assert row["found"] == head["bound"] / head["worst_seen"] > LARGEST_RATIO
-    assert row["wanted"] == "<= 10000"
-    assert row["holds"] is False
-    assert not found.content["holds"]
-
-
-def test_a_held_out_set_does_not_replace_one_of_ours():
-    with pytest.raises(ValueError, match="held-out set may not be named 'plain'"):
-        certified(small_detector(), held_out={"test": raw_bins(2), "plain": raw_bins(2)})
+    assert (row["wanted"], row["holds"], found.content["holds"]) == ("<= 10000", False, False)
 
 
 @pytest.mark.parametrize(
-    ("part", "value", "message"),
+    ("broken", "bins", "held_out", "message"),
     [
-        ("constant", math.nan, "scores of 8 of 8 calibration bins are not finite in float64; "),
-        ("quadratic", 1e200, "8 .* scores of standard deviation inf; scale the head down"),
+        ({}, torch.zeros(0, 4, 150), {}, "expected calibration .* at least one, got"),
+        ({}, torch.full((2, 4, 150), math.nan), {}, "bin 0, channel SG1, sample 0 is nan"),
+        ({}, raw_bins(1), {}, "1 calibration bins have scores of standard deviation 0; give more"),
+        ({}, raw_bins(8), {"plain": raw_bins(2)}, "held-out set may not be named 'plain'"),
+        ({"constant": math.nan}, raw_bins(8), {}, "scores of 8 of 8 .* are not finite in float64"),
+        ({"quadratic": 1e200}, raw_bins(8), {}, "8 .* deviation inf; scale the head down"),
     ],
 )
-def test_a_broken_head_is_told_from_too_few_bins(part, value, message):
+def test_what_cannot_be_certified_is_refused(broken, bins, held_out, message):
     detector = small_detector()
-    getattr(detector.head, part).mul_(value)
+    for part, factor in broken.items():
+        getattr(detector.head, part).mul_(factor)
     with pytest.raises(ValueError, match=message):
-        certified(detector, num_bins=8)
+        certify(detector, bins, held_out, simulated=True, extremes=1)
