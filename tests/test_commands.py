@@ -74,7 +74,6 @@ TINY_DATA = (
     "data._target_=test_commands.TinyRecordings",
     "data.materials=[A,B,C]",
     "data.cycles=4",
-    "num_workers=0",
 )
 TINY_SPLIT = ("split.seen=[A,B]", "split.unseen=[C]", "split.train_fraction=0.5")
 TINY_FOLDS = (
@@ -82,7 +81,10 @@ TINY_FOLDS = (
     "split.materials=[A,B,C]",
     "split.train_fraction=0.5",
 )
-TINY_FIT = ("recipe.num_features=10", "recipe.penalties=[0.1,1.0]", "export=false")
+TINY_FIT = (
+    *("recipe.num_features=10", "recipe.penalties=[0.1,1.0]"),
+    *("num_workers=0", "export=false"),
+)
 TINY = (*TINY_DATA, *TINY_SPLIT, *TINY_FIT)
 
 
@@ -214,8 +216,9 @@ def test_evaluate_tells_of_recordings_it_was_trained_on(tiny, tmp_path, capsys):
 
 
 def evaluated(tiny, folder, *overrides):
-    told = (*TINY_DATA, *TINY_SPLIT, f"cache={tiny.cache}", f"model={tiny.folder / 'detector.pt'}")
-    return evaluate(composed(*told, *overrides, name="evaluate"), folder)
+    told = *TINY_DATA, *TINY_SPLIT, "num_workers=0", f"cache={tiny.cache}"
+    model = f"model={tiny.folder / 'detector.pt'}"
+    return evaluate(composed(*told, model, *overrides, name="evaluate"), folder)
 
 
 @pytest.mark.parametrize(

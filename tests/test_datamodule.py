@@ -31,19 +31,19 @@ def test_features_are_those_of_the_filtered_bins():
 def test_the_cache_saves_the_work_and_a_damaged_entry_is_made_anew(tmp_path, caplog):
     source = SmallSet()
     maker = small_maker(source, FeatureCache(tmp_path))
-    first, second = (maker(RecordingId("a", 0), split_of(source)) for _ in range(2))
-    assert source.loads == 1
-    assert torch.equal(first.features, second.features)
-    assert set(second.seconds) == {"read_cache"}
+
+    def made():
+        return maker(RecordingId("a", 0), split_of(source))
+
+    first, second = made(), made()
+    assert (source.loads, set(second.seconds)) == (1, {"read_cache"})
     (path,) = tmp_path.glob("*/*.npz")
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-    again = maker(RecordingId("a", 0), split_of(source))
+    path.write_bytes(path.read_bytes()[:-4])
+    third = made()
     assert source.loads == 2
-    assert torch.equal(first.features, again.features)
     assert "damaged" in caplog.text
-    assert path.read_bytes() != bytes(content)
+    assert torch.equal(first.features, second.features)
+    assert torch.equal(first.features, third.features)
 
 
 def test_shuffled_labels_keep_their_counts_and_lose_their_order():
@@ -67,10 +67,8 @@ def test_a_sample_that_is_not_finite_is_named():
 class BrokenBefore(SmallSet):
     """One sample is missing 30 before the first bin."""
 
-    def load(self, recording, windows=None):
-        loaded = super().load(recording, windows)
-        loaded.samples[0, 150] = torch.nan
-        return loaded
+    def shape(self, noise, time_s, recording, generator):
+        noise[0, 150] = torch.nan
 
 
 @pytest.mark.parametrize("align", ["centred", "causal"])
