@@ -10,7 +10,6 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from contract.names import STREAM_OUTPUTS
 from engine_bins import some_hand
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +18,6 @@ from streams import detector_of, onset_of, signal
 from test_dead_streams import alarming_with_gaussians
 from test_detector import VARIANTS, noise, random_detector
 from test_predictions import with_gaussians
-from torch.nn.functional import pad
 
 from tactslip_torch.deploy.bins import RawBin, Timing, bin_graph, described
 from tactslip_torch.deploy.check import (
@@ -34,7 +32,7 @@ from tactslip_torch.deploy.check import (
 from tactslip_torch.deploy.stream import onset_memory, onset_scores, stream_graph
 from tactslip_torch.deploy.value import F32, F64, I64, Graph
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.calibration import Isotonic, Platt, probability, widened_llr
+from tactslip_torch.model.calibration import Isotonic, Platt, widened_llr
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
@@ -219,36 +217,37 @@ def detector():
     return alarming_detector()
 
 
-# Bins ------------------------------------------------------------------------------------------
+# Checks ----------------------------------------------------------------------------------------
 
 
-def bin_run(detector, change=lambda samples, out: out):
-    """What a right bin graph in float32 gives, changed; ``change`` sees the samples."""
-    single = copy.deepcopy(detector).float()
-    raw, settings = RawBin.of(detector), AlarmSettings.of(detector)
-    context = detector.context_before - raw.before, detector.context_after - raw.after
+@pytest.fixture(scope="module")
+def joint(detector):
+    """With an alarm of fast evidence beside that of bins."""
+    made, samples = copy.deepcopy(detector), simulated_stream(HAND, 2000.0, torch.float64)
+    onset = onset_of(torch.cat([samples] * 2, 1), quantile=0.999)
+    settings = replace(AlarmSettings.of(detector), onset=replace(onset, threshold=1e9))
+    made.info[KEY] = settings.to_dict()
+    return made
 
-    def run(inputs):
-        samples = torch.tensor(inputs["samples"])
-        with torch.no_grad():
-            score, is_valid, *_ = single.predict_raw(pad(samples, context))
-        stated = probability(settings.calibration.llr(score), settings.slip_share)
-        out = {"score": score.numpy(), "probability": stated.numpy(), "valid": is_valid.numpy()}
-        return change(samples, out)
 
-    return run
+def stream_run(detector, precision="float32"):
+    return runner(session_of(stream_graph(detector, AlarmSettings.of(detector), precision).model()))
 
 
 def at(is_there, **values):
     """Other outputs on bins that a predicate ``[B]`` of their samples picks."""
 
     def change(samples, out):
-        mask = is_there(samples).numpy()
+        mask = is_there(torch.tensor(samples)).numpy()
         for name, value in values.items():
             out = out | {name: np.where(mask, np.array(value, out[name].dtype), out[name])}
         return out
 
     return change
+
+
+def changed(name, by):
+    return lambda samples, out: out | {name: by(out[name])}
 
 
 def one_bin(samples):
@@ -268,39 +267,69 @@ def behind_nan(samples):
     return ~holds_nan(samples) & holds_nan(samples).any()
 
 
-WRONG_BINS = {
-    "another name": (
+def never_early(alarms):
+    """No alarm by the first decision of a push: one that forgets its latch."""
+    return np.where(np.arange(len(alarms)) == 0, False, alarms)
+
+
+WRONG = [
+    (
+        "bin",
         lambda samples, out: {n.replace("score", "scores"): x for n, x in out.items()},
         r"it gives .*scores float32\[256\], expected score float32\[256\], scores missing",
     ),
-    "rows mixed up": (
-        lambda samples, out: out | {"score": out["score"][::-1]},
-        "score differs from torch by",
+    ("bin", changed("score", lambda x: x[::-1]), "score differs from torch by"),
+    ("bin", at(one_bin, valid=False), "differs from torch at 1 of 256, the first is number 3"),
+    ("bin", at(constant, valid=True), r"\(constant\): valid differs from torch at 16"),
+    ("bin", at(holds_nan, valid=True), r"\(nan\): valid differs"),
+    ("bin", at(behind_nan, score=0.123), "simulated bins behind a degenerate one"),
+    (
+        "stream",
+        lambda samples, out: {n: x for n, x in out.items() if n != "on"},
+        "it gives on missing, expected on bool",
     ),
-    "one flag wrong": (
-        at(one_bin, valid=False),
-        "valid differs from torch at 1 of 256, the first is number 3",
-    ),
-    "trusts the dead": (at(constant, valid=True), r"\(constant\): valid differs from torch at 16"),
-    "trusts the torn": (at(holds_nan, valid=True), r"\(nan\): valid differs"),
-    "one breaks others": (at(behind_nan, score=0.123), "simulated bins behind a degenerate one"),
-}
+    ("stream", changed("alarm", never_early), "alarm differs from torch at .*, the first"),
+    ("stream", changed("valid", np.ones_like), "broken channels: valid differs from torch"),
+    ("stream", changed("onset_s", lambda x: x - 0.01), "onset_s differs from torch by 1.0e-02 s"),
+    ("stream", changed("score", lambda x: x * np.float32(1.01)), "score differs from torch"),
+    ("joint", changed("onset_score", lambda x: x + 1e-8), "onset_score differs from torch by 1.0e"),
+    ("joint", changed("by_onset", np.zeros_like), "another threshold: by_onset differs"),
+    ("joint", changed("onset_score", np.float32), "gives onset_score float32"),
+]
 
 
-@pytest.mark.parametrize("name", WRONG_BINS)
-def test_a_wrong_bin_graph_is_refused(detector, name):
-    change, message = WRONG_BINS[name]
+@pytest.mark.parametrize(("kind", "change", "message"), WRONG, ids=[row[2] for row in WRONG])
+def test_a_wrong_graph_is_refused(request, kind, change, message):
+    made_of = request.getfixturevalue("joint" if kind == "joint" else "detector")
+    if kind == "bin":
+        check, run = check_bins, runner(session_of(bin_graph(made_of, "float32").model()))
+    else:
+        check, run = check_stream, stream_run(made_of)
     with pytest.raises(ValueError, match=message) as caught:
-        check_bins(bin_run(detector, change), detector, "float32")
+        check(lambda inputs: change(inputs["samples"], run(inputs)), made_of, "float32")
     assert "\n" not in str(caught.value)
 
 
 def test_a_right_bin_graph_passes_and_is_measured(detector):
-    found = check_bins(bin_run(detector), detector, "float32")
+    found = check_model(bin_graph(detector, "float32").model(), detector, "bin", "float32")
     assert found["bins"] == 320
     assert 0 < found["worst_sd"] < 1e-3
     assert set(found["degenerate_worst_sd"]) == set(DEGENERATE)
     assert list(found["missing_worst_sd"]) == ["the first", "every other", "all"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "hop"), [("joint", 20), ("detector", 20), ("detector", 70), ("detector", 3000)]
+)
+def test_a_right_stream_graph_of_any_hop_passes_and_is_measured(request, kind, hop):
+    """The last samples are of no whole hop, or the hop is longer than the simulated slip."""
+    other = copy.deepcopy(request.getfixturevalue(kind))
+    other.info[KEY] = replace(AlarmSettings.of(other), hop_samples=hop).to_dict()
+    found = check_stream(stream_run(other), other, "float32")
+    assert found["decisions"] >= (400 if kind == "joint" else 12)
+    assert 0 <= found["worst_sd"] < 1e-3
+    if hop == 20:
+        assert found["alarms"] > 0
 
 
 def test_rounding_is_no_error_where_it_decides_a_score():
@@ -313,93 +342,6 @@ def test_rounding_is_no_error_where_it_decides_a_score():
     of_entropy = SlipDetector(pool, channel_filter, [place], scaler, head, {"simulated": True})
     found = check_model(bin_graph(of_entropy, "float64").model(), of_entropy, "bin", "float64")
     assert found["worst_sd"] < 1e-9
-
-
-# Streams ---------------------------------------------------------------------------------------
-
-
-class StreamRun:
-    """A right stream graph: its memory hides in a ``StreamingDetector``, the state is a counter."""
-
-    def __init__(self, detector, change=lambda out: out, remembers=True):
-        self.detector, self.change, self.remembers = detector, change, remembers
-        self.timing = Timing.of(detector, AlarmSettings.of(detector))
-
-    def __call__(self, inputs):
-        if not inputs["tail"].size or not self.remembers:
-            settings = AlarmSettings.of(self.detector)
-            settings = replace(settings, threshold=float(inputs["threshold"][0]))
-            self.stream = StreamingDetector(self.detector, settings, dtype=torch.float32)
-        made = self.stream.push(inputs["samples"])
-        out = {name: getattr(made, field).numpy() for name, field in STREAM_OUTPUTS.items()}
-        out["next_tail"] = np.zeros((self.timing.tail, 4), np.float32)
-        out["next_state"] = np.zeros(self.timing.state_size)
-        return self.change(out)
-
-
-def changed(name, by):
-    return lambda out: out | {name: by(out[name])}
-
-
-def never_early(alarms):
-    """No alarm by the first decision of a push: one that forgets its latch."""
-    return np.where(np.arange(len(alarms)) == 0, False, alarms)
-
-
-WRONG_STREAMS = {
-    "no column": (
-        lambda out: {n: x for n, x in out.items() if n != "on"},
-        "it gives on missing, expected on bool",
-    ),
-    "drops an alarm": (changed("alarm", never_early), "alarm differs from torch at .*, the first"),
-    "trusts all": (changed("valid", np.ones_like), "broken channels: valid differs from torch"),
-    "onset": (changed("onset_s", lambda x: x - 0.01), "onset_s differs from torch by 1.0e-02 s"),
-    "score": (changed("score", lambda x: x * np.float32(1.01)), "score differs from torch"),
-}
-
-
-@pytest.mark.parametrize("name", WRONG_STREAMS)
-def test_a_wrong_stream_graph_is_refused(detector, name):
-    change, message = WRONG_STREAMS[name]
-    with pytest.raises(ValueError, match=message) as caught:
-        check_stream(StreamRun(detector, change), detector, "float32")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        (None, None, None),
-        ("onset_score", lambda x: x + 1e-8, "onset_score differs from torch by 1.0e-08"),
-        ("by_onset", np.zeros_like, "another threshold: by_onset differs"),
-        ("onset_score", np.float32, "gives onset_score float32"),
-    ],
-)
-def test_onset_scores_are_checked(detector, name, change, message):
-    joint, samples = copy.deepcopy(detector), simulated_stream(HAND, 2000.0, torch.float64)
-    onset = onset_of(torch.cat([samples] * 2, 1), quantile=0.999)
-    settings = replace(AlarmSettings.of(detector), onset=replace(onset, threshold=1e9))
-    joint.info[KEY] = settings.to_dict()
-    run = runner(session_of(stream_graph(joint, settings).model()))
-    if name is None:
-        found = check_stream(run, joint, "float32")
-        assert found["decisions"] > 400
-        return
-    with pytest.raises(ValueError, match=message):
-        check_stream(lambda x: changed(name, change)(run(x)), joint, "float32")
-
-
-@pytest.mark.parametrize("hop", [20, 70, 3000])
-def test_a_right_stream_graph_of_any_hop_passes_and_is_measured(detector, hop):
-    """The last samples are of no whole hop, or the hop is longer than the simulated slip."""
-    other = copy.deepcopy(detector)
-    settings = replace(AlarmSettings.of(detector), hop_samples=hop)
-    other.info[KEY] = settings.to_dict()
-    found = check_stream(StreamRun(other), other, "float32")
-    assert found["decisions"] >= 12
-    assert 0 <= found["worst_sd"] < 1e-3
-    if hop == 20:
-        assert found["alarms"] > 0
 
 
 # Models ----------------------------------------------------------------------------------------
@@ -617,51 +559,30 @@ def test_a_stream_that_ran_for_years_goes_on(rule, onset):
     np.testing.assert_array_equal(found["time_s"], by_then / 2000.0)
 
 
-# Calibration -----------------------------------------------------------------------------------
-
-X = np.array([-2.5, -1.0, 0.0, 0.5, 1.0, 3.0])
-
-
-def run(graph, **inputs):
-    """What onnxruntime makes of a graph, with its usual optimisations."""
-    content = graph.model().SerializeToString()
-    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    return dict(
-        zip([out.name for out in session.get_outputs()], session.run(None, inputs), strict=True)
-    )
-
-
-def applied(function, *arrays, num_axes=1):
-    """A function of values, run on arrays."""
-    graph = Graph()
-    values = [
-        graph.input(f"x{i}", array.dtype, [None] * array.ndim) for i, array in enumerate(arrays)
-    ]
-    graph.output("y", function(*values), [None] * num_axes)
-    return run(graph, **{f"x{i}": array for i, array in enumerate(arrays)})["y"]
-
-
 # Arithmetic ------------------------------------------------------------------------------------
-
-
-def test_what_values_do_not_know_is_refused():
-    value = Graph().input("x", F64, (2, 2))
-    with pytest.raises(TypeError, match="median of torch is not known to values of a graph"):
-        torch.median(value)
 
 
 @pytest.mark.parametrize("number", [1 + 1e-9, 1 - 1e-9, 1.0, 2.0])
 @pytest.mark.parametrize("function", [operator.mul, operator.truediv], ids=["times", "over"])
 def test_a_factor_next_to_one_is_not_dropped(function, number):
     # onnxruntime takes it for 1 where the node is neither the first nor the last
-    x = np.abs(X)
-    found = applied(lambda value: function(value.abs(), number).maximum(-1.0), x)
-    np.testing.assert_allclose(found, function(x, number), rtol=1e-15)
+    x, graph = np.array([0.0, 0.5, 1.0, 3.0]), Graph()
+    made = function(graph.input("x", F64, [None]).abs(), number).maximum(-1.0)
+    graph.output("y", made, [None])
+    content = graph.model().SerializeToString()
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    np.testing.assert_allclose(session.run(None, {"x": x})[0], function(x, number), rtol=1e-15)
 
 
-@pytest.mark.parametrize("function", [operator.add, operator.le, operator.matmul])
-def test_values_of_two_dtypes_do_not_meet(function):
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda x, y: torch.median(x), "median of torch is not known to values of a graph"),
+        *((f, "float32 meets float64; cast") for f in (operator.add, operator.le, operator.matmul)),
+    ],
+)
+def test_what_values_cannot_do_is_refused(function, message):
     graph = Graph()
     x, y = graph.input("x", F32, (2, 2)), graph.input("y", F64, (2, 2))
-    with pytest.raises(TypeError, match="float32 meets float64; cast one of them"):
+    with pytest.raises(TypeError, match=message):
         function(x, y)

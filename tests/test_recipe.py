@@ -27,11 +27,7 @@ from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.missing_channels import RESOLUTION
 from tactslip_torch.training import plan as planning
 from tactslip_torch.training.learner import SlipLearner
-from tactslip_torch.training.plan import (
-    TrainingPass,
-    choose_model,
-    plan_detector,
-)
+from tactslip_torch.training.plan import TrainingPass, choose_model, plan_detector
 from tactslip_torch.training.recipe import (
     FREE_CONSTANT,
     Recipe,

@@ -27,11 +27,7 @@ from tactslip_torch.onset.rules import (
     latch,
     rule_from_dict,
 )
-from tactslip_torch.onset.thresholds import (
-    Budget,
-    false_alarms,
-    lowest_threshold,
-)
+from tactslip_torch.onset.thresholds import Budget, false_alarms, lowest_threshold
 
 LIST = (
     KOfN(1, 1),
@@ -72,10 +68,7 @@ def cusum(rule: Cusum, llrs: list[float]) -> list[float]:
     return found
 
 
-ORACLES: dict[str, Callable[..., list[float]]] = {
-    "k_of_n": k_of_n,
-    "cusum": cusum,
-}
+ORACLES: dict[str, Callable[..., list[float]]] = {"k_of_n": k_of_n, "cusum": cusum}
 
 
 @RULE
@@ -185,12 +178,7 @@ def drawn(seed: int) -> list[int]:
 
 
 drawn_values = st.integers(0, 2**40).map(drawn)  # hypothesis draws short plain lists
-drawn_times = st.fixed_dictionaries(
-    {
-        "rearm": st.integers(0, 5),
-        "refractory": st.integers(0, 9),
-    }
-)
+drawn_times = st.fixed_dictionaries({"rearm": st.integers(0, 5), "refractory": st.integers(0, 9)})
 
 
 # --------------------------------------------------------------------------------- the definition

@@ -273,10 +273,7 @@ REFUSED = [
     (recording(dtype=torch.int64), r"dtype must be floating, got torch\.int64"),
     (lambda: paper_scenes(burst_rate=1), r"unknown override burst_rate; a scene has .*strokes"),
     (lambda: paper_scenes(cycles=0), r"cycles must be a whole number of at least 1, got 0"),
-    (
-        lambda: SimulatedRecordings(sessions=0),
-        r"data\.sessions must be a positive .*, got 0",
-    ),
+    (lambda: SimulatedRecordings(sessions=0), r"data\.sessions must be a positive .*, got 0"),
     (lambda: simulate_many([], at_once=0), r"at_once must be a positive whole number, got 0"),
     (lambda: simulate_many([], windows=[None]), r"expected windows of each of 0 scenes, got 1"),
     (
@@ -395,10 +392,7 @@ def test_provenance_and_keys_name_the_backend_of_bristles(monkeypatch):
     by_engine = {"backend": "native", "tactslip_torch_version": version("tactslip_torch")}
     by_engine |= {"dtype": "float64", "device": "cpu"}
     assert simulate(scene, windows=[]).provenance["integrator"] == by_engine
-    for fidelity, backends in (
-        ("kinematic", [None, None]),
-        ("bristles", ["native", "torch"]),
-    ):
+    for fidelity, backends in (("kinematic", [None, None]), ("bristles", ["native", "torch"])):
         source = SimulatedRecordings(
             cycles=1, materials=["M2"], fidelity=fidelity, scene={"strokes": strokes}
         )

@@ -8,12 +8,11 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import torch
-import yaml
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
-from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from small_detector import HAND
 from test_detect import (  # noqa: F401
     RATE_HZ,
@@ -42,47 +41,15 @@ def run(model, tmp_path_factory):  # noqa: F811
     return place, detected(model, place / "a.npz", place / "out", *options)
 
 
-def bag_of(path):
-    """A folder of rosbag2 around an MCAP file, as ``ros2 bag reindex`` makes one."""
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    counts = summary.statistics.channel_message_counts
-    topics = [
-        {
-            "topic_metadata": {
-                "name": channel.topic,
-                "type": summary.schemas[channel.schema_id].name,
-                "serialization_format": channel.message_encoding,
-                "offered_qos_profiles": "",
-            },
-            "message_count": counts.get(number, 0),
-        }
-        for number, channel in summary.channels.items()
-    ]
-    start, end = summary.statistics.message_start_time, summary.statistics.message_end_time
-    said = {
-        "version": 8,
-        "storage_identifier": "mcap",
-        "relative_file_paths": [path.name],
-        "duration": {"nanoseconds": end - start},
-        "starting_time": {"nanoseconds_since_epoch": start},
-        "message_count": summary.statistics.message_count,
-        "topics_with_message_count": topics,
-    }
-    folder = path.with_suffix(".folder")
-    folder.mkdir(exist_ok=True)
-    (folder / path.name).write_bytes(path.read_bytes())
-    (folder / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": said}))
-    return folder
-
-
 def messages_of(path):
     """Topic: times in seconds and messages, by rosbags and the definitions in the file alone."""
-    found = {}
-    with AnyReader([bag_of(path)]) as reader:
-        for connection, time, content in reader.messages():
-            message = reader.deserialize(content, connection.msgtype)
-            found.setdefault(connection.topic, []).append((time / 1e9, message))
+    found, types = {}, get_typestore(Stores.EMPTY)
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            if schema.name not in types.types:
+                types.register(get_types_from_msg(schema.data.decode(), schema.name))
+            content = types.deserialize_cdr(message.data, schema.name)
+            found.setdefault(channel.topic, []).append((message.log_time / 1e9, content))
     return found
 
 
@@ -99,11 +66,8 @@ def test_samples_decisions_alarms_and_truth_are_read_back(run):
     times = np.array([time for time, _ in found["/tactile"]])
     np.testing.assert_allclose(times, np.arange(len(rows)) / RATE_HZ, atol=1e-9)
     decided = rows_of(place / "out" / "a_decisions.csv")
-    for topic, column in (
-        ("probability", "probability"),
-        ("valid", "is_valid"),
-        ("alarm", "is_on"),
-    ):
+    columns = {"probability": "probability", "valid": "is_valid", "alarm": "is_on"}
+    for topic, column in columns.items():
         said = [message.data for _, message in found[f"/slip/{topic}"]]
         wanted = [row[column] for row in decided]
         assert [str(value) for value in said] == wanted

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from test_native import quick_compiler
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +23,8 @@ INGREDIENTS = (
 @pytest.fixture(scope="module")
 def unpacked(tmp_path_factory):
     """What pip would install, in an empty folder; the checkout stays clean."""
-    return unpack(tmp_path_factory, {})
+    compiler = quick_compiler(tmp_path_factory.mktemp("compiler"))
+    return unpack(tmp_path_factory, {"CXX": compiler})
 
 
 def unpack(tmp_path_factory, variables):
