@@ -42,7 +42,6 @@ def ridge(bins, penalty, kernel=PAPER_KERNEL):
         (torch.ones(4, dtype=torch.bool), None, r"one N, got \(5, 2\), \(4,\)$"),
         (torch.ones(5, dtype=torch.bool), torch.ones(4), r"got \(5, 2\), \(5,\), \(4,\)$"),
         (torch.ones(5, dtype=torch.bool), torch.arange(5.0), "positive and finite, got 0"),
-        (torch.ones(5, dtype=torch.bool), torch.full((5,), torch.inf), "and finite, got inf"),
     ],
 )
 def test_bins_that_do_not_fit_together_are_refused(is_slip, weights, message):
@@ -97,22 +96,6 @@ def test_a_kernel_that_does_not_fold_says_what_it_costs(kernel, rng, caplog):
     with caplog.at_level("INFO"):
         machine = fit_machine(draw(rng, 60), 0.3, kernel)
     assert f"all 60 training bins are kept, {machine.cost}" in caplog.text
-
-
-@pytest.mark.parametrize("route", ["primal", "dual"])
-@pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize("num_bins", [3, 8, 40])
-def test_an_infinite_penalty_is_least_squares(num_bins, degree, route, rng):
-    """Interpolation with fewer bins than monomials, the normal equations with more."""
-    bins = draw(rng, num_bins)
-    machine = fit_machine(bins, float("inf"), Polynomial(degree, 0.5), route=route)
-    z = bins.features.numpy()
-    columns = [np.ones(num_bins), *z.T]
-    if degree == 2:
-        columns += [z[:, i] * z[:, j] for i in range(3) for j in range(i, 3)]
-    design = np.stack(columns, axis=-1)
-    fitted = design @ np.linalg.lstsq(design, bins.targets.numpy(), rcond=None)[0]
-    np.testing.assert_allclose(machine(bins.features).numpy(), fitted, rtol=1e-7, atol=1e-7)
 
 
 NONE = TrainingBins(torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool))
@@ -188,16 +171,6 @@ def test_derivatives_are_right_once_and_twice(num_bins, num_features, route, rng
         torch.autograd.grad(scores(*inputs).sum(), inputs), expected, strict=True
     ):
         torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-9)
-
-
-def test_single_precision_is_promoted_and_gets_its_gradient(rng):
-    z, targets, *_ = (tensor.detach().float() for tensor in drawn(rng, 12, 4))
-    machine = fit_quadratic(z.requires_grad_(), targets, 0.7)
-    assert machine.linear.dtype == torch.float64
-    (slope,) = torch.autograd.grad(machine.quadratic.sum(), z)
-    double = z.detach().double().requires_grad_()
-    (expected,) = torch.autograd.grad(fit_quadratic(double, targets, 0.7).quadratic.sum(), double)
-    torch.testing.assert_close(slope, expected.float())
 
 
 @ROUTES

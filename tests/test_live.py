@@ -1,6 +1,5 @@
 """Samples as they come: frames, sources that break off, the pump, and the page's server."""
 
-import asyncio
 import json
 import os
 import pty
@@ -10,13 +9,17 @@ import struct
 import threading
 import time
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import reduce
+from operator import xor
 
 import numpy as np
 import pytest
 import torch
-import websockets
 from small_detector import HAND, alarming_detector
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from tactslip_torch.data.formats import Reading
 from tactslip_torch.deploy.check import simulated_stream
@@ -85,8 +88,8 @@ class Kept:
     def told(self, kind):
         return [text for each, text in self.events if each == kind]
 
-    def until(self, is_there, seconds=20.0):
-        end = time.monotonic() + seconds
+    def until(self, is_there):
+        end = time.monotonic() + 20
         while not is_there():
             assert time.monotonic() < end, self.events
             self.changed.wait(0.02)
@@ -99,6 +102,13 @@ def expected(detector, samples, dtype=torch.float64):
     return {name: torch.cat([getattr(p, name) for p in parts]) for name in parts[0]._fields}
 
 
+def decided_on(source, detector, *sinks, wait_s=0.0, **options):
+    """What a sink is given of a source to its end."""
+    kept, stream = Kept(wait_s), StreamingDetector(detector, dtype=torch.float64)
+    watch(source, stream, [kept, *sinks], **options)
+    return kept
+
+
 def assert_decided(kept, wanted):
     for name, values in wanted.items():
         torch.testing.assert_close(kept.column(name), values, rtol=1e-9, atol=1e-9, msg=name)
@@ -107,40 +117,45 @@ def assert_decided(kept, wanted):
 # Frames ------------------------------------------------------------------------------------------
 
 
+def crc16(content):
+    """Bit by bit, as in the standard."""
+    total = 0xFFFF
+    for byte in content:
+        total ^= byte << 8
+        for _ in range(8):
+            total = (total << 1 ^ (0x1021 if total & 0x8000 else 0)) & 0xFFFF
+    return total
+
+
+SUMS = {
+    None: (0, lambda content: 0),
+    "sum8": (1, lambda content: sum(content) % 256),
+    "xor8": (1, lambda content: reduce(xor, content)),
+    "crc16": (2, crc16),
+    "crc32": (4, zlib.crc32),
+}
+"""By check sum its bytes and its value."""
+
+
 def written(values, how):
     """Frames of ``values [n, C]``, made by the words of the description alone."""
-    order = "<" if how.byte_order == "little" else ">"
+    size, total = SUMS[how.checksum]
     frames = []
     for number, first in enumerate(range(0, len(values), how.samples)):
         content = b""
         if how.counter:
-            size = int(how.counter[4:]) // 8
-            content += (number % (1 << 8 * size)).to_bytes(size, how.byte_order)
+            bits = int(how.counter[4:])
+            content += (number % (1 << bits)).to_bytes(bits // 8, how.byte_order)
         content += b"\xee" * how.skip
         for value in values[first : first + how.samples].ravel().tolist():
-            if how.dtype == "int24":
-                content += int(value).to_bytes(3, how.byte_order, signed=True)
+            if how.dtype == "float32":
+                content += struct.pack("<f" if how.byte_order == "little" else ">f", value)
             else:
-                code = {"int16": "h", "uint8": "B", "int32": "i", "float32": "f"}[how.dtype]
-                content += struct.pack(order + code, value)
-        sums = {None: 0, "sum8": 1, "xor8": 1, "crc16": 2, "crc32": 4}[how.checksum]
+                num = int(how.dtype.lstrip("uint")) // 8
+                content += int(value).to_bytes(num, how.byte_order, signed=how.dtype[0] == "i")
         if how.length:
-            content += bytes(how.length - len(content) - sums - len(how.start))
-        total = 0
-        if how.checksum == "sum8":
-            total = sum(content) % 256
-        elif how.checksum == "crc32":
-            total = zlib.crc32(content)
-        elif how.checksum:  # bit by bit, as in the standard
-            for byte in content:
-                total ^= byte
-            if how.checksum == "crc16":
-                total = 0xFFFF
-                for byte in content:
-                    total ^= byte << 8
-                    for _ in range(8):
-                        total = (total << 1 ^ (0x1021 if total & 0x8000 else 0)) & 0xFFFF
-        frames.append(how.start + content + total.to_bytes(sums, how.byte_order))
+            content += bytes(how.length - len(content) - size - len(how.start))
+        frames.append(how.start + content + total(content).to_bytes(size, how.byte_order))
     return frames
 
 
@@ -289,26 +304,15 @@ def as_sent(samples):
 @contextmanager
 def watched(source, detector, *sinks, **options):
     """A source that is watched while the block runs; it is closed at its end."""
-    kept, failed = Kept(), []
-
-    def run():
+    kept, stream = Kept(), StreamingDetector(detector, dtype=torch.float64)
+    with ThreadPoolExecutor(1) as pool:
+        watching = pool.submit(watch, source, stream, [kept, *sinks], **options)
         try:
-            watch(
-                source, StreamingDetector(detector, dtype=torch.float64), [kept, *sinks], **options
-            )
-        except BaseException as error:
-            failed.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield kept
-    finally:
-        source.close()
-        thread.join(20)
-        assert not thread.is_alive()
-        assert failed == []
-        assert kept.is_closed
+            yield kept
+        finally:
+            source.close()
+            watching.result(20)
+    assert kept.is_closed
 
 
 class Pty:
@@ -404,20 +408,18 @@ def test_a_stream_is_decided_on_and_recovers_when_the_cable_is_pulled(
         device.send(whole)
         kept.until(lambda: counts.received == 2 * len(samples))
     device.close()
-    assert [kind for kind, _ in kept.events if kind != "waiting"] == [
-        *("connected", "lost", "connected", "ended")
-    ]
+    kinds = [kind for kind, _ in kept.events if kind != "waiting"]
+    assert kinds == ["connected", "lost", "connected", "ended"]
     assert counts.dropped == 0
     wanted = expected(detector, volts)
     num = len(wanted["number"])
-    for name in ("number", "score", "statistic", "is_alarm", "is_valid"):
-        for part in (kept.column(name)[:num], kept.column(name)[num:]):
-            torch.testing.assert_close(part, wanted[name], rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(kept.column("available_s")[:num], wanted["available_s"])
     begins = kept.blocks[-1][0] + len(kept.blocks[-1][1]) - len(samples)
-    again_s = kept.column("available_s")[num:] - begins / RATE
-    torch.testing.assert_close(again_s, wanted["available_s"])
     assert begins > len(samples)
+    for own, start_s in ((slice(num), 0.0), (slice(num, None), begins / RATE)):
+        for name in ("number", "score", "statistic", "is_alarm", "is_valid"):
+            torch.testing.assert_close(kept.column(name)[own], wanted[name], rtol=1e-9, atol=1e-9)
+        since_s = kept.column("available_s")[own] - start_s
+        torch.testing.assert_close(since_s, wanted["available_s"])
     rows = [json.loads(line) for text in lines for line in text.splitlines()]
     assert [row["score"] for row in rows if "score" in row] == kept.column("score").tolist()
     alarms = int(kept.column("is_alarm").sum())
@@ -433,9 +435,9 @@ def test_a_file_is_decided_on_as_it_is(written_as, detector, samples, tmp_path):
     else:
         np.savetxt(path, samples, delimiter=",", header=",".join(NAMES), comments="")
     reading = Reading(sample_rate_hz=RATE, time_first=True)
-    kept = Kept()
     source = source_of(str(path), detector, Frames(), reading=reading, speed=None)
-    watch(source, StreamingDetector(detector, dtype=source.dtype), [kept])
+    kept = decided_on(source, detector)
+    assert source.dtype == torch.float64
     assert_decided(kept, expected(detector, samples))
     np.testing.assert_array_equal(np.concatenate([x for _, x in kept.blocks]), samples)
     fast = FileInTime(path, detector, reading, speed=40.0, repeat=True)
@@ -454,9 +456,7 @@ def test_standard_input_is_read_to_its_end(detector, samples, monkeypatch):
     writer = threading.Thread(target=lambda: (os.write(theirs, text), os.close(theirs)))
     try:
         writer.start()
-        kept = Kept()
-        source = StandardInput(Frames(), detector)
-        watch(source, StreamingDetector(detector, dtype=torch.float64), [kept], queue_s=0.05)
+        kept = decided_on(StandardInput(Frames(), detector), detector, queue_s=0.05)
     finally:
         os.dup2(before, 0)
         for each in (ours, before):
@@ -483,12 +483,16 @@ class Sent:
         self.items = []
 
 
+def blocks_of(samples, size, time_s=None):
+    """Samples in blocks, each with its times if there are any."""
+    parts = [slice(first, first + size) for first in range(0, len(samples), size)]
+    return [Block(samples[part], None if time_s is None else time_s[part]) for part in parts]
+
+
 def test_what_waits_too_long_is_dropped_and_counted_and_times_stay_right(detector, samples):
-    blocks = [Block(samples[i : i + 50]) for i in range(0, len(samples), 50)]
     for is_live in (True, False):
-        kept, counts = Kept(wait_s=0.002), Counts()
-        stream = StreamingDetector(detector, dtype=torch.float64)
-        watch(Sent(blocks, is_live), stream, [kept], queue_s=0.2, counts=counts)
+        counts, source = Counts(), Sent(blocks_of(samples, 50), is_live)
+        kept = decided_on(source, detector, wait_s=0.002, queue_s=0.2, counts=counts)
         num = sum(len(block) for _, block in kept.blocks)
         assert counts.received == len(samples)
         assert num + counts.dropped == counts.received
@@ -501,14 +505,11 @@ def test_what_waits_too_long_is_dropped_and_counted_and_times_stay_right(detecto
 
 def test_times_of_a_sender_count_and_what_goes_back_is_passed_over(detector, samples):
     time_s = 1e5 + np.arange(len(samples)) / RATE
-    blocks = [
-        *(Block(samples[i : i + 100], time_s[i : i + 100]) for i in range(0, 1000, 100)),
-        Block(samples[:100], time_s[:100]),
-        *(Block(samples[i : i + 100], time_s[i : i + 100]) for i in range(1040, 2000, 100)),
-    ]
-    kept = Kept()
-    watch(Sent(blocks), StreamingDetector(detector, dtype=torch.float64), [kept])
-    padded = samples[: blocks[-1].time_s.size + 1940].copy()
+    before, behind = slice(1000), slice(1040, 2040)
+    blocks = blocks_of(samples[before], 100, time_s[before])
+    blocks += [blocks[0], *blocks_of(samples[behind], 100, time_s[behind])]
+    kept = decided_on(Sent(blocks), detector)
+    padded = samples[:2040].copy()
     padded[1000:1040] = np.nan
     wanted = expected(detector, padded)
     torch.testing.assert_close(kept.column("score"), wanted["score"], equal_nan=True)
@@ -523,9 +524,8 @@ def test_an_error_of_a_sink_ends_the_stream_and_closes_the_others(detector, samp
         raise RuntimeError("no place left")
 
     kept = Kept()
-    sinks = [kept, Callback(fail)]
     with pytest.raises(RuntimeError, match="no place left"):
-        watch(Sent([Block(samples)]), StreamingDetector(detector), sinks)
+        decided_on(Sent([Block(samples)]), detector, kept, Callback(fail))
     assert kept.is_closed
 
 
@@ -624,18 +624,12 @@ def test_a_wrong_token_and_a_wrong_origin_are_refused(serve, query, origin, stat
     assert server.address.endswith("/?token=a%20token%2Bmore")
     assert json.loads(asked(server, "/live.json")[1])["token_needed"] is True
     origin = f"http://127.0.0.1:{server.port}" if origin == "own" else origin
-
-    async def connect():
-        await (
-            await websockets.connect(f"ws://127.0.0.1:{server.port}/ws{query}", origin=origin)
-        ).close()
-
-    if status == 101:
-        asyncio.run(connect())
-        return
-    with pytest.raises(websockets.InvalidStatus) as caught:
-        asyncio.run(connect())
-    assert caught.value.response.status_code == status
+    try:
+        with connect(f"ws://127.0.0.1:{server.port}/ws{query}", origin=origin):
+            found = 101
+    except InvalidStatus as refused:
+        found = refused.response.status_code
+    assert found == status
 
 
 def test_beyond_this_machine_there_is_always_a_token(serve):
@@ -654,19 +648,16 @@ def test_the_page_is_given_the_samples_and_the_decisions(serve, detector, sample
     server = serve(counts=counts)
     got, is_there = [], threading.Event()
 
-    async def read():
-        async with websockets.connect(f"ws://127.0.0.1:{server.port}/ws") as page:
-            async for message in page:
+    def read():
+        with connect(f"ws://127.0.0.1:{server.port}/ws") as page:
+            for message in page:
                 got.append(message)
                 is_there.set()
 
-    thread = threading.Thread(target=lambda: asyncio.run(read()))
+    thread = threading.Thread(target=read)
     thread.start()
     is_there.wait(20)
-    kept = Kept()
-    blocks = [Block(samples[i : i + 7]) for i in range(0, len(samples), 7)]
-    stream = StreamingDetector(detector, dtype=torch.float64)
-    watch(Sent(blocks), stream, [kept, server], counts=counts, queue_s=60.0)
+    kept = decided_on(Sent(blocks_of(samples, 7)), detector, server, counts=counts, queue_s=60.0)
     thread.join(20)
     texts = [json.loads(each) for each in got if isinstance(each, str)]
     assert texts[0]["type"] == "hello"

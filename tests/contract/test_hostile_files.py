@@ -15,6 +15,7 @@ import warnings
 import zipfile
 import zlib
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -27,21 +28,15 @@ import pytest
 import scipy.io
 import torch
 from foreign_files import LVM, stored
-from message_bags import Sent as SentMessages
-from message_bags import json_message, write_mcap
-from small_detector import alarming_detector, small_detector
-from small_set import SmallSet, small_maker, small_recipe
-from test_learner import trainer
+from message_bags import Sent, json_message, write_mcap
 
-from tactslip_torch import HandLayout, Recording, SlipDetector, StreamingDetector
+from tactslip_torch import Recording
 from tactslip_torch.commands.stopping import BAD_INPUT as ONE_LINE
 from tactslip_torch.commands.stopping import one_line
-from tactslip_torch.data.formats import FORMATS, pieces
+from tactslip_torch.data.formats import pieces
 from tactslip_torch.data.manifest import read_manifest
-from tactslip_torch.data.splits import random_bins
 from tactslip_torch.deploy.export import export_detector, read_sidecar, summary
 from tactslip_torch.model.moments import SufficientStats
-from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.own_files import (
     DETECTOR,
     STATISTICS,
@@ -50,9 +45,14 @@ from tactslip_torch.own_files import (
     read_checkpoint,
     save_table,
 )
-from tactslip_torch.training.adaptation import KnownBins, Machine, RecordingBins, Statistics, Step
-from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.adaptation import RecordingBins, Statistics, Step
 from tactslip_torch.training.learner import SlipLearner
+from tactslip_torch.training.recipe import Recipe
+
+from . import names
+from .names import FORMATS, FeaturePool, HandLayout, SlipDetector, StreamingDetector
+from .recordings import CHANNELS
 
 FORM = "tactslip_torch recording 1"
 MOST_BYTES = 2**33
@@ -63,13 +63,12 @@ LONGEST_S = 5
 LONGEST = 1000  # characters of a line for people, beside the path
 SAMPLES = np.random.default_rng(3).standard_normal((40, 3))
 TIMES = np.arange(40) / 100
-HAND = HandLayout.from_rows(
-    {"name": f"SG{i}", "kind": "SG", "finger": "index", "segment": "distal"} for i in range(3)
-)
+HAND = HandLayout.from_rows(CHANNELS[:3])
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _limited():
+@pytest.fixture(autouse=True)
+def _limited(seeds, own_files):
+    """Memory, once the whole files are there."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     before = resource.getrlimit(resource.RLIMIT_AS)
     most = pages * resource.getpagesize() + MOST_BYTES
@@ -146,7 +145,7 @@ def write_parquet(path):
 def write_json(path):
     rows = enumerate(SAMPLES.tolist())
     messages = [(n * 10_000_000, json_message({"x": row[0], "y": row[1:]})) for n, row in rows]
-    write_mcap(path, [SentMessages("/force", "Force", messages, "json", "jsonschema", "{}")])
+    write_mcap(path, [Sent("/force", "Force", messages, "json", "jsonschema", "{}")])
 
 
 THEIRS = {
@@ -331,8 +330,7 @@ def detect(path):
     num = detector.context_before + detector.pool.bin_samples + detector.context_after
     noise = torch.randn(2, len(detector.pool.hand), num, dtype=torch.float64)
     assert detector.predict_raw(noise).score.isfinite().all()
-    if "alarm" in detector.info:
-        AlarmSettings.of(detector)
+    if names.ALARM_INFO in detector.info:
         stream = StreamingDetector(detector)
         stream.push(torch.randn(400, len(detector.pool.hand)))
 
@@ -350,20 +348,17 @@ def adapt(path):
 
 def resume(path):
     read_checkpoint(path)
-    learner = a_learner()
-    learner._fingerprint = lambda: "made"
-    learner.on_load_checkpoint(torch.load(path, weights_only=True))
+    checkpoint = torch.load(path, weights_only=True)
+    pool = FeaturePool(HandLayout.from_rows(CHANNELS))
+    learner = SlipLearner(pool, ChannelFilter([51, 51, 11, 11]), Recipe(num_features=12))
+    learner._fingerprint = lambda: checkpoint.get("fingerprint")
+    learner.on_load_checkpoint(checkpoint)
     assert learner.plan.selection.size
 
 
 def told(path):
     read_sidecar(path.with_suffix(""))
     summary(path.with_suffix(""))
-
-
-def a_learner():
-    maker = small_maker(SmallSet())
-    return SlipLearner(maker.pool, maker.channel_filter, small_recipe(), with_baselines=False)
 
 
 OWN = {  # what is forged, and what is done with it
@@ -386,36 +381,19 @@ def own_file(folder, name, content):
 
 
 @pytest.fixture(scope="module")
-def own_files(tmp_path_factory):
-    """A whole file of each kind."""
+def own_files(selected, tmp_path_factory):
+    """A whole file of each kind, of a training and an adaptation."""
     folder = tmp_path_factory.mktemp("own")
-    detector = alarming_detector()
-    detector.save(folder / "detector.pt")
-    z = torch.rand(60, 4, generator=torch.Generator().manual_seed(0)).double() * 2 - 1
-    sums = SufficientStats(4, {"names": ["a"]})
-    sums.update("M1/0", z, z[:, 0] > 0)
-    sums.save(folder / "sums.pt")
-    known = KnownBins(
-        z, z[:, 0] > 0, torch.ones(60).double(), torch.ones(60).double(),
-        torch.zeros(60, dtype=torch.int64), ("M1/0",), ("M1",),
-    )  # fmt: skip
-    bins = {"M2/0": RecordingBins("M2", z[:9], z[:9, 0] > 0, "key")}
+    for name in (names.DETECTOR, names.CHECKPOINT):
+        shutil.copy(selected.folder / name, folder)
+    statistics = Statistics.load(selected.folder / "statistics.pt")
+    statistics.sums.save(folder / "sums.pt")
+    known = statistics.rehearsal
+    bins = {"M2/0": RecordingBins("M2", known.z[:9], known.is_slip[:9], "key")}
     step = Step({"action": "add"}, {}, {"M2/0": 0.0}, {}, "0" * 32, torch.zeros(9).byte())
-    labels = {"layout": "whole_slide", "bin_ms": 50.0}
-    machine = Machine(1.0, 0.5, "weights")
-    Statistics(sums, machine, labels, known, "0" * 32, bins, {"M2/0": 0.0}, (step,)).save(
-        folder / "statistics.pt"
-    )
-    (path,) = export_detector(small_detector(), folder, ["bin"])
-    assert path.name == "model.onnx"
-    source = SmallSet()
-    split, data = random_bins(source.ids, seen=["a", "b", "c"])[0], small_maker(source)
-    learner, fit = a_learner(), trainer(max_epochs=1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Lightning's own
-        fit.fit(learner, datamodule=SlipDataModule(data, split, num_workers=0))
-    learner._fingerprint = lambda: "made"
-    fit.save_checkpoint(folder / "last.ckpt")
+    statistics = replace(statistics, bins=bins, weights={"M2/0": 0.0}, steps=(step,))
+    statistics.save(folder / "statistics.pt")
+    export_detector(selected.detector, folder, ["bin"])
     for name, text in MANIFESTS.items():
         (folder / name).write_text(text)
     for name, (_, use) in OWN.items():
@@ -676,7 +654,7 @@ def test_the_canary_sings(tmp_path):
     assert (tmp_path / "canary").exists()
 
 
-MANIFEST_TRAPS = {  # beside what test_manifest.py names
+MANIFEST_TRAPS = {  # beside what tests/test_manifest.py names
     "NUL in a name.csv": b"file,material\na.csv\0,M1\n",
     "variable.csv": b"file,material\n$HOME/a.csv,M1\n",
     "long line.csv": b"file,material\n" + b"a" * 2**22 + b",M1\n",
