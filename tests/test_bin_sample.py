@@ -1,4 +1,5 @@
 import hashlib
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -24,46 +25,30 @@ def make_recordings(sizes, seed=0):
         features = rng.standard_normal((size, NUM)).astype(np.float32)
         is_slip = rng.uniform(size=size) < 0.6
         group = "abc"[int(rng.integers(3))]
-        # of several lengths, and in another order as text than as numbers
-        name = f"{group}/{number}"
+        name = f"{group}/{number}"  # in another order as text than as numbers
         recordings.append((name, group, torch.from_numpy(features), torch.from_numpy(is_slip)))
     return recordings
 
 
-def sample_of(recordings, most):
-    sample = BinSample(most)
-    for recording in recordings:
-        sample.update(*recording)
-    return sample
-
-
 def sorted_at_once(recordings, most):
-    """All bins of each stratum by (key, recording, bin), the first of them."""
-    strata = {}
+    """All bins of each stratum by (key, recording, bin), the first of them; how many there are."""
+    strata, chosen = defaultdict(list), []
     for name, group, features, is_slip in recordings:
-        for index in range(len(is_slip)):
-            bins = strata.setdefault((group, bool(is_slip[index])), [])
-            bins.append((key_of(name, index), name, index, features[index].tolist()))
-    chosen = []
+        for index, label in enumerate(is_slip.tolist()):
+            own = key_of(name, index), name, index, features[index].tolist()
+            strata[group, label].append(own)
     for (group, label), bins in strata.items():
         kept = sorted(bins)[:most]
-        chosen += [(*bin[1:], group, label, len(bins) / len(kept)) for bin in kept]
-    seen = {name: len(bins) for name, bins in strata.items()}
-    return sorted(chosen), seen
+        chosen += [(*own, group, label, len(bins) / len(kept)) for _, *own in kept]
+    return sorted(chosen), {stratum: len(bins) for stratum, bins in strata.items()}
 
 
 def rows_of(bins):
-    return [
-        (
-            bins.recording_names[bins.recording[i]],
-            int(bins.bin_index[i]),
-            bins.features[i].tolist(),
-            bins.group_names[bins.group[i]],
-            bool(bins.is_slip[i]),
-            float(bins.sample_weight[i]),
-        )
-        for i in range(len(bins.features))
-    ]
+    recordings = [bins.recording_names[i] for i in bins.recording]
+    groups = [bins.group_names[i] for i in bins.group]
+    index, features = bins.bin_index.tolist(), bins.features.tolist()
+    is_slip, weight = bins.is_slip.tolist(), bins.sample_weight.tolist()
+    return list(zip(recordings, index, features, groups, is_slip, weight, strict=True))
 
 
 recordings_of_any_sizes = st.builds(
@@ -73,18 +58,18 @@ recordings_of_any_sizes = st.builds(
 
 @given(recordings=recordings_of_any_sizes, most=st.integers(1, 12))
 def test_a_sample_equals_sorting_all_keys_at_once(recordings, most):
-    sample = sample_of(recordings, most)
+    sample = BinSample(most)
+    for recording in recordings:
+        sample.update(*recording)
     chosen, seen = sorted_at_once(recordings, most)
     bins = sample.bins()
     assert rows_of(bins) == chosen
-    assert sample.num_seen == seen
-    assert list(sample.num_seen) == sorted(seen)
+    assert list(sample.num_seen.items()) == sorted(seen.items())
     assert bins.group_names == tuple(sorted({group for group, _ in seen}))
     assert bins.recording_names == tuple(sorted({row[0] for row in chosen}))
-    assert bins.features.dtype == torch.float32
-    assert bins.is_slip.dtype == torch.bool
-    assert bins.group.dtype == bins.recording.dtype == bins.bin_index.dtype == torch.int64
-    assert bins.sample_weight.dtype == torch.float64
+    columns = bins.features, bins.is_slip, bins.sample_weight
+    assert [x.dtype for x in columns] == [torch.float32, torch.bool, torch.float64]
+    assert {x.dtype for x in (bins.group, bins.recording, bins.bin_index)} == {torch.int64}
 
 
 def test_a_sample_of_fewer_than_none_is_refused():

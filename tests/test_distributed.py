@@ -1,33 +1,56 @@
 """Several processes under Lightning: the detector of one, to rounding."""
 
 import json
+import multiprocessing
 import os
 import re
+import socket
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
-from test_commands import TINY, assert_same_detector, run_train
+from test_commands import (
+    TINY,
+    TINY_DATA,
+    TINY_FIT,
+    TINY_FOLDS,
+    assert_same_detector,
+    run_train,
+)
 
 from tactslip_torch import SlipDetector
+from tactslip_torch.__main__ import main
 
-HERE = Path(__file__).parent
-MANY = ("data.cycles=8", "split.train_fraction=0.75")
-BINS = ("recipe.num_features=40",)  # 861 monomials: fewer bins, so bins are kept
 pytestmark = pytest.mark.slow
+BINS = ("recipe.num_features=40",)  # 861 monomials: fewer bins, so bins are kept
 
 
-def launched(folder, *overrides, torchrun=0, tiny=(*TINY, *MANY)):
-    start = [sys.executable, "-m"]
-    if torchrun:
-        start += ["torch.distributed.run", f"--nproc_per_node={torchrun}", "--standalone", "-m"]
-    command = [*start, "tactslip_torch.train", *tiny, f"hydra.run.dir={folder}", *overrides]
-    environment = {k: v for k, v in os.environ.items() if k != "TACTSLIP_TRACEBACK"}
-    environment |= {"PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"}
-    return subprocess.run(
-        command, cwd=folder.parent, env=environment, capture_output=True, text=True, timeout=300
-    )
+def together(num, *words):
+    """Processes that train together, forked from this one, with the variables of torchrun."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free.getsockname()[1]}
+    shared |= {"WORLD_SIZE": num, "GROUP_RANK": 0, "TORCHELASTIC_RUN_ID": "run"}
+    forks = multiprocessing.get_context("fork")
+    words = (*words, "trainer.strategy=ddp", f"trainer.devices={num}")
+    places = [shared | {"RANK": rank, "LOCAL_RANK": rank} for rank in range(num)]
+    processes = [forks.Process(target=carry_out, args=(place, words)) for place in places]
+    for process in processes:
+        process.start()
+    return processes
+
+
+def carry_out(place, words):
+    os.environ.update({name: str(value) for name, value in place.items()})
+    warnings.simplefilter("default")
+    sys.argv = ["tactslip", "train", *words]
+    main()
+
+
+def assert_same_scores(folder, other):
+    one, its = (json.loads((f / "metrics.json").read_text()) for f in (folder, other))
+    assert one["splits"] == its["splits"]
 
 
 @pytest.fixture(scope="module")
@@ -35,47 +58,51 @@ def cache(tmp_path_factory):
     return f"cache={tmp_path_factory.mktemp('cache')}"
 
 
-def test_processes_learn_what_one_does(cache, tmp_path):  # 3 share the recordings unevenly
-    _, alone = run_train(tmp_path / "alone", *TINY, *MANY, *BINS, cache)
-    done = launched(tmp_path / "ddp", *BINS, cache, "trainer.strategy=ddp", "trainer.devices=3")
+def test_processes_that_lightning_starts_learn_what_one_does(cache, tmp_path):
+    alone, ddp = tmp_path / "alone", tmp_path / "ddp"
+    run_train(alone, *TINY, *BINS, cache)
+    words = *TINY, *BINS, cache, f"hydra.run.dir={ddp}", "trainer.strategy=ddp"
+    command = [sys.executable, "-m", "tactslip_torch", "train", *words, "trainer.devices=2"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "OMP_NUM_THREADS": "1"}
+    options = {"cwd": tmp_path, "env": environment, "timeout": 300}
+    done = subprocess.run(command, capture_output=True, text=True, **options)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert_same_detector(tmp_path / "alone", tmp_path / "ddp")
-    together = json.loads((tmp_path / "ddp" / "metrics.json").read_text())
-    assert together["splits"] == alone["splits"]
     assert done.stdout.count("results in") == 1
-    one, three = (SlipDetector.load(tmp_path / n / "detector.pt").info for n in ("alone", "ddp"))
-    same, other = one.pop("solve"), three.pop("solve")
+    assert_same_detector(alone, ddp)
+    assert_same_scores(alone, ddp)
+    one, two = (SlipDetector.load(folder / "detector.pt").info for folder in (alone, ddp))
+    same, other = one.pop("solve"), two.pop("solve")
     assert same.keys() == other.keys()
     for name, value in same.items():  # sums are rounded by the order of their parts
         is_number = isinstance(value, float)
         assert value == (pytest.approx(other[name], rel=1e-6) if is_number else other[name])
-    assert one == three
+    assert one == two
 
 
-def test_what_another_process_cannot_read_is_named(cache, tmp_path):
-    broken = "+data.broken=A/1"  # the second of the training recordings
-    done = launched(tmp_path / "ddp", "cache=off", broken, "trainer.strategy=ddp",
-                    "trainer.devices=2")  # fmt: skip
-    assert done.returncode != 0
-    line = r"error in process 1: A/1: channel SG1, sample 2000 \(1\.0000 s\) is nan; repair"
-    assert re.search(line, done.stderr)
+def test_folds_are_learned_in_uneven_shares(cache, tmp_path):
+    alone, ddp = tmp_path / "alone", tmp_path / "ddp"
+    told = *TINY_DATA, *TINY_FOLDS, *TINY_FIT, cache
+    run_train(alone, *told)
+    for process in together(3, *told, f"hydra.run.dir={ddp}"):  # of 4 recordings
+        process.join(300)
+        assert process.exitcode == 0
+    assert_same_detector(alone / "without_A", ddp / "without_A")
+    assert_same_scores(alone, ddp)
+
+
+def test_what_another_process_cannot_read_is_named(tmp_path, capfd):
+    broken = "+data.broken=A/2"  # the second of the training recordings
+    first, second = together(2, *TINY, "cache=off", broken, f"hydra.run.dir={tmp_path / 'run'}")
+    second.join(300)
+    first.kill()  # which waits for the other, unless it is told by who started both
+    first.join()
+    assert second.exitcode == 2
+    line = r"error in process 1: A/2: channel SG1, sample 2000 \(1\.0000 s\) is nan; repair"
+    assert re.search(line, capfd.readouterr().err)
 
 
 def test_torchrun_without_its_strategy_is_refused(tmp_path, monkeypatch):
     for name, value in {"WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "run"}.items():
         monkeypatch.setenv(name, value)
     with pytest.raises(ValueError, match=r"2 processes were started, .* add trainer\.strategy=ddp"):
-        run_train(tmp_path, *TINY, *MANY, "cache=off")
-
-
-def test_folds_with_uneven_shares_under_torchrun(cache, tmp_path):
-    folds = ("split=leave_one_material_out", "split.materials=[A,B,C]")
-    folds += ("data.cycles=5", "split.train_fraction=0.6")
-    plain = [o for o in TINY if not o.startswith("split.")]
-    _, alone = run_train(tmp_path / "alone", *plain, *folds, cache)
-    four = ("trainer.strategy=ddp", "trainer.devices=4")
-    done = launched(tmp_path / "ddp", cache, *four, torchrun=4, tiny=(*plain, *folds))
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert_same_detector(tmp_path / "alone" / "without_A", tmp_path / "ddp" / "without_A")
-    together = json.loads((tmp_path / "ddp" / "metrics.json").read_text())
-    assert together["splits"] == alone["splits"]
+        run_train(tmp_path, *TINY, "cache=off")
