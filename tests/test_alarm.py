@@ -518,6 +518,6 @@ def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
     assert metrics["alarm"]["settings"] == settings.to_dict()
     assert settings.metadata["simulated"] is True
     assert {"test", "unseen", "test stream", "unseen stream"} <= set(metrics["events"])
-    assert metrics["alarm"]["scenes"]["paper"]["test"][JOINT]["num_onsets"] > 0
+    assert metrics["events"]["test stream"][JOINT]["num_onsets"] > 0
     assert "budget of false alarms, at 95 % confidence: held 2000 " in capsys.readouterr().out
     assert {"alarm.png", "events.png"} <= {path.name for path in tmp_path.iterdir()}
