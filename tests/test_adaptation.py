@@ -40,47 +40,34 @@ def recordings(material, number, first_seed, turn=0.0):
     }
 
 
-def without_slip(own):
-    return replace(own, z=own.z[~own.is_slip], is_slip=own.is_slip[~own.is_slip])
-
-
 def statistics(trained):
     """Of recordings whose bins are all in the rehearsal sample."""
     sums = SufficientStats(K)
     for name, own in trained.items():
         sums.update(name, own.z, own.is_slip)
-    sizes = torch.tensor([len(own.z) for own in trained.values()])
-    ones = torch.ones(int(sizes.sum()), dtype=torch.float64)
-    rehearsal = KnownBins(
-        torch.cat([own.z for own in trained.values()]),
-        torch.cat([own.is_slip for own in trained.values()]),
-        ones,
-        ones,
-        torch.arange(len(trained)).repeat_interleave(sizes),
-        tuple(trained),
-        tuple(own.material for own in trained.values()),
+    z, is_slip = (
+        torch.cat([getattr(own, n) for own in trained.values()]) for n in ("z", "is_slip")
     )
+    ones = torch.ones(len(z), dtype=torch.float64)
+    sizes = torch.tensor([len(own.z) for own in trained.values()])
+    recording = torch.arange(len(trained)).repeat_interleave(sizes)
+    materials = tuple(own.material for own in trained.values())
+    rehearsal = KnownBins(z, is_slip, ones, ones, recording, tuple(trained), materials)
     return Statistics(sums, MACHINE, {"bin_ms": 50.0}, rehearsal, "digest")
 
 
-@pytest.fixture(scope="module")
-def trained():
-    return recordings("a", 4, 0) | recordings("b", 4, 10) | recordings("c", 4, 20, turn=0.1)
+TRAINED = recordings("a", 4, 0) | recordings("b", 4, 10) | recordings("c", 4, 20, turn=0.1)
+NEW = recordings("new", 3, 100, turn=1.0)
 
 
 @pytest.fixture(scope="module")
-def old(trained):
-    return statistics(trained)
+def old():
+    return statistics(TRAINED)
 
 
 @pytest.fixture(scope="module")
 def before(old):
     return solve(old)
-
-
-@pytest.fixture(scope="module")
-def new():
-    return recordings("new", 3, 100, turn=1.0)
 
 
 def assert_same(one, other, folder, weight=1.0):
@@ -97,15 +84,15 @@ def assert_same(one, other, folder, weight=1.0):
 # Machines ----------------------------------------------------------------------------------------
 
 
-def test_machine_and_scores_without_a_recording_are_those_of_refits(old, trained, new):
-    after = old.reweighed(dict.fromkeys(new, 2.5), new)
-    solved, everyone = solve(after), trained | new
+def test_machine_and_scores_without_a_recording_are_those_of_refits(old):
+    after = old.reweighed(dict.fromkeys(NEW, 2.5), NEW)
+    solved, everyone = solve(after), TRAINED | NEW
     scales = after.sums.class_scale(MACHINE.balance)
 
     def refitted_without(name, z):
         kept = {other: own for other, own in everyone.items() if other != name}
         is_slip = torch.cat([own.is_slip for own in kept.values()])
-        weight = torch.cat([torch.full((NUM_BINS,), 2.5 if n in new else 1.0) for n in kept])
+        weight = torch.cat([torch.full((NUM_BINS,), 2.5 if n in NEW else 1.0) for n in kept])
         weight = weight.double() * scales[is_slip.long()]
         bins = TrainingBins(torch.cat([own.z for own in kept.values()]), is_slip, weight)
         kernel = Polynomial(2, MACHINE.offset)
@@ -145,36 +132,36 @@ def test_bins_go_out_as_they_came_in(old, num_bins, weight, tmp_path):
     assert_same(replace(back, bins={}, weights={}), old, tmp_path, weight)
 
 
-def test_forgetting_is_as_if_it_was_never_in(old, before, trained, tmp_path):
-    mine = {name: own for name, own in trained.items() if own.material == "c"}
-    others = {name: own for name, own in trained.items() if own.material != "c"}
+def test_forgetting_is_as_if_it_was_never_in(old, before, tmp_path):
+    mine = {name: own for name, own in TRAINED.items() if own.material == "c"}
+    others = {name: own for name, own in TRAINED.items() if own.material != "c"}
     found = forget(old, before, mine)
     expected = statistics(others).sums
     torch.testing.assert_close(found.statistics.sums.sums, expected.sums, rtol=0, atol=1e-12)
     assert sorted(found.old.after) == ["a", "b"]
     with pytest.raises(ValueError, match="other content"):
-        forget(old, before, {"a/1": replace(trained["a/1"], z=trained["a/2"].z)})
+        forget(old, before, {"a/1": replace(TRAINED["a/1"], z=TRAINED["a/2"].z)})
     with pytest.raises(ValueError, match="d/1 is not in"):
-        forget(old, before, {"d/1": trained["a/1"]})
+        forget(old, before, {"d/1": TRAINED["a/1"]})
 
 
-def test_a_new_material_is_learned_and_later_recordings_share_its_weight(old, before, new):
+def test_a_new_material_is_learned_and_later_recordings_share_its_weight(old, before):
     sums = old.sums.sums.clone()
-    found = add(old, before, new, 4.0, margin=1.0)
+    found = add(old, before, NEW, 4.0, margin=1.0)
     assert torch.equal(old.sums.sums, sums)  # nothing that is given is changed
     assert not old.bins
     assert found.new["after"] > found.new["before"] + 0.1
     assert sorted(found.old.before) == ["a", "b", "c"]
     more = {"new/7": recording("new", 107, turn=1.0)}
     later = add(found.statistics, found.solved, more, 2.0, margin=1.0)
-    assert dict(later.statistics.weights) == dict.fromkeys([*new, *more], 2.0)
+    assert dict(later.statistics.weights) == dict.fromkeys([*NEW, *more], 2.0)
     assert later.new["after"] is None  # nothing else of this recording is known
     assert "new" in later.old.before
 
 
 @pytest.mark.parametrize("margin", [0.1, 0.0])
-def test_auto_takes_the_largest_weight_that_old_materials_allow(old, before, new, margin):
-    found = add(old, before, new, None, margin=margin)
+def test_auto_takes_the_largest_weight_that_old_materials_allow(old, before, margin):
+    found = add(old, before, NEW, None, margin=margin)
     assert found.tried[found.factor] == found.old.mean_fall
     # a material has 4 recordings, the new one 3
     assert found.weight * 3 == pytest.approx(found.factor * 4)
@@ -183,14 +170,15 @@ def test_auto_takes_the_largest_weight_that_old_materials_allow(old, before, new
         return
     assert found.old.problem(0.5 * margin) is None
     larger = FACTORS[FACTORS.index(found.factor) + 1]
-    by_hand = add(old, before, new, found.weight * larger / found.factor, margin=margin)
+    by_hand = add(old, before, NEW, found.weight * larger / found.factor, margin=margin)
     assert by_hand.old.problem(0.5 * margin) is not None
 
 
-def test_bins_without_slip_weigh_as_those_of_an_average_material(old, before, trained):
-    quiet = without_slip(recording("quiet", 50))
+def test_bins_without_slip_weigh_as_those_of_an_average_material(old, before):
+    own = recording("quiet", 50)
+    quiet = replace(own, z=own.z[~own.is_slip], is_slip=own.is_slip[~own.is_slip])
     found = add(old, before, {"quiet/0": quiet}, None, margin=0.0)
-    num_quiet = sum(int((~own.is_slip).sum()) for own in trained.values()) / 3
+    num_quiet = sum(int((~own.is_slip).sum()) for own in TRAINED.values()) / 3
     assert found.weight * len(quiet.z) / num_quiet == pytest.approx(found.factor)
 
 

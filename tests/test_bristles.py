@@ -12,7 +12,6 @@ import torch
 from scipy.integrate import solve_ivp
 
 from tactslip_torch import native
-from tactslip_torch.native import BackendName
 from tactslip_torch.simulation import _bristles
 from tactslip_torch.simulation._bristles import (
     Lanes,
@@ -23,9 +22,11 @@ from tactslip_torch.simulation._bristles import (
     stage_times_s,
 )
 
-BACKENDS = ("torch", "native")
 NO_ENGINE = native.why_not()
 needs_engine = pytest.mark.skipif(bool(NO_ENGINE), reason=NO_ENGINE)
+BACKENDS = ("torch", "native")
+NATIVE = pytest.param("native", marks=needs_engine)
+each_backend = pytest.mark.parametrize("backend", ["torch", NATIVE])
 Course = Callable[[float], float]
 
 
@@ -126,13 +127,6 @@ def assert_close(one: tuple, other: tuple, tolerance: float = 0.0) -> None:
         assert (mine.double() - its.double()).abs().max() <= tolerance * scale
 
 
-@pytest.fixture(params=BACKENDS)
-def backend(request: pytest.FixtureRequest) -> BackendName:
-    if request.param == "native" and NO_ENGINE:
-        pytest.skip(NO_ENGINE)
-    return request.param
-
-
 # --- against Radau ------------------------------------------------------------------------------
 
 CASES = {
@@ -188,6 +182,7 @@ def test_order_is_two_where_nothing_lets_go():
 # --- what the model does ------------------------------------------------------------------------
 
 
+@each_backend
 def test_balance_of_forces_holds_in_the_trace(backend):
     element = replace(TACKY, sigma2=0.7, pressure=tuple(hertz_pressure(3).tolist()))
     lanes, step_s = element.lanes(), 250e-6
@@ -233,6 +228,7 @@ def test_backends_agree(n):
         assert_close(one, other, 1e-8)
 
 
+@each_backend
 def test_pieces_make_the_whole(backend):
     lanes, step_s = varied(4), 2.0**-12
     whole, end = carry(lanes, at_rest(lanes), shaken, 60, step_s, backend=backend)
@@ -268,22 +264,25 @@ def test_auto_takes_what_it_can(monkeypatch):
     taken, compiled = [], _bristles._carry_native
     monkeypatch.setattr(_bristles, "_carry_native", lambda *a: taken.append(1) or compiled(*a))
     lanes, single = varied(), varied(dtype=torch.float32)
-    carry(lanes, at_rest(lanes), shaken, 2, 250e-6)
-    assert taken
-    taken.clear()
-    carry(single, at_rest(single), shaken, 2, 250e-6)
     wanting = lanes._replace(mu_s=lanes.mu_s.clone().requires_grad_())
-    trace, _ = carry(wanting, at_rest(lanes), shaken, 2, 250e-6)
+
+    def go(own, backend="auto"):
+        taken.clear()
+        return carry(own, at_rest(own), shaken, 2, 250e-6, backend=backend)[0], bool(taken)
+
+    assert go(lanes)[1]
+    assert not go(single)[1]
+    trace, is_native = go(wanting)
     assert trace.friction_n.requires_grad
+    assert not is_native
     with pytest.raises(ValueError, match=r'"native" needs float64 on the CPU, got torch.float32'):
-        carry(single, at_rest(single), shaken, 2, 250e-6, backend="native")
+        go(single, "native")
     with pytest.raises(ValueError, match="backend must be one of auto, native, torch, got 'fast'"):
-        carry(lanes, at_rest(lanes), shaken, 2, 250e-6, backend="fast")
+        go(lanes, "fast")
     monkeypatch.setattr(native, "_loaded", lambda: "no compiler")
-    carry(lanes, at_rest(lanes), shaken, 2, 250e-6)
-    assert not taken
+    assert not go(lanes)[1]
     with pytest.raises(ValueError, match='"native" cannot be used: no compiler'):
-        carry(lanes, at_rest(lanes), shaken, 2, 250e-6, backend="native")
+        go(lanes, "native")
 
 
 def test_gradients_are_those_of_the_scheme():
@@ -306,19 +305,13 @@ def extreme(n: int, dtype: torch.dtype) -> tuple[Lanes, torch.Tensor, torch.Tens
     masses, loads = (0.0, 1e-12, 5e-3, 1.0), (0.0, 1e-9, 1.0, 1e6)
     grid = np.array(list(product(speeds, stiffnesses, bristles, masses, loads)))
     speed, k, sigma, m, load = torch.tensor(grid).T
-    tacky = torch.arange(len(grid)) % 2 == 0
-    lanes = SMOOTH.lanes(
-        dtype,
-        k=k,
-        k1=0.2 * k,
-        m=m,
-        sigma=sigma,
-        d0=(1e-3 * sigma).sqrt(),
-        mu_s=torch.where(tacky, 1.1, 0.8),
-        mu_k=torch.where(tacky, 0.85, 0.7),
-        vs=torch.where(tacky, 0.05, 0.01),
-        pressure=hertz_pressure(n),
-    )
+    is_tacky = torch.arange(len(grid)) % 2 == 0
+    surface = {
+        name: torch.where(is_tacky, getattr(TACKY, name), getattr(SMOOTH, name))
+        for name in ("mu_s", "mu_k", "vs")
+    }
+    skin = {"k": k, "k1": 0.2 * k, "m": m, "sigma": sigma, "d0": (1e-3 * sigma).sqrt()}
+    lanes = SMOOTH.lanes(dtype=dtype, **skin, **surface, pressure=hertz_pressure(n))
     return lanes, speed, load
 
 
@@ -343,11 +336,12 @@ def largest_force(lanes: Lanes, speed: torch.Tensor, load: torch.Tensor) -> torc
 @pytest.mark.parametrize("step_s", [1e-6, 5e-3])
 @pytest.mark.parametrize(
     ("n", "dtype", "backend", "num"),
-    [(4, torch.float64, "native", 60), (2, torch.float32, "torch", 15)],
+    [
+        pytest.param(4, torch.float64, "native", 60, marks=needs_engine),
+        (2, torch.float32, "torch", 15),
+    ],
 )
 def test_bounded_and_within_the_cone(step_s, n, dtype, backend, num):
-    if backend == "native" and NO_ENGINE:
-        pytest.skip(NO_ENGINE)
     lanes, speed, load = extreme(n, dtype)
     drive, slack = turning(speed, load, num * step_s), 1.0 + 64 * torch.finfo(dtype).eps
     load_n, moving = load.to(dtype), speed.to(dtype)

@@ -1,6 +1,5 @@
 """Cached features: what is stored comes back, damage is noticed, and the folder stays small."""
 
-import logging
 import os
 
 import pytest
@@ -68,11 +67,10 @@ def test_a_damaged_file_is_absent_with_a_warning_and_is_written_again(cache, cap
     cache.store(KEY, features())
     (path,) = files(cache)
     path.write_bytes(damage(path.read_bytes()))
-    with caplog.at_level(logging.WARNING):
-        assert cache.load(KEY) is None
-    assert [record.levelname for record in caplog.records] == ["WARNING"]
-    assert str(path) in caplog.text
-    assert "damaged" in caplog.text
+    assert cache.load(KEY) is None
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+    assert all(word in caplog.text for word in (str(path), "damaged"))
     cache.store(KEY, features())
     assert torch.equal(cache.load(KEY), features())
 
@@ -88,20 +86,19 @@ def test_a_damaged_file_is_absent_with_a_warning_and_is_written_again(cache, cap
     ],
 )
 def test_prune_drops_what_was_used_longest_ago_and_nothing_else(
-    tmp_path, most_files, spare_bytes, read, left
+    cache, most_files, spare_bytes, read, left
 ):
-    cache = FeatureCache(tmp_path)
     cache.prune()  # of nothing
     keys = [cache_key({"cycle": i}) for i in range(5)]
     for i, key in enumerate(keys):
         cache.store(key, features(seed=i))
-        os.utime(tmp_path / key[:2] / f"{key}.npz", (1000 + i, 1000 + i))
+        os.utime(cache.folder / key[:2] / f"{key}.npz", (1000 + i, 1000 + i))
     cache.most_bytes = most_files * files(cache)[0].stat().st_size + spare_bytes
-    others = [tmp_path / "README", tmp_path / keys[0][:2] / f".{keys[0]}.1.tmp.npz"]
+    place = cache.folder / keys[0][:2]
+    others = [cache.folder / "README", place / f".{keys[0]}.1.tmp.npz"]
     for path in others:  # the second is being written by another run
         path.write_text("mine")
-    vanished = tmp_path / keys[0][:2] / "gone.npz"
-    vanished.symlink_to(tmp_path / "nowhere")
+    (place / "gone.npz").symlink_to(cache.folder / "nowhere")
     if read is not None:
         cache.load(keys[read])
     cache.prune()
@@ -110,27 +107,27 @@ def test_prune_drops_what_was_used_longest_ago_and_nothing_else(
 
 
 def test_the_digest_follows_names_and_content_wherever_the_package_lies(tmp_path):
-    digests = []
-    for package in (tmp_path / "one", tmp_path / "two"):
+    one, two = tmp_path / "one", tmp_path / "two"
+    for package in (one, two):
         (package / "b").mkdir(parents=True)
         (package / "a.py").write_text("x = 1\n")
         (package / "b" / "c.py").write_text("y = 2\n")
         (package / "notes.txt").write_text(package.name)  # no code
-        digests.append(source_digest(package))
-    assert digests[0] == digests[1]
-    (package / "b" / "c.py").write_text("y = 3\n")
-    changed = source_digest(package)
-    (package / "b" / "c.py").rename(package / "b" / "d.py")
-    renamed = source_digest(package)
-    (package / "b" / "e.py").write_text("")
-    added = source_digest(package)
-    (package / "engine.cpp").write_text("")  # makes features too
-    assert len({digests[0], changed, renamed, added, source_digest(package)}) == 5
+    digests = [source_digest(one)]
+    assert digests == [source_digest(two)]
+    for change in (
+        lambda: (one / "b" / "c.py").write_text("y = 3\n"),
+        lambda: (one / "b" / "c.py").rename(one / "b" / "d.py"),
+        lambda: (one / "b" / "e.py").touch(),
+        lambda: (one / "engine.cpp").touch(),  # makes features too
+    ):
+        change()
+        digests.append(source_digest(one))
+    assert len(set(digests)) == 5
 
 
 def test_the_users_cache_folder(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert default_cache_folder() == tmp_path / "tactslip_torch"
-    monkeypatch.setenv("XDG_CACHE_HOME", "")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert default_cache_folder() == tmp_path / "home" / ".cache" / "tactslip_torch"
+    for value, folder in ((str(tmp_path), tmp_path), ("", tmp_path / "home" / ".cache")):
+        monkeypatch.setenv("XDG_CACHE_HOME", value)
+        assert default_cache_folder() == folder / "tactslip_torch"

@@ -39,24 +39,18 @@ def tensors(*arrays):
     return tuple(torch.from_numpy(np.asarray(array)) for array in arrays)
 
 
-def platt_targets(is_slip, weights):
-    n, m = weights[is_slip].sum(), weights[~is_slip].sum()
-    return np.where(is_slip, (n + 1) / (n + 2), 1 / (m + 2))
-
-
 # ------------------------------------------------------------------------------------- Platt
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize(("scale", "shift"), [(1.0, 0.0), (1e-6, 3.0), (1e4, -2e4)])
 def test_platt_is_sklearns_logistic_regression_towards_platts_targets(scale, shift, weighted, rng):
     scores, is_slip = logistic_bins(rng, 400, 1.2, -0.7)
     weights = rng.uniform(0.2, 3, 400) if weighted else np.ones(400)
-    target = platt_targets(is_slip, weights)
+    n, m = weights[is_slip].sum(), weights[~is_slip].sum()
+    target = np.where(is_slip, (n + 1) / (n + 2), 1 / (m + 2))
     # a soft target is a bin of each class, weighted by it
-    both = np.concatenate([scores, scores])[:, None]
-    truth = np.repeat([1, 0], 400)
     parts = np.concatenate([weights * target, weights * (1 - target)])
     oracle = LogisticRegression(C=1e15, tol=1e-14, solver="newton-cholesky", max_iter=500)
-    oracle.fit(both, truth, sample_weight=parts)
+    oracle.fit(np.tile(scores, 2)[:, None], np.repeat([1, 0], 400), sample_weight=parts)
     balance = logit((weights * target).sum() / weights.sum())
     fitted = fit_platt(*tensors(scale * scores + shift, is_slip, weights))
     llr = fitted.llr(torch.from_numpy(scale * scores + shift)).numpy()
@@ -83,22 +77,20 @@ def test_steps_are_sklearns_isotonic_regression(levels, weighted, rng):
         scores = np.round(scores * levels / 8) / levels
     weights = rng.uniform(0.2, 3, 300) if weighted else np.ones(300)
     share = (weights * is_slip).sum() / weights.sum()
-    ends = np.repeat([scores.min(), scores.max()], 2)
-    x = np.concatenate([scores, ends])
-    y = np.concatenate([is_slip, [1, 0, 1, 0]]).astype(float)
-    w = np.concatenate([weights, np.tile([2 * share, 2 * (1 - share)], 2)])
+    x = np.r_[scores, np.repeat([scores.min(), scores.max()], 2)]
+    y = np.r_[is_slip, 1, 0, 1, 0].astype(float)
+    w = np.r_[weights, np.tile([2 * share, 2 * (1 - share)], 2)]
     steps = IsotonicRegression().fit(x, y, sample_weight=w).predict(scores)
     expected = logit(steps) - logit(share)
 
     fitted = fit_isotonic(*tensors(scores, is_slip, weights))
-    distinct = np.unique(np.round(expected, 10))
-    np.testing.assert_allclose(fitted.llrs, distinct, atol=1e-9)
+    np.testing.assert_allclose(fitted.llrs, np.unique(np.round(expected, 10)), atol=1e-9)
     for knot, llr in zip(fitted.scores, fitted.llrs, strict=True):
         own = np.isclose(expected, llr, atol=1e-9, rtol=0)
         assert scores[own].min() <= knot <= scores[own].max()
         # the knot is the median by weight of its step
-        below, above = own & (scores < knot), own & (scores > knot)
-        assert max(weights[below].sum(), weights[above].sum()) <= weights[own].sum() / 2 + 1e-9
+        below, above = (weights[own & side].sum() for side in (scores < knot, scores > knot))
+        assert max(below, above) <= weights[own].sum() / 2 + 1e-9
 
 
 # ----------------------------------------------------------------------------- what all share
@@ -173,19 +165,15 @@ def test_probability_is_bayes_at_another_balance(share):
 # -------------------------------------------------------------------------------- reliability
 def plain_reliability(p, y, w, num_cells):
     """Cells by where the middle of a probability's weight falls, tied ones together."""
-    total, done = w.sum(), 0.0
-    cells = {}
+    done, cells = 0.0, {}
     for value in np.unique(p):
         own = p == value
         middle = done + w[own].sum() / 2
         done += w[own].sum()
-        cells.setdefault(min(int(num_cells * middle / total), num_cells - 1), []).append(own)
-    rows = []
-    for members in cells.values():
-        own = np.any(members, axis=0)
-        mean = np.average(p[own], weights=w[own])
-        rows.append((mean, np.average(y[own], weights=w[own]), w[own].sum()))
-    return np.array(rows).T
+        number = min(int(num_cells * middle / w.sum()), num_cells - 1)
+        cells[number] = cells.get(number, False) | own
+    means = [[np.average(x[own], weights=w[own]) for x in (p, y)] for own in cells.values()]
+    return *np.array(means).T, [w[own].sum() for own in cells.values()]
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -202,17 +190,22 @@ def test_cells_and_errors_are_the_definitions(weighted, levels, rng):
     np.testing.assert_allclose(found["slip_shares"], happened, atol=1e-12)
     np.testing.assert_allclose(found["counts"], count, rtol=1e-12)
     gap = np.abs(stated - happened)
-    assert found["ece"] == pytest.approx((gap * count).sum() / w.sum(), rel=1e-12)
-    assert found["mce"] == pytest.approx(gap.max(), rel=1e-12)
-    assert found["brier"] == pytest.approx(brier_score_loss(y, p, sample_weight=w), rel=1e-12)
+    errors = {"ece": np.average(gap, weights=count), "mce": gap.max()}
+    errors["brier"] = brier_score_loss(y, p, sample_weight=w)
+    assert {name: found[name] for name in errors} == pytest.approx(errors, rel=1e-12)
     inside = np.clip(p, 1e-9, 1 - 1e-9)
     found = reliability(*tensors(inside, y), weights=torch.from_numpy(w))
     assert found["log_loss"] == pytest.approx(log_loss(y, inside, sample_weight=w), rel=1e-9)
 
 
-def test_reliability_of_no_probabilities_is_refused():
-    for p, message in ((1.1, "probability must lie in 0 to 1"), (math.nan, "must lie in 0 to 1")):
-        with pytest.raises(ValueError, match=message):
-            reliability(torch.tensor([0.5, p]), torch.tensor([True, False]))
-    with pytest.raises(ValueError, match="of one N"):
-        reliability(torch.tensor([0.5, 0.1]), torch.tensor([True]))
+@pytest.mark.parametrize(
+    ("p", "message"),
+    [
+        ([0.5, 1.1], "must lie in 0 to 1"),
+        ([0.5, math.nan], "must lie in 0 to 1"),
+        ([1], "of one N"),
+    ],
+)
+def test_reliability_of_no_probabilities_is_refused(p, message):
+    with pytest.raises(ValueError, match=message):
+        reliability(torch.tensor(p), torch.tensor([True, False]))

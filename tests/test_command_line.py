@@ -39,8 +39,6 @@ MISTAKES = {
     "train Seed=1": "Seed 'did you mean seed?'",
     "train num_features=60": "num_features 'did you mean recipe.num_features?'",
     "train recipe.num_featurs=60": "'did you mean recipe.num_features?'",
-    "train +recipe.num_featurs=60": "'did you mean recipe.num_features?'",
-    "train cycles=2": "'did you mean data.cycles?'",
     "train learning_rate=0.1": "learning_rate 'tactslip train --help'",
     "train +scene.frction_noise_mv=4": "'did you mean scene.friction_noise_mv?'",
     "train +trainer.limit_train_batchs=2": "trainer.limit_train_batchs",
@@ -65,7 +63,8 @@ MISTAKES = {
     "train +exp quick": "+exp=quick",
     "train +exp=quik": "'known: quick,'",
     "train recipe=robst": "'known: robust,'",
-    "train split=unseen": "'known: unseen4,'",
+    "train -m split=seen6,seen7": "'unknown split seen7; known: seen6,'",
+    "train data=mine --config-dir recordings": "'unknown data mine; known: authors_raw,'",
     "train data=webcam": "simulated",
     "train data.materials=[M1, M6]": "\"'data.materials=[M1, M6]'\"",
     "train data.materials=[M1,M6": "\"'data.materials=[M1,M6]'\"",
@@ -90,7 +89,6 @@ MISTAKES = {
     "detect model=missing.pt input=recordings": "missing.pt",
     "detect model=missing.pt imput=recordings": "'did you mean input?'",
     "detect model=missing.pt input=recordings mcap=a.mcap": "'mcap must be true or false'",
-    "detect model=missing.pt input=recordings rerun=yes": "'rerun must be true or false'",
     "stream": "model=",
     "stream model=detector.pt": "source=",
     "stream model=detector.pt source=nowhere.csv": "nowhere.csv serial: listen: stdin",
@@ -101,11 +99,8 @@ MISTAKES = {
     "stream model=detector.pt source=serial:/dev/ttyACM0 frame.format=binary": "frame.header",
     "stream model=detector.pt source=ros2:/tactile": "rclpy setup.bash",
     "stream model=detector.pt source=stdin serve=true token=abc": "token 8 3",
-    "export model=missing.pt": "missing.pt",
-    "importance model=missing.pt": "missing.pt",
     "data root=recordings": "action=",
     "data action=chek root=recordings": "chek check",
-    "data action=check root=nowhere": "nowhere",
     "generate materials=gold": "gold M1",
     "generate format=docx": "docx npz",
 }
@@ -138,6 +133,8 @@ def in_a_folder():
         place = Path(folder)
         (place / "recordings").mkdir()
         (place / "recordings" / "cup1.csv").write_text("t,SG1\n0,1\n")
+        (place / "own" / "data").mkdir(parents=True)
+        (place / "own" / "data" / "mine.yaml").write_text("_target_: mine.Recordings\n")
         (place / "notes.txt").write_text("no detector")
         shutil.copy(ROOT / "tactslip_torch/pretrained/paper24-sim.pt", place / "detector.pt")
         yield place
@@ -189,6 +186,7 @@ def test_a_text_is_a_list_of_one_where_a_list_is_wanted(line, key, value):
         "train 'recipe.scene_weights={arm_motion: 1}' '~features.frames.PVDF'",
         "train onset=alarms 'onset.budget={held: 2}' +onset.streams.extra_scenes.held.machine_mv=9",
         "train data=files data.root=x 'data.streams={a: {kind: SG}}'",
+        "train data=mine --config-dir own",
         "train -m +exp=quick,unseen4 'seed=range(0,3)' 'data.materials=[M1],[M2]'",
         "data action=label_template root=a=b 'pattern={material}_{trial}'",
         "crossval -m recipe@recipes.paper=robust,paper",

@@ -6,7 +6,7 @@ from omegaconf.errors import MissingMandatoryValue
 from torch.utils.data import DataLoader, Dataset
 
 from tactslip_torch.commands import configuration
-from tactslip_torch.commands.configuration import conf_dir, unknown_choice
+from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.stopping import errors_in_one_line, one_line
 
 # Where the configuration lives -----------------------------------------------------------------
@@ -22,40 +22,6 @@ def test_conf_inside_the_package_comes_first_and_none_is_an_error(monkeypatch, t
         folder.mkdir(parents=True)
         (folder / "train.yaml").touch()
         assert conf_dir() == folder
-
-
-# Choices that do not exist ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("-m split=seen6,seen7", "unknown split seen7"),
-        ("data=mine --config-dir nowhere", "unknown data mine; known: authors_raw"),
-    ],
-)
-def test_a_choice_that_does_not_exist_is_one_line(arguments, message):
-    line = unknown_choice(arguments.split())
-    assert line is not None
-    assert line.startswith(message)
-    assert "\n" not in line
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        "",
-        "+exp=unseen4,seen6 -m",
-        "split.train_fraction=0.5 data.cycles=2",
-        "model=out/a=b.pt",
-        "data=mine --config-dir {folder}",
-        "-cd {folder} +own=thing",
-    ],
-)
-def test_choices_that_exist_pass(arguments, tmp_path):
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "mine.yaml").touch()
-    assert unknown_choice(arguments.format(folder=tmp_path).split()) is None
 
 
 # One line --------------------------------------------------------------------------------------
