@@ -9,13 +9,13 @@ import pytest
 import torch
 from small_detector import HAND as FOUR_CHANNELS
 from small_detector import small_detector
-from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
-from test_commands import BAD_INPUT, TinyRecordings, composed
+from small_set import SMALL_HAND, SmallSet, refitted_scores, small_maker, small_recipe
+from test_commands import BAD_INPUT, TINY_DATA, TINY_SPLIT, TinyRecordings, composed
 
-import tactslip_torch.analysis.pareto as module
 import tactslip_torch.commands.pareto as command
 from tactslip_torch import SlipDetector
 from tactslip_torch.analysis import latency as latency_module
+from tactslip_torch.analysis import pareto
 from tactslip_torch.analysis.latency import (
     GROUPS,
     CostModel,
@@ -28,16 +28,6 @@ from tactslip_torch.analysis.latency import (
     time_calls,
     time_in_fresh_process,
 )
-from tactslip_torch.analysis.pareto import (
-    Candidate,
-    Group,
-    ParetoSearch,
-    Search,
-    landmarks,
-    nondominated,
-    worth_naming,
-    worth_timing,
-)
 from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.data.splits import seen6, unseen4
 from tactslip_torch.features.bank import make_plan, pool_names
@@ -49,7 +39,6 @@ from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.recipe import (
     FREE_CONSTANT,
     FeatureSelection,
@@ -82,18 +71,16 @@ def no_clock():
     """Prices as given: what anything takes is not looked at, but in the command's own test."""
     with pytest.MonkeyPatch.context() as patch:
         costs = CostModel(10.0, PRICES, PRICES, tail=2.0)
-        patch.setattr(module, "measure_costs", lambda *args, **named: costs)
+        patch.setattr(pareto, "measure_costs", lambda *args, **named: costs)
         yield patch
 
 
-def searching(source=None, recipe=RECIPE, channel_filter=None, **changes):
+def searching(**changes):
     """A search on a small set that has read its training recordings."""
-    source = source or SmallSet()
-    search, maker = Search(**(SMALL | changes)), small_maker(source)
-    if channel_filter is not None:
-        maker = FeatureMaker(source, maker.pool, channel_filter, maker.rule)
-    fold = seen6(source.ids, seen=["a", "b", "c"])[0]
-    made = ParetoSearch({"centred": maker}, fold, search, recipe, num_workers=0)
+    maker = small_maker(SmallSet())
+    fold = seen6(maker.source.ids, seen=["a", "b", "c"])[0]
+    search = pareto.Search(**SMALL | changes)
+    made = pareto.ParetoSearch({"centred": maker}, fold, search, RECIPE, num_workers=0)
     made.read()
     return made
 
@@ -104,39 +91,23 @@ def searched():
     return made, made.candidates()
 
 
-def only(candidates, channels, components, ranking, degree, size, columns="channel"):
-    wanted = (channels, components, ranking, degree, columns)
-    (found,) = [
-        c
-        for c in candidates
-        if (*c.group[1:3], c.ranking, c.degree, c.columns) == wanted and c.selection.size == size
-    ]
-    return found
-
-
-def made_up(latency, accuracy=0.9, size=4, **changes):
+def at(worst_ms, compute_us, accuracy, size=50):
     """A candidate that nobody searched for."""
     ends = torch.ones(size, dtype=torch.float64)
-    selection = FeatureSelection(
-        (3, 40, 300, 17, *range(400, 400 + size))[:size], FeatureScaler(-ends, ends)
-    )
-    group = Group(*(changes.pop(name, value) for name, value in (
-        ("align", "causal"), ("channels", "all"), ("components", "all"), ("mask", None)
-    )))  # fmt: skip
-    fields = {"columns": "channel", "ranking": "t", "degree": 1, "penalty": 0.01}
-    fields |= {"selection": selection, "by_group": {}} | changes
-    return Candidate(
-        group=group,
+    selected = (3, 40, 300, 17, *range(400, 400 + size))[:size]
+    return pareto.Candidate(
+        group=pareto.Group("causal", "all", "all", None),
+        columns="channel",
+        ranking="t",
+        degree=1,
+        penalty=0.01,
+        selection=FeatureSelection(selected, FeatureScaler(-ends, ends)),
+        by_group={},
         balanced_accuracy=accuracy,
-        latency=latency,
-        modelled_us=latency.compute_us,
-        **fields,
+        latency=Latency(worst_ms - 55 - compute_us / 1000, 50.0, 5.0, compute_us),
+        modelled_us=compute_us,
+        graph_us=compute_us,
     )
-
-
-def at(worst_ms, compute_us, accuracy, size=50, **changes):
-    latency = Latency(worst_ms - 55 - compute_us / 1000, 50.0, 5.0, compute_us)
-    return made_up(latency, accuracy, size, graph_us=compute_us, **changes)
 
 
 # What is searched --------------------------------------------------------------------------------
@@ -152,19 +123,18 @@ def test_groups_hold_what_their_names_say():
     assert {name.channel[:2] for name in names_of("gauges", "all")} == {"SG"}
     assert names_of("films", "all") == everything - names_of("gauges", "all")
     costly, jumping = {"median", "mode", "iqr", "entropy"}, {"mode", "cv", "entropy"}
-    assert names_of("all", "unsorted") == {n for n in everything if n.descriptor not in costly}
-    assert {name.domain for name in names_of("all", "time")} == {"time"}
-    steady = {n for n in everything if n.descriptor not in jumping}
-    moments = {n for n in steady if n.descriptor not in costly}
-    assert names_of("all", "steady") == steady
-    assert names_of("all", "moments") == moments
-    assert names_of("all", "time_moments") == {n for n in moments if n.domain == "time"}
-    spreads = {(n.descriptor, n.domain) for n in names_of("all", "spreads")}
-    assert spreads == {("std", "time"), ("range", "time")}
-    left = everything - names_of("all", "deep_spectra")
-    assert {(n.component, n.domain) for n in left} == {
-        (c, "freq") for c in ("A1", "D1", "A2", "D2")
+    deep = {"A3", "D3", "A4", "D4", "raw"}
+    rules = {
+        "time": lambda n: n.domain == "time",
+        "unsorted": lambda n: n.descriptor not in costly,
+        "steady": lambda n: n.descriptor not in jumping,
+        "moments": lambda n: n.descriptor not in costly | jumping,
+        "time_moments": lambda n: n.domain == "time" and n.descriptor not in costly | jumping,
+        "spreads": lambda n: n.domain == "time" and n.descriptor in ("std", "range"),
+        "deep_spectra": lambda n: n.domain == "time" or n.component in deep,
     }
+    for components, does in rules.items():
+        assert names_of("all", components) == set(filter(does, everything)), components
     for channels, components in (("toes", "all"), ("all", "cheap")):
         with pytest.raises(ValueError, match=rf"unknown group '{channels}' or '{components}'"):
             names_of(channels, components)
@@ -188,26 +158,28 @@ def test_groups_hold_what_their_names_say():
 )
 def test_what_cannot_be_searched_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
-        Search(**(SMALL | changes))
+        pareto.Search(**(SMALL | changes))
 
 
 # What is found -----------------------------------------------------------------------------------
 @pytest.mark.parametrize("degree", [1, 2])
 def test_a_score_is_that_of_machines_that_never_met_the_material(searched, degree):
     made, candidates = searched
-    found = only(candidates, "films", "all", "t", degree, 6)
+    wanted = ("films", "all", "t", degree, "channel", 6)
+    (found,) = [
+        c
+        for c in candidates
+        if (*c.group[1:3], c.ranking, c.degree, c.columns, c.selection.size) == wanted
+    ]
     statistics = made.training_statistics["centred"]
     sample = statistics.sample.bins()
     z = scaled_selection(RECIPE, statistics, found.selected)(sample.features)
     weights = sample_weight(RECIPE, sample)
-    by_penalty = {}
+    bins, by_penalty = TrainingBins(z, sample.is_slip, weights), {}
     for penalty in SMALL["penalties"]:
-        scores = []
-        for index in range(len(sample.group_names)):
-            out = sample.group == index
-            training = TrainingBins(z[~out], sample.is_slip[~out], weights[~out])
-            head = fit_machine(training, penalty, Polynomial(degree, 0.5))
-            scores.append(balanced_accuracy(head(z[out]) >= 0, sample.is_slip[out]))
+        is_called = refitted_scores(bins, sample.group, penalty, Polynomial(degree, 0.5)) >= 0
+        masks = [sample.group == index for index in range(len(sample.group_names))]
+        scores = [balanced_accuracy(is_called[own], sample.is_slip[own]) for own in masks]
         by_penalty[penalty] = scores
     best = max(by_penalty, key=lambda penalty: sum(by_penalty[penalty]))
     assert found.balanced_accuracy == pytest.approx(sum(by_penalty[best]) / 3)
@@ -265,7 +237,7 @@ def test_each_finger_goes_that_is_missed_least(monkeypatch):
 
 def test_landmarks_are_the_best_the_cheap_and_the_small():
     def found(*rows):
-        return list(landmarks(rows).values())
+        return list(pareto.landmarks(rows).values())
 
     best, third, poor, few, fewer, quick = (
         at(60.0, us, accuracy, size)
@@ -281,14 +253,16 @@ def test_landmarks_are_the_best_the_cheap_and_the_small():
     made = [at(60.0, 100.0, accuracy) for accuracy in (0.8, 0.9, 0.7)]
     pooled = [replace(each, columns="pooled mean") for each in made]
     small = [at(60.0, 100.0, accuracy, 20) for accuracy in (0.4, 0.5)]
-    assert set(worth_naming([*made, *pooled, *small])) == {made[1], pooled[1], small[1]}
+    assert set(pareto.worth_naming([*made, *pooled, *small])) == {made[1], pooled[1], small[1]}
 
 
 def test_what_is_close_to_the_limits_is_timed(rng):
     """Two filters: the quick one waits longer, so accuracy does not rise with compute."""
     line = [at(61.0, 100.0 + 10 * i, 0.8 - 0.001 * (39 - i)) for i in range(40)]
     line += [at(59.0, 500.0 + 10 * i, 0.6 + 0.001 * i) for i in range(40)]
-    timed = worth_timing([line[i] for i in rng.permutation(80)], 10, Limits(80.0, 300.0, [5.0]))
+    timed = pareto.worth_timing(
+        [line[i] for i in rng.permutation(80)], 10, Limits(80.0, 300.0, [5.0])
+    )
     # 450 us and 300 us at most, then 200 us, best first: the model may err either way
     compute = [each.latency.compute_us for each in timed]
     assert compute[:5] == [490.0, 450.0, 300.0, 200.0, 440.0]
@@ -305,20 +279,17 @@ def test_the_front_is_what_nothing_beats(rng):
     expected = [
         i
         for i, own in enumerate(points)
-        if not any(beats(other, own) for other in points) and own not in points[:i]
+        if own not in points[:i] and not any(beats(other, own) for other in points)
     ]
-    assert nondominated(points) == expected
-    assert nondominated([]) == []
+    assert pareto.nondominated(points) == expected
+    assert pareto.nondominated([]) == []
 
 
 # The command -------------------------------------------------------------------------------------
 TINY = (
-    "data._target_=test_commands.TinyRecordings",
-    "data.materials=[A,B,C]",
-    "data.cycles=4",
-    "split.seen=[A,B]",
-    "split.unseen=[C]",
-    "split.train_fraction=0.5",
+    *TINY_DATA,
+    *TINY_SPLIT,
+    "num_workers=0",
     "search=quick",
     "search.sizes=[4,8]",
     "search.rankings=[t]",
@@ -328,7 +299,6 @@ TINY = (
     "search.components=[time]",
     "search.aligns=[centred]",
     "retime_calls=20",
-    "num_workers=0",
 )
 FEW = ("search.sizes=[4]", "search.degrees=[1]", "search.statistics=[]", "search.channels=[all]")
 EASY = ("deadline_ms=500", "compute_us=400000")  # a busy machine keeps these too
@@ -377,7 +347,7 @@ def test_the_files_and_the_parts_of_the_promise(written):
         assert len(row["selected"]) == row["num_features"]
         assert row["graph_p50_us"] > 0
     points = [(r["latency"]["worst_ms"], r["p99_us"], -r["validation"]) for r in found["front"]]
-    assert nondominated(points) == list(range(len(points)))
+    assert pareto.nondominated(points) == list(range(len(points)))
     assert found["searched"] == len(found["modelled"]) >= found["timed"] >= len(points)
 
 
@@ -408,14 +378,6 @@ def test_unseen_materials_are_never_read_and_test_cycles_by_the_chosen_one_alone
     assert found["chosen"]["test"]["num_bins"] > 0
 
 
-def fails(monkeypatch, capsys, tmp_path, *arguments):
-    """Exit status and the last line that the command leaves on standard error."""
-    monkeypatch.setattr(sys, "argv", ["pareto", *TINY, f"hydra.run.dir={tmp_path}", *arguments])
-    with pytest.raises(SystemExit) as stopped:
-        command.main()
-    return stopped.value.code, capsys.readouterr().err.strip().splitlines()[-1]
-
-
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
@@ -431,7 +393,7 @@ def fails(monkeypatch, capsys, tmp_path, *arguments):
     ],
 )
 def test_bad_input_is_one_line(monkeypatch, tmp_path, argument, message):
-    monkeypatch.setattr(ParetoSearch, "read", None)  # it refuses before it works
+    monkeypatch.setattr(pareto.ParetoSearch, "read", None)  # it refuses before it works
     with pytest.raises(BAD_INPUT) as caught:
         run(tmp_path, argument)
     line = one_line(caught.value)
@@ -442,8 +404,12 @@ def test_bad_input_is_one_line(monkeypatch, tmp_path, argument, message):
 
 def test_none_that_meets_the_limits_is_said_plainly(monkeypatch, capsys, tmp_path):
     (tmp_path / "detector.pt").write_text("of an earlier run")
-    status, line = fails(monkeypatch, capsys, tmp_path, "compute_us=1", *FEW)
-    assert status == 1
+    arguments = ["pareto", *TINY, f"hydra.run.dir={tmp_path}", "compute_us=1", *FEW]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit) as stopped:
+        command.main()
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert stopped.value.code == 1
     found = json.loads((tmp_path / "pareto.json").read_text())
     quickest = min(row["p99_us"] for row in found["front"])  # misses least
     said = f"the closest has compute {quickest:.0f} us above compute_us=1"
@@ -458,11 +424,8 @@ RATE_HZ = 2000
 
 def decided_after_ms(onset, num_samples, hop, look_ahead, compute_us):
     """Samples come one by one; the first bin that begins at or behind the onset decides."""
-    for newest in range(10**6):
-        start = newest - look_ahead - num_samples + 1
-        if start >= onset and start % hop == 0:
-            return (newest + 1 - onset) * 1000 / RATE_HZ + compute_us / 1000
-    raise AssertionError("never decided")
+    start = next(start for start in itertools.count(onset) if start % hop == 0)
+    return (start + num_samples + look_ahead - onset) * 1000 / RATE_HZ + compute_us / 1000
 
 
 @pytest.mark.parametrize("look_ahead", [0, 5, 25])
@@ -499,10 +462,9 @@ def test_the_hop_leaves_head_room_where_one_does():
     roomy = limits.latency(parts, 380.0, headroom=1.25)
     assert (roomy.hop_ms, roomy.compute_us) == (10, 380)  # 25 ms with 475 us are 80.075 ms
     assert limits.latency(parts, 390.0, headroom=1.5).hop_ms == 25  # 585 us are none: without
-    assert Limits(60.0, 5000.0, [5.0]).headroom(Latency(2.0, 50.0, 5.0, 400.0)) == pytest.approx(
-        7.5
-    )
-    assert Limits(900.0, 500.0, [5.0]).headroom(Latency(2.0, 50.0, 5.0, 400.0)) == 1.25
+    tight = Latency(2.0, 50.0, 5.0, 400.0)
+    assert Limits(60.0, 5000.0, [5.0]).headroom(tight) == pytest.approx(7.5)
+    assert Limits(900.0, 500.0, [5.0]).headroom(tight) == 1.25
     for us, hop_ms in ((12_000.0, 25), (60_000.0, 25), (5_000.0, 10)):
         assert Latency(0.0, 50.0, 5.0, us).with_shortest_hop(limits.hops_ms).hop_ms == hop_ms
 
@@ -511,49 +473,39 @@ PRIMES = dict(zip(GROUPS, (2.0, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37), strict
 MODEL = CostModel(0.5, {name: 1000 * price for name, price in PRIMES.items()}, PRIMES, tail=2.0)
 
 
-def parts(*names):
-    return parts_of(make_plan(FOUR_CHANNELS, 4, names))
-
-
 def priced(**groups):
     """The bill by hand: each group once, and so many of its parts."""
     return 2 * (0.5 + sum((1000 + num) * PRIMES[name] for name, num in groups.items()))
 
 
-@pytest.mark.parametrize(
-    ("names", "bill"),
-    [
-        (["SG1 raw time mean"], {"gauges": 1, "moments": 1, "columns": 1}),
-        (["SG1 raw time mode"], {"gauges": 1, "sorts": 1, "columns": 1}),
-        (
-            ["PVDF1 A2 time std", "PVDF1 A2 time median", "PVDF1 A2 time iqr"],
-            {"films": 1, "branches": 1, "moments": 1, "sorts": 1, "columns": 3},
-        ),
-        (
-            ["PVDF1 A2 time correlation", "PVDF2 A2 time entropy"],
-            {
-                "films": 2,
-                "branches": 2,
-                "correlations": 1,
-                "sorts": 1,
-                "histograms": 1,
-                "columns": 2,
-            },
-        ),
-        (
-            ["PVDF1 D4 freq spectral_centroid", "PVDF1 D4 freq spectral_spread"],
-            {"films": 1, "spectra": 1, "lines": 1, "columns": 2},
-        ),
-        (
-            ["PVDF1 A1 freq band_energy_ratio", "PVDF1 D3 freq band_energy_ratio"],
-            {"films": 1, "energies": 1, "columns": 2},
-        ),
-    ],
-)
+BILLS = [
+    (["SG1 raw time mean"], {"gauges": 1, "moments": 1}),
+    (["SG1 raw time mode"], {"gauges": 1, "sorts": 1}),
+    (
+        ["PVDF1 A2 time std", "PVDF1 A2 time median", "PVDF1 A2 time iqr"],
+        {"films": 1, "branches": 1, "moments": 1, "sorts": 1},
+    ),
+    (
+        ["PVDF1 A2 time correlation", "PVDF2 A2 time entropy"],
+        {"films": 2, "branches": 2, "correlations": 1, "sorts": 1, "histograms": 1},
+    ),
+    (
+        ["PVDF1 D4 freq spectral_centroid", "PVDF1 D4 freq spectral_spread"],
+        {"films": 1, "spectra": 1, "lines": 1},
+    ),
+    (
+        ["PVDF1 A1 freq band_energy_ratio", "PVDF1 D3 freq band_energy_ratio"],
+        {"films": 1, "energies": 1},
+    ),
+]
+
+
+@pytest.mark.parametrize(("names", "bill"), BILLS)
 def test_shared_work_is_on_the_bill_once(names, bill):
-    needed, everything = parts(*names), range(len(names))
-    assert MODEL.compute_us(detector_parts(needed, everything)) == pytest.approx(priced(**bill))
-    pooled = priced(**bill | {"columns": 5, "pooled": len(names)})  # five numbers of all of them
+    needed, everything = parts_of(make_plan(FOUR_CHANNELS, 4, names)), range(len(names))
+    alone = priced(**bill, columns=len(names))
+    assert MODEL.compute_us(detector_parts(needed, everything)) == pytest.approx(alone)
+    pooled = priced(**bill, columns=5, pooled=len(names))  # five numbers of all of them
     assert MODEL.compute_us(detector_parts(needed, everything, 5)) == pytest.approx(pooled)
 
 
@@ -573,9 +525,8 @@ def test_prices_are_found_again_in_timings_that_follow_them(monkeypatch):
     assert min(costs.base_us, *costs.group_us.values(), *costs.part_us.values()) >= 0
     some = detector_parts(needed, range(0, len(needed), 50))
     assert costs.compute_us(some) == pytest.approx(MODEL.compute_us(some), rel=0.05)
-    assert (
-        json.loads(json.dumps(costs.to_dict(), allow_nan=False))["groups"].keys() == GROUPS.keys()
-    )
+    plain = json.loads(json.dumps(costs.to_dict(), allow_nan=False))
+    assert plain["groups"].keys() == GROUPS.keys()
 
 
 # The clock ---------------------------------------------------------------------------------------

@@ -1,13 +1,13 @@
 """Recipes, plans and passes: what is chosen, and that neither order nor workers matter."""
 
 import json
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
 import torch
 from scipy.stats import ttest_ind
-from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
+from small_set import SMALL_HAND, SmallSet, refitted_scores, small_maker, small_recipe
 from test_commands import TINY, composed
 from torch.nn.functional import binary_cross_entropy_with_logits
 
@@ -129,10 +129,7 @@ def test_a_sample_stands_for_all_bins_with_both_classes_of_one_weight(balance, r
         ({"kernel": "rbf"}, r"recipe.kernel=rbf needs recipe.gamma"),
         ({"penalties": ()}, r"recipe.penalties must be positive, got \[\]"),
         ({"penalties": (0.1, float("inf"))}, r"validation needs finite values"),
-        (
-            {"num_features": 1.5},
-            r"recipe.num_features must be whole numbers of at least 1, got \[1.5\]",
-        ),
+        ({"num_features": 1.5}, r"num_features must be whole numbers of at least 1, got \[1.5\]"),
         ({"offsets": -1.0}, r"recipe.offsets must not be negative"),
         ({"tail": "0.1"}, r"recipe.tail must lie in \[0, 0.5\), got '0.1'"),  # text is no number
         ({"most_correlation": 0.0}, r"recipe.most_correlation must lie in \(0, 1\]"),
@@ -143,10 +140,7 @@ def test_a_sample_stands_for_all_bins_with_both_classes_of_one_weight(balance, r
         ({"validation": "nested", "kernel": "rbf", "gamma": 1}, "needs recipe.kernel=polynomial"),
         ({"validation": "nested", "degree": 3}, "of degree 1 or 2"),
         ({"tolerance": 1.0}, r"recipe.tolerance must lie in \[0, 1\), got 1.0"),
-        (
-            {"scene_weights": {"taps": 0.0}},
-            "recipe.scene_weights must be positive, got {'taps': 0.0}",
-        ),
+        ({"scene_weights": {"taps": 0.0}}, "scene_weights must be positive, got {'taps': 0.0}"),
         ({"feature_filter": {"kinds": "SG"}}, r"recipe.feature_filter: unknown 'kinds', expected"),
         ({"feature_filter": {"kind": 3}}, r"feature_filter.kind must be a name or several, got 3"),
         ({"feature_filter": "SG"}, r"recipe.feature_filter must be like .*, got 'SG'"),
@@ -169,9 +163,9 @@ def test_bad_recipes_are_refused(change, message):
     ids=str,
 )
 def test_what_needs_a_quadratic_machine_refuses_another(changes, message):
+    Recipe().check_quadratic("tuning")
     with pytest.raises(ValueError, match=message):
         Recipe(**changes).check_quadratic("tuning")
-    Recipe().check_quadratic("tuning")
 
 
 # Plans -----------------------------------------------------------------------------------------
@@ -181,19 +175,17 @@ def test_validation_and_calibration_equal_refits_without_the_group(rng):
     parts = make_parts(rng)
     plan = planned(Recipe(**FEW, balance="weights"), parts)
     bins = balanced(plan, parts)
-    material = [r.material for r, _, is_slip in parts for _ in is_slip]
+    material = torch.tensor([ord(r.material) for r, _, is_slip in parts for _ in is_slip])
     assert [row["penalty"] for row in plan.validation] == [0.1, 3.0]
     for row in plan.validation:
-        scores = torch.zeros(len(material), dtype=torch.float64)
+        scores = refitted_scores(bins, material, row["penalty"])
         for name, found in row["balanced_accuracy"].items():
-            mine = torch.tensor([each == name for each in material])
-            others = (x[~mine] for x in (bins.features, bins.is_slip, bins.weights))
-            scores[mine] = fit_machine(TrainingBins(*others), row["penalty"])(bins.features[mine])
+            mine = material == ord(name)
             assert found == balanced_accuracy(scores[mine] >= 0, bins.is_slip[mine])
         assert row["mean"] == pytest.approx(sum(row["balanced_accuracy"].values()) / 3)
-        expected, found = fit_platt(scores, bins.is_slip, bins.weights), row["calibration"]
-        assert calibration_from_dict(found).slope == pytest.approx(expected.slope, rel=1e-6)
-        assert calibration_from_dict(found).offset == pytest.approx(expected.offset, rel=1e-6)
+        expected = astuple(fit_platt(scores, bins.is_slip, bins.weights))
+        found = astuple(calibration_from_dict(row["calibration"]))
+        assert found == pytest.approx(expected, rel=1e-6)
     best = max(row["mean"] for row in plan.validation)
     chosen = next(row for row in plan.validation if row["mean"] == best)
     assert (plan.penalty, plan.calibration) == (chosen["penalty"], chosen["calibration"])
@@ -315,9 +307,8 @@ def test_what_matches_has_every_attribute_that_is_asked_for(wanted, does, num):
 @pytest.mark.parametrize("most_correlation", [1.0, 0.995])
 def test_only_what_matches_is_ranked_and_in_the_order_of_the_whole_ranking(most_correlation, rng):
     statistics, wanted = told_apart(rng, SMALL_POOL), {"domain": "freq"}
-    options = {"most_correlation": most_correlation, "penalties": 0.1}
-    recipe = Recipe(num_features=9, feature_filter=wanted, **options)
-    plan = plan_detector(recipe, statistics, SMALL_POOL)
+    options = {"num_features": 9, "most_correlation": most_correlation, "penalties": 0.1}
+    plan = plan_detector(Recipe(feature_filter=wanted, **options), statistics, SMALL_POOL)
     every = select_features(Recipe(num_features=len(SMALL_POOL.names)), statistics).selected
     of_spectra = [index for index in every if SMALL_POOL.names[index].domain == "freq"]
     assert list(plan.selection.selected) == of_spectra[:9]
@@ -360,21 +351,19 @@ FILM_POOL = FeaturePool(HAND, level=1)
 GROUPS = ("M1", "M2", "M3", "M4")
 
 
-def recipe(**changes):
-    base = {
-        "validation": "nested",
-        "use": ["channel", "pooled", "both"],
-        "pooling": ["mean", "std"],
-        "num_features": [None, 10],
-        "degree": [1, 2],
-        "ranking": "gd",
-        "compress": True,
-        "tail": 0.01,
-        "balance": "weights",
-        "tolerance": 0.005,
-        "penalties": [0.001, 0.1],
-    }
-    return Recipe(**base | changes)
+NESTED = {
+    "validation": "nested",
+    "use": ["channel", "pooled", "both"],
+    "pooling": ["mean", "std"],
+    "num_features": [None, 10],
+    "degree": [1, 2],
+    "ranking": "gd",
+    "compress": True,
+    "tail": 0.01,
+    "balance": "weights",
+    "tolerance": 0.005,
+    "penalties": [0.001, 0.1],
+}
 
 
 def sample_of(rng, groups=GROUPS, per=30):
@@ -390,26 +379,20 @@ def sample_of(rng, groups=GROUPS, per=30):
             group += [index] * per
     features = FILM_POOL(torch.from_numpy(np.concatenate(bins))).float()
     num = len(is_slip)
-    return SampledBins(
-        features,
-        torch.tensor(is_slip),
-        torch.tensor(group),
-        tuple(groups),
-        torch.arange(num) // 5,
-        tuple(f"r{i}" for i in range(num // 5)),
-        torch.arange(num),
-        torch.full((num,), 2.0, dtype=torch.float64),
-    )
+    recordings = torch.arange(num) // 5, tuple(f"r{i}" for i in range(num // 5))
+    weight = torch.full((num,), 2.0, dtype=torch.float64)
+    of_bins = features, torch.tensor(is_slip), torch.tensor(group), tuple(groups)
+    return SampledBins(*of_bins, *recordings, torch.arange(num), weight)
 
 
-def chosen(sample, how):
-    return choose_model(how, FILM_POOL, sample)
+def chosen(sample, **changes):
+    return choose_model(Recipe(**NESTED | changes), FILM_POOL, sample)
 
 
 @pytest.fixture(scope="module")
 def drawn():
     sample = sample_of(np.random.default_rng(0))
-    return sample, chosen(sample, recipe())
+    return sample, chosen(sample)
 
 
 def test_pooled_features_win_where_another_channel_slips_in_each_group(drawn):
@@ -426,15 +409,15 @@ def test_pooled_features_win_where_another_channel_slips_in_each_group(drawn):
 
 
 def test_of_ties_the_simplest_with_the_strongest_penalty_is_taken(drawn):
-    everything = chosen(drawn[0], recipe(tolerance=0.99))
+    everything = chosen(drawn[0], tolerance=0.99)
     assert everything.structure == ("pooled", None, Polynomial(1, FREE_CONSTANT))
     assert everything.penalty == min(row["penalty"] for row in everything.rows)
 
 
 def test_a_grid_that_ends_at_its_edge_is_extended_and_says_so(drawn, caplog):
-    few = recipe(use="pooled", num_features=None, degree=1, tolerance=0.2)
+    few = {"use": "pooled", "num_features": None, "degree": 1, "tolerance": 0.2}
     with caplog.at_level("INFO"):
-        choice = chosen(drawn[0], few)
+        choice = chosen(drawn[0], **few)
     assert "ended at its edge and was extended by 0.0001" in caplog.text
     assert min(row["penalty"] for row in choice.rows) < 0.001
 
@@ -444,15 +427,18 @@ def test_what_is_done_to_a_group_does_not_reach_machines_without_it(drawn):
     sample, before = drawn
     mine = sample.group == 2
     flipped = torch.where(mine, ~sample.is_slip, sample.is_slip)
-    after = chosen(replace(sample, is_slip=flipped), recipe())
+    after = chosen(replace(sample, is_slip=flipped))
     accuracy = before.nested["balanced_accuracy"]["M3"]
     # the others' labels are as they were, so the machine is the same and every answer turns
     assert after.nested["balanced_accuracy"]["M3"] == pytest.approx(1 - accuracy)
     spoilt = sample.features.clone()
     spoilt[mine] = 1e6 * torch.rand(spoilt[mine].shape)
-    single = recipe(use="both", num_features=10, degree=2, penalties=0.1)
-    rows = [chosen(replace(sample, features=x), single).rows[0] for x in (sample.features, spoilt)]
-    assert rows[0]["balanced_accuracy"]["M3"] != rows[1]["balanced_accuracy"]["M3"]
+    single = {"use": "both", "num_features": 10, "degree": 2, "penalties": 0.1}
+    scores = [
+        chosen(replace(sample, features=x), **single).rows[0]["balanced_accuracy"]
+        for x in (sample.features, spoilt)
+    ]
+    assert scores[0]["M3"] != scores[1]["M3"]
 
 
 def test_scenes_have_the_weight_that_is_asked_for(rng):
@@ -462,7 +448,7 @@ def test_scenes_have_the_weight_that_is_asked_for(rng):
     per_bin = ("features", "is_slip", "group", "recording", "bin_index", "sample_weight")
     kept = {name: getattr(sample, name)[is_quiet] for name in per_bin}
     quiet_arm = replace(sample, **kept)  # an arm that moves without slip
-    how = recipe(scene_weights={"arm_motion": 0.5})
+    how = Recipe(**NESTED, scene_weights={"arm_motion": 0.5})
     weights = sample_weight(how, quiet_arm)
     is_arm = torch.isin(quiet_arm.group, torch.tensor([0, 2]))
     no_slip = ~quiet_arm.is_slip
@@ -470,17 +456,16 @@ def test_scenes_have_the_weight_that_is_asked_for(rng):
     assert float(weights[no_slip].sum()) == pytest.approx(float(weights[~no_slip].sum()))
     assert set(scene_weights(how, quiet_arm)) == {"arm_motion", "paper"}
     with pytest.raises(ValueError, match="scene_weights names 'taps', of which there is no"):
-        sample_weight(recipe(scene_weights={"taps": 1.0}), quiet_arm)
+        sample_weight(replace(how, scene_weights={"taps": 1.0}), quiet_arm)
 
 
 def test_one_group_cannot_be_left_out(rng):
     with pytest.raises(ValueError, match="needs two with bins of both classes, got 1"):
-        chosen(sample_of(rng, ("M1",)), recipe())
+        chosen(sample_of(rng, ("M1",)))
 
 
-RECIPE = Recipe(
-    num_features=6, penalties=(0.01, 0.1, 1.0), compress=True, tail=0.01, balance="weights"
-)
+RANGES = {"compress": True, "tail": 0.01}
+RECIPE = Recipe(num_features=6, penalties=(0.01, 0.1, 1.0), balance="weights", **RANGES)
 
 
 @pytest.fixture(scope="module")
@@ -532,11 +517,8 @@ def test_grid_is_of_refits_without_the_group(small, bins):
     scaler = small[2].selection.scaler
     points = grid_points(scaler, bins, recipe)
     assert [point[:2] for point in points] == [(0.1, 0.5), (1.0, 0.5), (0.1, 2.0), (1.0, 2.0)]
-    z, scores = scaler(bins.features), torch.empty(len(bins.group), dtype=torch.float64)
-    for group in range(3):
-        own = bins.group == group
-        others = TrainingBins(z[~own], bins.is_slip[~own], bins.weights[~own])
-        scores[own] = fit_machine(others, 1.0, Polynomial(2, 2.0))(z[own])
+    training = TrainingBins(scaler(bins.features), bins.is_slip, bins.weights)
+    scores = refitted_scores(training, bins.group, 1.0, Polynomial(2, 2.0))
     expected = grouped_loss(scores, bins.is_slip, bins.group)
     assert points[3].loss == pytest.approx(float(expected.loss), rel=1e-6)
     assert least_loss(points).loss == min(point.loss for point in points)
@@ -569,44 +551,32 @@ def test_a_held_out_group_does_not_change_its_descent(small):
     features[sample.group == 2] *= 1.03
     tuning = Tuning(learn=["penalty", "scales"], bins=8, steps=2, patience=3)
     first, second = (
-        tuned_by(small, replace(sample, features=x), tuning).metadata["held"][2]
+        tuned_by(small, replace(sample, features=x), tuning).metadata["held"][2]["history"]
         for x in (sample.features, features)
     )
-    assert [row["loss"] for row in first["history"]] == [row["loss"] for row in second["history"]]
-    assert first["history"][0]["held_loss"] != second["history"][0]["held_loss"]
+    assert [row["loss"] for row in first] == [row["loss"] for row in second]
+    assert first[0]["held_loss"] != second[0]["held_loss"]
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
+    ("values", "changes", "message"),
     [
-        ({"learn": ["bias"]}, "tuning.learn must be a list of some of penalty, offset"),
-        ({"steps": 0}, "tuning.steps must be a positive whole number, got 0"),
-        ({"bins": "abc"}, "tuning.bins must be a positive whole number, got 'abc'"),
-        ({"rate": float("nan")}, "tuning.rate must be a positive finite number, got nan"),
-    ],
-)
-def test_bad_tuning_is_refused(values, message):
-    with pytest.raises(ValueError, match=message):
-        Tuning(**values)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"degree": 3}, "needs recipe.kernel=polynomial recipe.degree=2"),
-        ({"offsets": 0.0}, r"needs recipe\.offsets above 0"),
-        ({}, "needs three groups to hold some out, got a, b"),
+        ({"learn": ["bias"]}, {}, "tuning.learn must be a list of some of penalty, offset"),
+        ({"steps": 0}, {}, "tuning.steps must be a positive whole number, got 0"),
+        ({"bins": "abc"}, {}, "tuning.bins must be a positive whole number, got 'abc'"),
+        ({"rate": float("nan")}, {}, "tuning.rate must be a positive finite number, got nan"),
+        ({}, {"degree": 3}, "needs recipe.kernel=polynomial recipe.degree=2"),
+        ({}, {"offsets": 0.0}, r"needs recipe\.offsets above 0"),
+        ({}, {}, "needs three groups to hold some out, got a, b"),
     ],
     ids=str,
 )
-def test_what_could_not_be_tuned_is_refused_beforehand(small, changes, message):
+def test_what_could_not_be_tuned_is_refused_beforehand(small, values, changes, message):
     split = small[3]
-    if not changes:
-        roles = {r: role for r, role in split.roles.items() if r.material != "c"}
-        split = replace(split, roles=roles)
+    Tuning().check(replace(RECIPE, group_by="cycle"), split)
+    two = {r: role for r, role in split.roles.items() if changes or r.material != "c"}
     with pytest.raises(ValueError, match=message):
-        Tuning().check(replace(RECIPE, **changes), split)
-    Tuning().check(replace(RECIPE, group_by="cycle"), small[3])
+        Tuning(**values).check(replace(RECIPE, **changes), replace(split, roles=two))
 
 
 @pytest.mark.slow

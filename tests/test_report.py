@@ -20,6 +20,7 @@ from tactslip_torch.onset.events import (
     pooled_metrics,
     recording_events,
 )
+from tactslip_torch.report import results
 from tactslip_torch.report.metrics import answer_metrics, bin_metrics, split_metrics
 from tactslip_torch.report.onset import (
     REST,
@@ -35,24 +36,6 @@ from tactslip_torch.report.recordings import (
     ranges_table,
     signals_figure,
     trials_table,
-)
-from tactslip_torch.report.results import (
-    PAPER_LINE,
-    answers_figure,
-    answers_table,
-    confusion_figure,
-    events_figure,
-    events_table,
-    materials_table,
-    print_results,
-    reliability_figure,
-    reliability_table,
-    selected_features_figure,
-    splits_table,
-    tuning_figure,
-    tuning_tables,
-    validation_figure,
-    write_results,
 )
 from tactslip_torch.report.style import ALARM, table
 from tactslip_torch.report.sweep import sweep_table, write_sweep
@@ -75,9 +58,9 @@ def metrics_of(**more):
     return {"simulated": True, "splits": splits} | more
 
 
-def features(hand=None):
+def features():
     rows = []
-    for number, channel in enumerate((hand or HandLayout.paper24()).channels):
+    for number, channel in enumerate(HandLayout.paper24().channels):
         component = "raw" if channel.kind == "SG" else f"{'AD'[number % 2]}{1 + number % 4}"
         row = {"channel": channel.name, "component": component, "domain": "time"}
         row |= {"descriptor": ("kurtosis", "std", "energy")[number % 3]}
@@ -197,13 +180,13 @@ def test_the_papers_numbers_stand_beside_its_own_scenes_alone(drawn, tmp_path, s
     metrics = {"simulated": True, "splits": {"test": scores_of(scenes=scenes)}}
     elsewhere = metrics | {"is_papers_hand": False}
     for each in (metrics, elsewhere):
-        confusion_figure(each, tmp_path / "confusion.png")
+        results.confusion_figure(each, tmp_path / "confusion.png")
     own, other = (figure.axes[0].get_xlabel() for figure in drawn)
     assert ("paper: non-slip 93.8" in own) == is_papers
     assert other == "prediction\n\n"
-    assert any(row[0] == "paper" for row in rows_of(splits_table(metrics))) == is_papers
-    assert PAPER_LINE not in splits_table(elsewhere)
-    lines = materials_table(metrics).splitlines()
+    assert any(row[0] == "paper" for row in rows_of(results.splits_table(metrics))) == is_papers
+    assert results.PAPER_LINE not in results.splits_table(elsewhere)
+    lines = results.materials_table(metrics).splitlines()
     expected = ["acrylic", "ABS", "20 mm/s", "40 mm/s", "60 mm/s"]
     expected = expected if "paper" in scenes or len(scenes) == 1 else []
     if len(scenes) > 1:
@@ -217,19 +200,19 @@ def test_the_papers_numbers_stand_beside_its_own_scenes_alone(drawn, tmp_path, s
 def test_tuning_says_what_was_learned():
     metrics = metrics_of(tuning=tuning())
     metrics["splits"] = {"test": metrics["splits"]["test"]}
-    (text,) = tuning_tables(metrics)
+    (text,) = results.tuning_tables(metrics)
     assert "tuned by gradient" in text
     assert "1 steps from C=1, c=0.5 to C=2, c=0.25; learned: penalty, offset, scales" in text
-    assert tuning_tables(metrics_of()) == []
+    assert results.tuning_tables(metrics_of()) == []
 
 
 def test_reliability_and_prediction_sets_have_a_row_for_each_role():
-    lines = reliability_table(metrics_of(alarm={"reliability": BY_ROLE})).splitlines()
+    lines = results.reliability_table(metrics_of(alarm={"reliability": BY_ROLE})).splitlines()
     rows = [line.split() for line in lines[2:]]
     assert rows[0] == ["test", "all", "4000", "1.25", "2.50", "0.0625", "0.2500"]
     assert rows[1] == ["M1", "800", "2.00", "4.00", "0.0625", "0.2500"]
     assert [row[0] for row in rows[2:]] == ["unseen", "iron"]
-    lines = answers_table(metrics_of(answers=ANSWERS)).splitlines()
+    lines = results.answers_table(metrics_of(answers=ANSWERS)).splitlines()
     assert lines[2].split()[:4] == ["unseen", "15.00", "88.24", "85.83"]
     assert set(lines[3].split()[1:-1]) == {"-"}
     assert lines[4].startswith("asked: 80 % covered")
@@ -238,7 +221,7 @@ def test_reliability_and_prediction_sets_have_a_row_for_each_role():
 def test_events_have_a_row_for_each_role_and_rule():
     numbers = events_of()
     of_role = {"first_transition": numbers, "two_of_three": numbers}
-    text = events_table(metrics_of(events={"test": of_role, "unseen": of_role}))
+    text = results.events_table(metrics_of(events={"test": of_role, "unseen": of_role}))
     first, _, *found = rows_of(text)
     assert first[0].startswith("SIMULATED")
     rate = numbers["false_alarms_per_minute"]
@@ -261,13 +244,13 @@ def test_events_have_a_row_for_each_role_and_rule():
 
 def test_events_say_what_their_delay_is_made_of_and_why_there_are_none():
     timed = {"test": {"rule": events_of(), "cusum at 1/h": events_of(compute_s=0.0021)}}
-    *_, untimed, parts = rows_of(events_table(metrics_of(events=timed)))
+    *_, untimed, parts = rows_of(results.events_table(metrics_of(events=timed)))
     assert untimed[-1] == "-"
     look_ahead, *rest, whole, compute = map(float, parts[1:])
     assert (look_ahead, compute) == (12.5, 2.1)
     assert look_ahead + sum(rest) == pytest.approx(whole, abs=0.2)
     nothing = {role: {"a": no_events(), "b": no_events()} for role in ("train", "test")}
-    text = events_table(metrics_of(events=nothing))
+    text = results.events_table(metrics_of(events=nothing))
     assert rows_of(text)[2][2:] == ["0", *["-"] * 10]
     assert text.count(REASON) == text.count(f"no events: {REASON}") == 1
 
@@ -276,37 +259,43 @@ def test_events_say_what_their_delay_is_made_of_and_why_there_are_none():
 
 NEVER = events_of() | {"delay_ms": None, "found": {"value": 0.0, "low": 0.0, "high": 0.1}}
 MANY = {f"rule {number}": NEVER for number in range(7)} | {"8": events_of()}  # more than colours
-FIGURES = {
-    "confusion": lambda path, of: confusion_figure(metrics_of(simulated=of), path),
-    "many splits, an absent class": lambda path, of: confusion_figure(
-        {"simulated": of, "splits": {str(i): split_metrics([[0, 0], [i, 5]]) for i in range(5)}},
-        path,
-    ),
-    "selected": lambda path, of: selected_features_figure(features(), path, simulated=of),
-    "validation": lambda path, of: validation_figure(
-        metrics_of(simulated=of, validation=[*CHOICES, RBF]), path
-    ),
-    "reliability": lambda path, of: reliability_figure(
-        metrics_of(simulated=of, alarm={"reliability": BY_ROLE}), path
-    ),
-    "tuning": lambda path, of: tuning_figure(tuning(), path, simulated=of),
-    "answers": lambda path, of: answers_figure(metrics_of(simulated=of, answers=ANSWERS), path),
-    "events": lambda path, of: events_figure(
-        metrics_of(
-            simulated=of,
-            events={"test": MANY, "unseen": {"x": events_of(quiet_s=7200.0)}}
-            | {"held": {"y": no_events()}, "silent": {"z": NEVER}},
-        ),
-        path,
-    ),
+EVENTS = {
+    "test": MANY,
+    "unseen": {"x": events_of(quiet_s=7200.0)},
+    "held": {"y": no_events()},
+    "silent": {"z": NEVER},
 }
+ABSENT = {str(i): split_metrics([[0, 0], [i, 5]]) for i in range(5)}  # many, without a class
 
 
-@pytest.mark.parametrize("name", FIGURES)
-def test_a_figure_is_written_whole_and_says_what_is_simulated(drawn, tmp_path, name):
-    path, simulated = tmp_path / "figure.png", name != "confusion"
+def tuning_of(metrics, path):
+    results.tuning_figure(tuning(), path, simulated=metrics["simulated"])
+
+
+def features_of(metrics, path):
+    results.selected_features_figure(features(), path, simulated=metrics["simulated"])
+
+
+FIGURES = [
+    (results.confusion_figure, {}),
+    (results.confusion_figure, {"splits": ABSENT}),
+    (results.validation_figure, {"validation": [*CHOICES, RBF]}),
+    (results.reliability_figure, {"alarm": {"reliability": BY_ROLE}}),
+    (results.answers_figure, {"answers": ANSWERS}),
+    (results.events_figure, {"events": EVENTS}),
+    (tuning_of, {}),
+    (features_of, {}),
+]
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+@pytest.mark.parametrize(("draw", "more"), FIGURES, ids=lambda of: getattr(of, "__name__", ""))
+def test_a_figure_is_written_whole_and_says_what_is_simulated(
+    drawn, tmp_path, draw, more, simulated
+):
+    path = tmp_path / "figure.png"
     path.write_bytes(b"an older figure")
-    FIGURES[name](path, simulated)
+    draw(metrics_of(simulated=simulated, **more), path)
     assert_png(path)
     assert ("SIMULATED" in drawn[0].get_suptitle()) == simulated
 
@@ -324,8 +313,8 @@ def test_results_have_a_table_and_a_figure_of_all_there_is(drawn, tmp_path, caps
         timing_s={"features": 1.0},
         trained_on={"materials": ["A", "B"]},
     )
-    write_results(tmp_path / "all", everything, features())
-    print_results(everything, features())
+    results.write_results(tmp_path / "all", everything, features())
+    results.print_results(everything, features())
     out = capsys.readouterr().out
     for words in ("two of three", "asked: 80 %", "solved by eigen", "trained on materials A, B"):
         assert words in out
@@ -336,8 +325,8 @@ def test_results_have_a_table_and_a_figure_of_all_there_is(drawn, tmp_path, caps
     kept = json.loads((tmp_path / "all" / "metrics.json").read_text())
     assert kept["splits"] == everything["splits"]
     few = metrics_of(events={"test": {"two_of_three": no_events()}})
-    write_results(tmp_path / "few", few, [])
-    print_results(few, [])
+    results.write_results(tmp_path / "few", few, [])
+    results.print_results(few, [])
     assert REASON in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "few").iterdir()} == {"metrics.json", "confusion.png"}
 

@@ -74,10 +74,10 @@ def test_merged_parts_equal_the_whole_in_any_split_and_order(cuts, order, seed, 
     for part in parts:
         merged.merge(part)
     assert_same(merged, whole)
-    updated = ClassMoments(12)
+    grown = ClassMoments(12)
     for a, b in itertools.pairwise(edges):
-        updated.update(torch.from_numpy(features[a:b]), torch.from_numpy(labels[a:b]))
-        assert_same(updated, moments_of(features[:b], labels[:b]))  # also between updates
+        grown.update(torch.from_numpy(features[a:b]), torch.from_numpy(labels[a:b]))
+        assert_same(grown, moments_of(features[:b], labels[:b]))  # also between updates
 
 
 @pytest.mark.parametrize("variance", VARIANCES)
@@ -89,12 +89,10 @@ def test_a_feature_that_never_moves(variance):
     assert t_scores(moments_of(features, labels), variance).tolist() == [0, 0, math.inf]
 
 
-@given(
-    scores=st.lists(
-        st.sampled_from([0.0, 1.0, 2.5, math.inf, math.nan]) | st.floats(0, 9), min_size=1
-    ),
-    data=st.data(),
-)
+some_scores = st.sampled_from([0.0, 1.0, 2.5, math.inf, math.nan]) | st.floats(0, 9)
+
+
+@given(scores=st.lists(some_scores, min_size=1), data=st.data())
 def test_ranking_is_by_score_then_index_with_nan_last(scores, data):
     num = data.draw(st.integers(1, len(scores)))
     numbers = [i for i, score in enumerate(scores) if not math.isnan(score)]
@@ -149,52 +147,10 @@ def test_distinct_features_equal_the_definition(most_correlation, num, rng):
     """300 features: more than one block of candidates."""
     features, is_slip = families(rng, 120, 300)
     scores = rng.permutation(300) / 7
-    actual = rank_distinct(
-        torch.from_numpy(scores),
-        torch.from_numpy(features),
-        torch.from_numpy(is_slip),
-        num,
-        most_correlation,
-    )
+    given = map(torch.from_numpy, (scores, features, is_slip))
+    actual = rank_distinct(*given, num, most_correlation)
     assert actual.dtype == torch.long
     assert actual.tolist() == distinct(scores, features, is_slip, num, most_correlation)
-
-
-def test_errors():
-    one_class = moments_of(torch.randn(5, 3), torch.ones(5, dtype=torch.long))
-    with pytest.raises(ValueError, match="no non-slip bin"):
-        t_scores(one_class)
-    with pytest.raises(ValueError, match="no slip bin"):
-        t_scores(moments_of(torch.randn(5, 3), torch.zeros(5, dtype=torch.long)))
-    both = moments_of(torch.randn(5, 3), torch.tensor([0, 1, 0, 1, 1]))
-    with pytest.raises(ValueError, match="'pooled' or 'welch', got 'student'"):
-        t_scores(both, "student")
-    for num in (4, 0, -1):
-        with pytest.raises(ValueError, match=rf"1\.\.3, got {num}"):
-            rank_features(torch.zeros(3), num)
-    for shape, of_labels in [((5, 4), (5,)), ((5, 3), (4,)), ((5, 3), (5, 1)), ((5, 3), ())]:
-        with pytest.raises(ValueError, match=rf"\[N, 3\] and .*\({shape[0]}, {shape[1]}\) and \("):
-            ClassMoments(3).update(torch.zeros(shape), torch.zeros(of_labels))
-    with pytest.raises(ValueError, match=r"float64; hand float32, as the data module does"):
-        ClassMoments(3).update(torch.zeros(5, 3).double(), torch.zeros(5))
-    broken = torch.zeros(5, 3)
-    broken[4, 2] = math.nan
-    with pytest.raises(ValueError, match="got nan in row 4, column 2"):
-        ClassMoments(3).update(broken, torch.zeros(5))
-
-
-def test_errors_of_distinct_features():
-    given = torch.zeros(3), torch.zeros(5, 3), torch.zeros(5)
-    for num in (0, 4):
-        with pytest.raises(ValueError, match=rf"1\.\.3, got {num}"):
-            rank_distinct(*given, num, 0.9)
-    for share in (-0.1, 1.1, math.nan):
-        with pytest.raises(ValueError, match=rf"most_correlation must lie in 0\.\.1, got {share}"):
-            rank_distinct(*given, 2, share)
-    with pytest.raises(ValueError, match=r"\[5, 4\], got \(5, 3\)"):
-        rank_distinct(torch.zeros(4), *given[1:], 2, 0.9)
-    with pytest.raises(ValueError, match=r"\[6, 3\], got \(5, 3\)"):
-        rank_distinct(*given[:2], torch.zeros(6), 2, 0.9)
 
 
 def related(rng, num_bins=80, num_features=30):
@@ -253,31 +209,55 @@ def test_per_cost_is_the_greedy_rule(power, rng):
     needs = rng.random((40, 12)) < 0.3
     needs[5] = False  # needs nothing: free
     prices = rng.integers(1, 10_000, 12)
-    found = rank_per_cost(
-        torch.from_numpy(scores), torch.from_numpy(needs), torch.from_numpy(prices), 40, power
-    )
+    found = rank_per_cost(*map(torch.from_numpy, (scores, needs, prices)), 40, power)
     assert found.tolist() == per_cost(scores, needs, prices, 40, power)
     assert sorted(found.tolist()) == list(range(40))
 
 
-def test_errors_name_the_value():
-    scores, features = torch.ones(3), torch.ones(5, 3)
-    needs, prices = torch.ones(3, 2, dtype=torch.bool), torch.tensor([1, 2])
-    with pytest.raises(ValueError, match=r"alpha must lie in 0\.\.1, got 1\.5"):
-        rank_weighted(scores, features, 2, 1.5)
-    with pytest.raises(ValueError, match=r"expected features \[n, 3\], got \(5, 4\)"):
-        rank_weighted(scores, torch.ones(5, 4), 2)
-    with pytest.raises(ValueError, match=r"num must lie in 1\.\.3, got 4"):
-        rank_weighted(scores, features, 4)
-    with pytest.raises(ValueError, match=r"num must lie in 1\.\.3, got 0"):
-        rank_per_cost(scores, needs, prices, 0)
-    with pytest.raises(ValueError, match=r"needs \[3, 2\] of bool, got \(3, 2\) of torch.float32"):
-        rank_per_cost(scores, needs.float(), prices, 2)
-    with pytest.raises(ValueError, match="prices must be whole numbers"):
-        rank_per_cost(scores, needs, -prices, 2)
-    with pytest.raises(ValueError, match="prices must be whole numbers"):
-        rank_per_cost(scores, needs, prices.double(), 2)
-    with pytest.raises(ValueError, match=r"more than 2\^50"):
-        rank_per_cost(scores, needs, prices * 2**50, 2)
-    with pytest.raises(ValueError, match="power must not be negative, got -1"):
-        rank_per_cost(scores, needs, prices, 2, -1)
+def labelled(*labels):
+    return moments_of(torch.randn(len(labels), 3), torch.tensor(labels))
+
+
+def updated(features, labels=5):
+    return ClassMoments(3).update(features, torch.zeros(labels))
+
+
+ONES = torch.ones(3)
+BINS = torch.ones(5, 3)
+NEEDS, PRICES = torch.ones(3, 2, dtype=torch.bool), torch.tensor([1, 2])
+BROKEN = torch.zeros(5, 3).index_put((torch.tensor(4), torch.tensor(2)), torch.tensor(math.nan))
+
+
+@pytest.mark.parametrize(
+    ("call", "arguments", "message"),
+    [
+        (t_scores, [labelled(1, 1, 1)], "no non-slip bin"),
+        (t_scores, [labelled(0, 0, 0)], "no slip bin"),
+        (t_scores, [labelled(0, 1), "student"], "'pooled' or 'welch', got 'student'"),
+        (updated, [torch.zeros(5, 4)], r"\[N, 3\] and .*\(5, 4\) and \(5,\)"),
+        (updated, [BINS, 4], r"\[N, 3\] and .*\(5, 3\) and \(4,\)"),
+        (updated, [BINS, (5, 1)], r"\(5, 3\) and \(5, 1\)"),
+        (updated, [BINS, ()], r"\(5, 3\) and \(\)"),
+        (updated, [BINS.double()], r"float64; hand float32, as the data module does"),
+        (updated, [BROKEN], "got nan in row 4, column 2"),
+        *((rank_features, [ONES, num], rf"1\.\.3, got {num}") for num in (4, 0, -1)),
+        (rank_distinct, [ONES, BINS, torch.zeros(5), 0, 0.9], r"1\.\.3, got 0"),
+        *(
+            (rank_distinct, [ONES, BINS, torch.zeros(5), 2, most], rf"lie in 0\.\.1, got {most}")
+            for most in (-0.1, 1.1, math.nan)
+        ),
+        (rank_distinct, [ONES, BINS, torch.zeros(6), 2, 0.9], r"\[6, 3\], got \(5, 3\)"),
+        (rank_weighted, [ONES, BINS, 2, 1.5], r"alpha must lie in 0\.\.1, got 1\.5"),
+        (rank_weighted, [ONES, torch.ones(5, 4), 2], r"features \[n, 3\], got \(5, 4\)"),
+        (rank_weighted, [ONES, BINS, 4], r"num must lie in 1\.\.3, got 4"),
+        (rank_per_cost, [ONES, NEEDS, PRICES, 0], r"num must lie in 1\.\.3, got 0"),
+        (rank_per_cost, [ONES, NEEDS.float(), PRICES, 2], r"needs \[3, 2\] of bool, got \(3, 2\)"),
+        (rank_per_cost, [ONES, NEEDS, -PRICES, 2], "prices must be whole numbers"),
+        (rank_per_cost, [ONES, NEEDS, PRICES.double(), 2], "prices must be whole numbers"),
+        (rank_per_cost, [ONES, NEEDS, PRICES * 2**50, 2], r"more than 2\^50"),
+        (rank_per_cost, [ONES, NEEDS, PRICES, 2, -1], "power must not be negative, got -1"),
+    ],
+)
+def test_what_cannot_be_ranked_is_named(call, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        call(*arguments)

@@ -42,21 +42,13 @@ from tactslip_torch.simulation import (
     Scene,
     Sensors,
     Stroke,
+    _sensors,
     paper_scenes,
     simulate,
     simulate_many,
     timeline,
 )
 from tactslip_torch.simulation._contact import Grasp, draw_grasp, quasi_static_slips
-from tactslip_torch.simulation._sensors import (
-    Handled,
-    draw_front,
-    losses,
-    machine_runs,
-    mains_bursts,
-    partial_intervals,
-    rotation_hz,
-)
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 
 SHORT = (Stroke(40.0, 20.0, 0.6), Stroke(60.0, 20.0, 0.4))
@@ -82,10 +74,6 @@ def short(name: str, material: str, model: str, cycle: int = 0) -> Scene:
     if model == "kinematic":
         return replace(scene, tail_s=min(scene.tail_s, 10.0))
     return replace(scene, strokes=tuple(replace(s, distance_mm=20.0) for s in scene.strokes[:2]))
-
-
-MODELS = [(name, "M3", "kinematic") for name in NAMES] + [("paper", "M6", "kinematic")]
-MODELS += [(name, "M6", model) for name in ("pulled", "taps") for model in ("one", "many")]
 
 
 @pytest.mark.parametrize(
@@ -117,16 +105,22 @@ def test_windows_and_channels_equal_the_whole_recording(name, material, model):
     assert whole.abs().max() <= 5.0
 
 
-def assert_truth_is_the_contacts(scene: Scene) -> None:
+MODELS = [(name, "M3", "kinematic") for name in NAMES] + [("paper", "M6", "kinematic")]
+MODELS += [(name, "M6", model) for name in ("pulled", "taps") for model in ("one", "many")]
+
+
+@pytest.mark.parametrize(("name", "material", "model"), MODELS)
+def test_truth_is_what_the_contact_does(name, material, model):
     """Half of the load slides in each slide, and nothing does where the hand is handled."""
+    scene = short(name, material, model)
     truth, (states, _) = timeline(scene), contacts(scene)
     load, num = draw_grasp(scene).load_n, truth.num_samples
     beyond = 0.5 if scene.fidelity == "bristles" else 0.0
     sliding = sum(load[e] / load.sum() * (s.slide[:num] > beyond) for e, s in states.items())
     slides = np.any([state.slide[:num] > 0 for state in states.values()], axis=0)
     assert truth.speeds_mm_s == tuple(s.speed_mm_s for s in scene.strokes if s.moves != "both")
-    assert len(truth.onsets_s) == len(truth.sliding_s) == len(truth.annotated_onsets_s)
-    assert len(truth.onsets_s) == len(truth.speeds_mm_s)
+    of_onsets = (truth.sliding_s, truth.annotated_onsets_s, truth.speeds_mm_s)
+    assert {len(each) for each in of_onsets} == {len(truth.onsets_s)}
     for onset_s, (first_s, last_s) in zip(truth.onsets_s, truth.released_s, strict=True):
         assert first_s < onset_s <= last_s
     for start_s, end_s in truth.sliding_s:
@@ -140,17 +134,12 @@ def assert_truth_is_the_contacts(scene: Scene) -> None:
     assert np.all((bounds >= 0) & (bounds <= truth.duration_s))
 
 
-@pytest.mark.parametrize(("name", "material", "model"), MODELS)
-def test_truth_is_what_the_contact_does(name, material, model):
-    assert_truth_is_the_contacts(short(name, material, model))
-
-
 def test_a_recording_carries_truth_and_provenance_and_the_dtype_asked_for():
     scene = Scene("copper", seed=3, cycle=7, strokes=SHORT)
     truth, double = timeline(scene), simulate(scene, dtype=torch.float64)
     assert double.samples.shape == (24, truth.num_samples)
-    names = ("onsets_s", "annotated_onsets_s", "sliding_s", "speeds_mm_s", "non_slip_s")
-    for name in (*names, "released_s"):
+    names = ("onsets_s", "annotated_onsets_s", "released_s", "sliding_s", "speeds_mm_s")
+    for name in (*names, "non_slip_s"):
         assert getattr(double, name) == getattr(truth, name)
     stated = {"simulated": True, "fidelity": "kinematic", "seed": 3, "cycle": 7, "scene": "paper"}
     assert stated.items() <= double.provenance.items()
@@ -178,116 +167,113 @@ def test_paper_scenes_are_the_protocol_and_take_flat_overrides():
 # --- what is refused ----------------------------------------------------------------------------
 
 CARRY = (Stroke(40.0, 20.0, 0.5, "both"),)
-SOFT = Contact(
-    presliding_mm=(0.3, 0.3),
-    relaxation=(1.0, 1.0),
-    relaxation_time_s=(0.2, 0.2),
-    touching=("PVDF7", "PVDF9"),
-)
+RELAXED = {"relaxation": (1.0, 1.0), "relaxation_time_s": (0.2, 0.2)}
+SOFT = Contact(presliding_mm=(0.3, 0.3), touching=("PVDF7", "PVDF9"), **RELAXED)
+LOOSE = Contact(touching=("SG1",), finger_loads=(("little", 0.0),))
+HEAVY, TAPPED, GRIPPED = Handling(carried_kg=50.0), Handling(taps_per_s=1), Handling(grips_per_s=1)
 AT_ONCE = (Stroke(40.0, 20.0, 0.5), Stroke(40.0, 20.0, 0.0, "both"))
 
 
-def scene(**values):
-    return lambda: Scene("M1", **{"strokes": SHORT, **values})
-
-
-def group(kind, **values):
-    return lambda: kind(**values)
+def scene(material="M1", **values):
+    return Scene(material, **{"strokes": SHORT, **values})
 
 
 def recording(**values):
-    return lambda: simulate(Scene("M1", strokes=SHORT), **values)
+    return simulate(scene(), **values)
 
 
 def truth(**values):
-    return lambda: timeline(Scene("M1", **values))
+    return timeline(scene(**values))
 
 
 def bristles(**values):
-    return lambda: timeline(scene_on("one", "M2", **values))
+    return timeline(scene_on("one", "M2", **values))
 
 
 def surface(mu_s, mu_ratio):
-    return lambda: Material("x", mu_s, (1, 2), 10.0, mu_ratio=mu_ratio)
+    return Material("x", mu_s, (1, 2), 10.0, mu_ratio=mu_ratio)
+
+
+def machine(**values):
+    return simulate(scene_of("machine", "M1", **values))
+
+
+def extremes(kind="plain", shape=(100,)):
+    return extreme_bins(kind, shape, torch.Generator())
 
 
 REFUSED = [
-    (lambda: Scene("M7"), r"unknown material 'M7'; known are M1, .*wood"),
-    (scene(fidelity="lugre"), r"unknown fidelity 'lugre'; known are kinematic, bristles$"),
-    (scene(sample_rate_hz=0), r"sample_rate_hz must be a positive finite number, got 0"),
-    (scene(tail_s=-1), r"tail_s must be a finite number of at least 0, got -1"),
-    (scene(strokes=()), r"a scene needs a stroke, or a tail_s to rest for; it has neither"),
-    (scene(strokes=(Stroke(9, 2),)), r"stroke 1 of 2 mm is too short to slip surely"),
-    (scene(contact=Contact(mu_k=2.0)), r"mu_k must not exceed mu_s, got 2\.0 above M1's 0\.8"),
+    (scene, {"material": "M7"}, r"unknown material 'M7'; known are M1, .*wood"),
+    (scene, {"fidelity": "lugre"}, r"unknown fidelity 'lugre'; known are kinematic, bristles$"),
+    (scene, {"sample_rate_hz": 0}, r"sample_rate_hz must be a positive finite number, got 0"),
+    (scene, {"tail_s": -1}, r"tail_s must be a finite number of at least 0, got -1"),
+    (scene, {"strokes": ()}, r"needs a stroke, or a tail_s to rest for; it has neither"),
+    (scene, {"strokes": (Stroke(9, 2),)}, r"stroke 1 of 2 mm is too short to slip surely"),
+    (scene, {"contact": Contact(mu_k=2.0)}, r"mu_k must not .*, got 2\.0 above M1's 0\.8"),
+    (scene, {"contact": LOOSE}, r"no element in contact: every element .* has zero load"),
+    (scene, {"contact": Contact(touching=("SG99",))}, r"contact\.touching names \['SG99'\], which"),
+    (scene, {"faults": Faults(dead=("PVDF99",))}, r"names \['PVDF99'\], which this hand does"),
+    (Stroke, {"speed_mm_s": -3.0}, r"Stroke\.speed_mm_s must be .*, got -3"),
+    (Stroke, {"speed_mm_s": 3, "distance_mm": 0}, r"Stroke\.distance_mm must be positive, got 0"),
+    (Stroke, {"speed_mm_s": 4, "moves": "it"}, r"must be one of hand, object, both, got 'it'"),
+    (Contact, {"mu_s": -0.2}, r"Contact\.mu_s must be finite and not negative, got -0\.2"),
+    (Contact, {"mu_s": 0.5, "mu_k": 0.6}, r"not exceed mu_s, got mu_k=0\.6 and mu_s=0\.5"),
+    (Contact, {"lifted_fraction": 1}, r"lifted_fraction must be below 1, or no element is in"),
+    (Contact, {"load_n": 0}, r"load_n must be positive, or no element is in contact, got 0"),
+    (Contact, {"relaxation": (0.5, 1.5)}, r"Contact\.relaxation must be at most 1"),
+    (Sensors, {"num_bits": 1}, r"Sensors\.num_bits must be 2 to 32, got 1"),
+    (Sensors, {"pvdf_highpass_hz": 0.66}, r"pvdf_highpass_hz must be at least 2, .* got 0\.66"),
+    (Sensors, {"rail_v": 0.0}, r"Sensors\.rail_v must be positive, got 0"),
+    (Disturbances, {"burst_rate_hz": float("nan")}, r"burst_rate_hz must be finite .* got nan"),
+    (Handling, {"tap_n": (2, 1)}, r"tap_n must be \(low, high\), 0 < low <= high, got \(2, 1\)"),
+    (Faults, {"dead": ("SG1",), "saturated": ("SG1",)}, r"SG1 twice; a channel has one fault"),
+    (Faults, {"swapped": [["SG1", "SG1"]]}, r"swapped must be pairs of channels, got \(\('SG1'"),
+    (Faults, {"drop_ms": (1.0, 300.0)}, r"drop_ms must be at most 200, got \(1\.0, 300\.0\)"),
+    (Dynamics, {"step_us": 0.0}, r"Dynamics\.step_us must be in \(0, 5000\], got 0"),
+    (Dynamics, {"num_bristles": 1.5}, r"num_bristles must be a whole number of 1 or more"),
+    (surface, {"mu_s": -1, "mu_ratio": (0.8, 0.9)}, r"x: expected mu_s > 0 .* -1 and \(0\.8, 0\.9"),
     (
-        scene(contact=Contact(touching=("SG1",), finger_loads=(("little", 0.0),))),
-        r"no element in contact: every element that may touch has zero load",
+        truth,
+        {"strokes": CARRY, "handling": HEAVY},
+        r"50 kg at 0\.5 m/s2 takes 25 N, more than half",
     ),
-    (scene(contact=Contact(touching=("SG99",))), r"contact\.touching names \['SG99'\], which this"),
-    (scene(faults=Faults(dead=("PVDF99",))), r"faults names \['PVDF99'\], which this hand does"),
-    (group(Stroke, speed_mm_s=-3.0), r"Stroke\.speed_mm_s must be .*, got -3"),
-    (group(Stroke, speed_mm_s=3, distance_mm=0), r"Stroke\.distance_mm must be positive, got 0"),
-    (group(Stroke, speed_mm_s=4, moves="it"), r"moves must be one of hand, object, both, got 'it'"),
-    (group(Contact, mu_s=-0.2), r"Contact\.mu_s must be finite and not negative, got -0\.2"),
-    (group(Contact, mu_s=0.5, mu_k=0.6), r"mu_k must not exceed mu_s, got mu_k=0\.6 and mu_s=0\.5"),
-    (group(Contact, lifted_fraction=1), r"lifted_fraction must be below 1, or no element is in"),
-    (group(Contact, load_n=0), r"load_n must be positive, or no element is in contact, got 0"),
-    (group(Contact, relaxation=(0.5, 1.5)), r"Contact\.relaxation must be at most 1"),
-    (group(Sensors, num_bits=1), r"Sensors\.num_bits must be 2 to 32, got 1"),
-    (group(Sensors, pvdf_highpass_hz=0.66), r"pvdf_highpass_hz must be at least 2, .* got 0\.66"),
-    (group(Sensors, rail_v=0.0), r"Sensors\.rail_v must be positive, got 0"),
-    (group(Disturbances, burst_rate_hz=float("nan")), r"burst_rate_hz must be finite .* got nan"),
-    (group(Handling, tap_n=(2, 1)), r"tap_n must be \(low, high\), 0 < low <= high, got \(2, 1\)"),
-    (group(Faults, dead=("SG1",), saturated=("SG1",)), r"names SG1 twice; a channel has one fault"),
-    (group(Faults, swapped=[["SG1", "SG1"]]), r"swapped must be pairs of channels, got \(\('SG1'"),
-    (group(Faults, drop_ms=(1.0, 300.0)), r"drop_ms must be at most 200, got \(1\.0, 300\.0\)"),
-    (group(Dynamics, step_us=0.0), r"Dynamics\.step_us must be in \(0, 5000\], got 0"),
-    (group(Dynamics, num_bristles=1.5), r"num_bristles must be a whole number of 1 or more"),
-    (surface(-1, (0.8, 0.9)), r"x: expected mu_s > 0 and mu_ratio .* got -1 and \(0\.8, 0\.9\)"),
+    (truth, {"strokes": AT_ONCE}, r"stroke 2, and up to 1 may be left of the slide before: pause"),
+    (truth, {"strokes": (Stroke(40.0, 20.0, 0.2),), "handling": TAPPED}, r"rest long .* 0\.1 s to"),
     (
-        truth(strokes=CARRY, handling=Handling(carried_kg=50.0)),
-        r"carrying 50 kg at 0\.5 m/s2 takes 25 N, more than half of the [\d.]+ N of static",
+        truth,
+        {"strokes": (Stroke(40.0, 20.0, 1.1),), "handling": GRIPPED},
+        r"for grips of up to 1 s",
     ),
-    (truth(strokes=AT_ONCE), r"in stroke 2, and up to 1 may be left of the slide before: pause"),
-    (
-        truth(strokes=(Stroke(40.0, 20.0, 0.2),), handling=Handling(taps_per_s=1.0)),
-        r"no rest long enough for taps of up to 0\.04 s, 0\.1 s to settle and 0\.1 s",
-    ),
-    (
-        truth(strokes=(Stroke(40.0, 20.0, 1.1),), handling=Handling(grips_per_s=1.0)),
-        r"no rest long enough for grips of up to 1 s",
-    ),
-    (
-        lambda: simulate(scene_of("machine", "M1", machine_hz=(30, 50), sample_rate_hz=60.0)),
-        r"machine_hz must lie below 27 Hz at 60 samples a second, got \(30, 50\)",
-    ),
-    (bristles(step_us=300.0), r"^a whole number of steps .* take 250$"),
+    (machine, {"machine_hz": (30, 50), "sample_rate_hz": 60.0}, r"below 27 Hz .* got \(30, 50\)"),
+    (bristles, {"step_us": 300.0}, r"^a whole number of steps .* take 250$"),
     # a skin that relaxes altogether gives way to so slow an arm faster than it is stretched
+    (bristles, {"strokes": (Stroke(0.4, 0.8, 0.1),), "contact": SOFT}, r"never slides: .* 0 % of"),
     (
-        bristles(strokes=(Stroke(0.4, 0.8, 0.1),), contact=SOFT),
-        r"^stroke 1 never slides: .* 0 % of the load let go",
+        recording,
+        {"windows": [(-0.1, 0.5)]},
+        r"within the recording, 0 <= start < end .* \(-0\.1, 0",
     ),
-    (recording(windows=[(-0.1, 0.5)]), r"within the recording, 0 <= start < end .* \(-0\.1, 0\.5"),
-    (recording(windows=[(0.0, float("nan"))]), r"a window must be finite, got \(0\.0, nan\)"),
-    (recording(channels=["SG1", "SG15"]), r"unknown channels SG15; this hand has SG1, .*PVDF10"),
-    (recording(dtype=torch.int64), r"dtype must be floating, got torch\.int64"),
-    (lambda: paper_scenes(burst_rate=1), r"unknown override burst_rate; a scene has .*strokes"),
-    (lambda: paper_scenes(cycles=0), r"cycles must be a whole number of at least 1, got 0"),
-    (lambda: SimulatedRecordings(sessions=0), r"data\.sessions must be a positive .*, got 0"),
-    (lambda: simulate_many([], at_once=0), r"at_once must be a positive whole number, got 0"),
-    (lambda: simulate_many([], windows=[None]), r"expected windows of each of 0 scenes, got 1"),
+    (recording, {"windows": [(0.0, float("nan"))]}, r"a window must be finite, got \(0\.0, nan\)"),
     (
-        lambda: extreme_bins("quiet", (100,), torch.Generator()),
-        r"kind must be one of plain, .* got 'quiet'",
+        recording,
+        {"channels": ["SG1", "SG15"]},
+        r"unknown channels SG15; this hand has SG1, .*PVDF10",
     ),
-    (lambda: extreme_bins("plain", (3, 1), torch.Generator()), r"two samples, got shape \(3, 1\)"),
+    (recording, {"dtype": torch.int64}, r"dtype must be floating, got torch\.int64"),
+    (paper_scenes, {"burst_rate": 1}, r"unknown override burst_rate; a scene has .*strokes"),
+    (paper_scenes, {"cycles": 0}, r"cycles must be a whole number of at least 1, got 0"),
+    (SimulatedRecordings, {"sessions": 0}, r"data\.sessions must be a positive .*, got 0"),
+    (simulate_many, {"scenes": [], "at_once": 0}, r"at_once must be a positive whole .*, got 0"),
+    (simulate_many, {"scenes": [], "windows": [None]}, r"windows of each of 0 scenes, got 1"),
+    (extremes, {"kind": "quiet"}, r"kind must be one of plain, .* got 'quiet'"),
+    (extremes, {"shape": (3, 1)}, r"two samples, got shape \(3, 1\)"),
 ]
 
 
-@pytest.mark.parametrize(("call", "message"), REFUSED, ids=[message for _, message in REFUSED])
-def test_what_cannot_be_is_refused_in_one_line(call, message):
-    with pytest.raises(ValueError, match=message) as refusal:
-        call()
+@pytest.mark.parametrize(("make", "values", "said"), REFUSED, ids=[row[2] for row in REFUSED])
+def test_what_cannot_be_is_refused_in_one_line(make, values, said):
+    with pytest.raises(ValueError, match=said) as refusal:
+        make(**values)
     assert "\n" not in str(refusal.value)
 
 
@@ -380,9 +366,6 @@ def test_a_batch_in_float32_or_by_the_eager_engine_is_the_same_to_rounding():
         for one, other in zip(simulate_many(scenes, **options), exact, strict=True):
             assert (one.samples - other.samples).abs().max() < tolerance
             np.testing.assert_allclose(one.onsets_s, other.onsets_s, atol=1e-4)
-    assert all(
-        torch.equal(simulate(s).samples, e.samples) for s, e in zip(scenes, exact, strict=True)
-    )
 
 
 @pytest.mark.skipif(bool(native.why_not()), reason=native.why_not())
@@ -404,18 +387,14 @@ def test_provenance_and_keys_name_the_backend_of_bristles(monkeypatch):
         assert Scene.from_dict(keys[0]) == replace(scene, fidelity=fidelity)
 
 
-@pytest.fixture(scope="module", params=BRISTLES)
-def bristle_recordings(request):
-    scenes = paper_scenes(cycles=3, materials=SEEN_MATERIALS, **CONTACTS[request.param])
-    recordings = {material: [] for material in SEEN_MATERIALS}
-    for recording in simulate_many(scenes):
-        recordings[recording.material].append(filtered(recording, HAND))
-    return request.param, recordings
-
-
 @pytest.mark.slow
-def test_bristles_look_as_the_paper_describes_and_shuffled_signals_do_not(bristle_recordings):
-    model, recordings = bristle_recordings
+@pytest.mark.parametrize("model", BRISTLES)
+def test_bristles_look_as_the_paper_describes_and_shuffled_signals_do_not(model):
+    recordings = {material: [] for material in SEEN_MATERIALS}
+    for recorded in simulate_many(
+        paper_scenes(cycles=2, materials=SEEN_MATERIALS, **CONTACTS[model])
+    ):
+        recordings[recorded.material].append(filtered(recorded, HAND))
     spoilt = changed(recordings, shuffled)
     for name, check in BY_NAME.items():
         if (model, name) == ("many", "pvdf_abrupt"):  # a patch lets go gently; shuffled it is 1
@@ -458,7 +437,11 @@ def harmonic_power(samples: np.ndarray, hertz: float, orders: tuple[int, ...]) -
 
 def test_a_machine_runs_at_its_lines_and_stands_still_between():
     wave, scene = added("machine", "M3", "machine_mv"), scene_of("machine", "M3")
-    runs, hertz, orders = machine_runs(scene), rotation_hz(scene), (1, 2, 3, 4, 6, 8)
+    runs, hertz, orders = (
+        _sensors.machine_runs(scene),
+        _sensors.rotation_hz(scene),
+        (1, 2, 3, 4, 6, 8),
+    )
     running = is_within(runs, wave.shape[1])
     assert 0.2 < running.mean() < 0.95
     assert np.abs(wave[:, ~running]).max() < 1e-7
@@ -478,7 +461,7 @@ def test_mains_bursts_are_mains_and_only_in_their_intervals():
     burst = added("mains_bursts", "M3", "mains_bursts_per_s", **often)
     hum = added("mains_bursts", "M3", "mains_mv", **often)  # the bursts stay
     scene = scene_of("mains_bursts", "M3", **often)
-    bursts = mains_bursts(scene)
+    bursts = _sensors.mains_bursts(scene)
     assert 5 < len(bursts) < 30  # 15 expected
     lengths = np.diff(bursts)
     assert 0.1 <= lengths.min() < lengths.max() <= 1.0
@@ -539,7 +522,7 @@ def test_faults_change_the_file_and_leave_the_truth_alone(name):
         assert np.array_equal(alone[one], sound[one])
         assert np.isnan(alone[other]).all()
     else:  # samples are lost: the last one is repeated
-        lost = {i for span in losses(scene, sound.shape[1]) for i in range(*span)}
+        lost = {i for span in _sensors.losses(scene, sound.shape[1]) for i in range(*span)}
         assert lost
         for index in sorted(lost):
             sound[:, index] = sound[:, index - 1]
@@ -612,7 +595,7 @@ def test_a_tap_is_a_half_sine_in_the_sg_channels_and_nothing_outside():
     felt = added("taps", "M3", "taps_per_s", onset_pulse_v=0.0)
     scene = scene_of("taps", "M3")
     grasp, time_s = draw_grasp(scene), np.arange(felt.shape[1]) / RATE_HZ
-    taps, forces = Handled(scene, grasp).taps, np.zeros((len(grasp.load_n), len(time_s)))
+    taps, forces = _sensors.Handled(scene, grasp).taps, np.zeros((len(grasp.load_n), len(time_s)))
     for tap in taps:
         length_s = tap.end_s - tap.start_s
         assert 0.005 <= length_s <= 0.040
@@ -620,7 +603,7 @@ def test_a_tap_is_a_half_sine_in_the_sg_channels_and_nothing_outside():
         half_sine = np.where((phase > 0) & (phase < 1), np.sin(np.pi * phase), 0.0)
         forces += tap.size[:, None] * half_sine
     assert len(taps) >= 3
-    expected = 0.2 * (draw_front(scene).gain[:, None] * forces[grasp.element_of_channel])
+    expected = 0.2 * (_sensors.draw_front(scene).gain[:, None] * forces[grasp.element_of_channel])
     lasting = sosfiltfilt(butter(2, 30.0, fs=RATE_HZ, output="sos"), felt - expected)
     assert np.abs(lasting[SLOW]).max() < 0.02 * expected[SLOW].max()  # the knock's rest
     away = ~is_within(timeline(scene).non_slip_s, felt.shape[1])
@@ -635,11 +618,11 @@ def test_a_grip_raises_the_sg_channels_stays_and_comes_back():
     changes = {"cycle": 1, "grips_per_s": 0.6}
     felt, scene = added("grips", "M3", "grips_per_s", **changes), scene_of("grips", "M3", **changes)
     grasp, (states, _) = draw_grasp(scene), contacts(scene)
-    down, gain, num = touching(grasp), draw_front(scene).gain, felt.shape[1]
+    down, gain, num = touching(grasp), _sensors.draw_front(scene).gain, felt.shape[1]
     assert felt[SLOW].min() > -1e-7  # never below
     assert np.abs(felt[SLOW][:, ~is_within(timeline(scene).non_slip_s, num)]).max() < 1e-7
     assert np.all(felt[~down] == 0)
-    grips = Handled(scene, grasp).grips
+    grips = _sensors.Handled(scene, grasp).grips
     alone = [
         g for g in grips if all(o is g or o.start_s > g.end_s or o.end_s < g.start_s for o in grips)
     ]
@@ -681,7 +664,7 @@ def test_a_finger_that_slips_alone_is_heard_at_rest_and_a_finger_that_sticks_fal
     plain = volts(replace(scene, imperfections=Imperfections()))
     changed, truth, down = volts(scene) - plain, timeline(scene), touching(draw_grasp(scene))
     fingers = np.array([channel.finger for channel in scene.hand.channels])
-    spans = {finger: partial_intervals(scene, finger) for finger in sorted(set(fingers))}
+    spans = {finger: _sensors.partial_intervals(scene, finger) for finger in sorted(set(fingers))}
     slide_s, heard, silent = truth.sliding_s[0], 0, 0
     for finger, intervals in spans.items():
         films = np.flatnonzero((fingers == finger) & down)

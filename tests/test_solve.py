@@ -8,18 +8,11 @@ import mpmath
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from tactslip_torch.model import fit
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine, held_out_scores
-from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, RadialBasis
+from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, RadialBasis
 from tactslip_torch.model.solve import solve_symmetric
-
-
-def with_spectrum(rng, values):
-    basis = np.linalg.qr(rng.standard_normal((len(values), len(values))))[0]
-    matrix = (basis * values) @ basis.T
-    return (matrix + matrix.T) / 2
 
 
 def singular(rng, num, rank):
@@ -163,28 +156,45 @@ def test_a_number_that_is_none_is_named(penalty, rng):
     right[7] = np.nan
     with pytest.raises(ValueError, match=r"^right-hand side of gram must be .* nan at \[7\]"):
         solve_symmetric(*tensors(matrix, right), penalty, name="gram")
-    apart = np.array([[1e-300, 1e300], [1e300, 1e-300]])
-    with pytest.raises(ValueError, match="overflows float64; scale the features"):
-        solve_symmetric(*tensors(apart, np.ones(2)), np.inf)
 
 
-def test_what_cannot_be_solved_is_refused_in_one_line(rng):
-    right = rng.standard_normal(40)
-    negative = with_spectrum(rng, np.r_[-0.5, np.ones(39)])
-    for penalty in (1e3, np.inf):
-        with pytest.raises(ValueError, match=r"not positive semi-definite: .* -0.5 beside 1;"):
-            solve_symmetric(*tensors(negative, right), penalty)
-    for penalty in (0.0, -1.0, np.nan, 1e-320):
-        with pytest.raises(ValueError, match=rf"positive, and so large .*, got {penalty}"):
-            solve_symmetric(torch.eye(2).double(), torch.ones(2).double(), penalty)
-    steep = with_spectrum(rng, np.geomspace(1e-20, 1, 40))
-    with pytest.raises(ValueError, match=r"rank \d+ of 40 and a condition of \d\.\de\+1[345]"):
-        solve_symmetric(*tensors(steep, right), np.inf)
-    limited = {"penalty": 1e9, "name": "gram"}
-    known = with_spectrum(rng, np.geomspace(1e-6, 1, 40))
-    solve_symmetric(*tensors(known, right), **limited, most_condition=1e8)
-    with pytest.raises(ValueError, match=r"^gram \+ I/C at penalty=1e\+09 .*to 1e\+04; lower"):
-        solve_symmetric(*tensors(known, right), **limited, most_condition=1e4)
+BASIS = np.linalg.qr(np.random.default_rng(0).standard_normal((40, 40)))[0]
+NEGATIVE = (BASIS * np.r_[-0.5, np.ones(39)]) @ BASIS.T
+STEEP = (BASIS * np.geomspace(1e-20, 1, 40)) @ BASIS.T
+KNOWN = (BASIS * np.geomspace(1e-6, 1, 40)) @ BASIS.T
+APART = np.array([[1e-300, 1e300], [1e300, 1e-300]])
+SMALL = 1e-312 * np.eye(2)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "penalty", "options", "message"),
+    [
+        *(
+            (NEGATIVE, c, {}, r"not positive semi-definite: .* -0.5 beside 1;")
+            for c in (1e3, np.inf)
+        ),
+        *(
+            (np.eye(2), c, {}, rf"positive, and so large .*, got {c}")
+            for c in (0.0, -1.0, np.nan, 1e-320)
+        ),
+        (STEEP, np.inf, {}, r"rank \d+ of 40 and a condition of \d\.\de\+1[345]"),
+        (KNOWN, 1e9, {"most_condition": 1e4}, r"^gram \+ I/C at penalty=1e\+09 .*to 1e\+04; lower"),
+        (APART, np.inf, {}, "overflows float64; scale the features"),
+        (SMALL, np.inf, {}, r"solution for gram leaves float64: an entry is (inf|nan);"),
+    ],
+)
+def test_what_cannot_be_solved_is_refused_in_one_line(matrix, penalty, options, message):
+    right = np.ones(len(matrix)) - 2.0 * (np.arange(len(matrix)) % 2)
+    with pytest.raises(ValueError, match=message) as caught:
+        solve_symmetric(*tensors(matrix, right), penalty, name="gram", **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_condition_is_refused_beyond_its_limit_alone_and_float32_always():
+    right = torch.ones(40).double()
+    solve_symmetric(*tensors(KNOWN), right, 1e9, most_condition=1e8)
+    with pytest.raises(ValueError, match=r"expected gram in float64, got torch.float32"):
+        solve_symmetric(torch.eye(40), right, 1.0, name="gram")
 
 
 def test_a_light_bin_is_no_noise():
@@ -198,33 +208,21 @@ def test_a_light_bin_is_no_noise():
         solve_symmetric(twice, torch.tensor([1.0, -1.0, 1.0]).double(), np.inf, weights)
 
 
-def test_what_leaves_float64_or_is_none_is_refused():
-    right = torch.tensor([1e5, -1e5]).double()
-    with pytest.raises(
-        ValueError, match=r"solution for gram leaves float64: an entry is (inf|nan);"
-    ):
-        solve_symmetric(1e-307 * torch.eye(2).double(), right, np.inf, name="gram")
-    with pytest.raises(ValueError, match=r"expected gram in float64, got torch.float32"):
-        solve_symmetric(torch.eye(2), right, 1.0, name="gram")
-
-
 CUBIC, RADIAL, LINE = Polynomial(3), RadialBasis(0.4), Polynomial(1, 0.7)
 GROUPS = ("bins", "cycles", "materials", "mixed")
 
 
-def draw(
-    rng: np.random.Generator, num_bins: int, num_features: int = 3, weighted: bool = False
-) -> TrainingBins:
+def draw(rng, num_bins, num_features=3, weighted=False):
     """Noisy labels of both classes everywhere, so that no fold loses one."""
     z = rng.uniform(-1, 1, (num_bins, num_features))
     is_slip = (z[:, 0] - z[:, 1] ** 2 + 0.3 * rng.normal(size=num_bins) > -0.2).copy()
     first = min(8, num_bins)
     is_slip[:first] = np.arange(first) // 2 % 2 == 0
     weights = torch.from_numpy(rng.uniform(0.2, 3, num_bins)) if weighted else None
-    return TrainingBins(torch.from_numpy(z), torch.from_numpy(is_slip), weights)
+    return TrainingBins(*tensors(z, is_slip), weights)
 
 
-def grouped(rng: np.random.Generator, num_bins: int, kind: str) -> Tensor:
+def grouped(rng, num_bins, kind):
     """Groups in no order, with names that are not 0, 1, 2, ..."""
     if kind == "bins":
         groups = np.arange(num_bins)
@@ -238,13 +236,13 @@ def grouped(rng: np.random.Generator, num_bins: int, kind: str) -> Tensor:
     return torch.from_numpy(rng.permutation(7 * groups - 20))
 
 
-def gram(kernel: Kernel, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def gram(kernel, a, b):
     if isinstance(kernel, RadialBasis):
         return np.exp(-kernel.gamma * ((a[:, None] - b[None]) ** 2).sum(-1))
     return (a @ b.T + kernel.offset) ** kernel.degree
 
 
-def refitted(bins: TrainingBins, groups: Tensor, penalty: float, kernel: Kernel) -> np.ndarray:
+def refitted(bins, groups, penalty, kernel):
     """Delete the group, solve, predict."""
     z, t, g = bins.features.numpy(), np.where(bins.is_slip, 1.0, -1.0), groups.numpy()
     w = np.ones(len(z)) if bins.weights is None else bins.weights.numpy()
@@ -256,9 +254,7 @@ def refitted(bins: TrainingBins, groups: Tensor, penalty: float, kernel: Kernel)
     return scores
 
 
-def assert_refits(
-    bins: TrainingBins, groups: Tensor, penalty: float, kernel: Kernel = PAPER_KERNEL
-) -> None:
+def assert_refits(bins, groups, penalty, kernel=PAPER_KERNEL):
     fit = HeldOut(bins, groups, kernel).at(penalty)
     expected = refitted(bins, groups, penalty, kernel)
     scale = max(1.0, np.abs(expected).max())

@@ -66,17 +66,19 @@ def test_the_highest_level_is_pywavelets(wavelet):
 
 
 @pytest.mark.parametrize(
-    ("num_samples", "options", "message"),
+    ("function", "num_samples", "options", "message"),
     [
-        (100, {"level": 5}, r"1\.\.4.*100 samples.*got 5"),
-        (50, {}, r"1\.\.3.*50 samples.*got 4"),
-        (100, {"wavelet": "rbio9.9"}, r"rbio9\.9"),
-        (9, {"level": 1}, r"bins of 9 samples .* rbio2\.2, which needs 10; use longer"),
+        (wavelet_branches, 100, {"level": 5}, r"1\.\.4.*100 samples.*got 5"),
+        (wavelet_branches, 50, {}, r"1\.\.3.*50 samples.*got 4"),
+        (wavelet_branches, 100, {"wavelet": "rbio9.9"}, r"rbio9\.9"),
+        (wavelet_branches, 9, {"level": 1}, r"9 samples .* rbio2\.2, which needs 10; use longer"),
+        (amplitude_spectrum, 1, {}, "at least two samples, got 1"),
+        (amplitude_spectrum, 100, {"method": "welch"}, "'reference' or 'clean', got 'welch'"),
     ],
 )
-def test_errors_name_the_value(num_samples, options, message):
+def test_errors_name_the_value(function, num_samples, options, message):
     with pytest.raises(ValueError, match=message):
-        wavelet_branches(torch.zeros(num_samples), **options)
+        function(torch.zeros(num_samples), **options)
 
 
 # --- filters without a name ---------------------------------------------------------------------
@@ -146,8 +148,7 @@ def test_spectrum_matrix_and_axis_equal_numpys(method, num_samples, rng):
         x = make(rng, 5, num_samples)
         expected = np.stack([oracles.amplitude_spectrum(one, method) for one in x])
         oracles.assert_columns_close(amplitude_spectrum(torch.from_numpy(x), method), expected)
-        matrix = spectrum_matrix(num_samples, method)
-        lines = matrix @ torch.from_numpy(x).to(torch.complex128).T
+        lines = spectrum_matrix(num_samples, method) @ torch.from_numpy(x).to(torch.complex128).T
         oracles.assert_columns_close(lines.abs().T, expected)
     axis = frequency_axis_hz(num_samples, 2000.0, method)
     exact = oracles.frequency_axis_hz(num_samples, 2000.0, method)
@@ -168,13 +169,6 @@ def test_spectrum_manners(method, rng, device):
     assert silence.grad.isfinite().all()
 
 
-def test_spectrum_errors_name_the_value():
-    with pytest.raises(ValueError, match="at least two samples, got 1"):
-        amplitude_spectrum(torch.zeros(3, 1))
-    with pytest.raises(ValueError, match="'reference' or 'clean', got 'welch'"):
-        amplitude_spectrum(torch.zeros(100), "welch")
-
-
 # --- another rate -------------------------------------------------------------------------------
 
 RATES = [(2000.0, 1000.0), (1000.0, 2000.0), (2000.0, 48.0), (92.3, 100.0), (2000.0, 2048.0)]
@@ -185,25 +179,21 @@ def tone(hz, rate_hz, num, phase=0.7, offset=0.0):
     return (offset + torch.sin(2 * math.pi * hz * times_s + phase))[None]
 
 
-def middle(x, margin):
-    return x[..., margin:-margin]
-
-
 @pytest.mark.parametrize(("from_hz", "to_hz"), RATES)
 @pytest.mark.parametrize("part", [0.03, 0.8])
 def test_a_tone_below_half_the_lower_rate_keeps_amplitude_and_phase(from_hz, to_hz, part):
     hz, low = part * min(from_hz, to_hz) / 2, min(from_hz, to_hz)
     found = resample(tone(hz, from_hz, round(200 * from_hz / low), offset=3.0), from_hz, to_hz)
     expected = tone(hz, to_hz, found.shape[-1], offset=3.0)
-    assert middle(found - expected, math.ceil(10 * to_hz / low) + 1).abs().max() < 5e-3
+    ends = math.ceil(10 * to_hz / low) + 1
+    assert (found - expected)[:, ends:-ends].abs().max() < 5e-3
 
 
 @pytest.mark.parametrize(("from_hz", "to_hz"), [(2000.0, 100.0), (100.0, 61.0)])
-@pytest.mark.parametrize("part", [1.2])
-def test_a_tone_above_half_the_new_rate_does_not_fold_back(from_hz, to_hz, part):
-    hz = part * to_hz / 2
+def test_a_tone_above_half_the_new_rate_does_not_fold_back(from_hz, to_hz):
+    hz = 1.2 * to_hz / 2
     found = resample(tone(hz, from_hz, round(200 * from_hz / to_hz)), from_hz, to_hz)
-    assert middle(found, 11).abs().max() < 5e-3
+    assert found[:, 11:-11].abs().max() < 5e-3
     every = tone(hz, from_hz, 4000)[:, :: round(from_hz / to_hz)]
     assert every.abs().max() > 0.5  # left out samples alone would have folded it
 
@@ -223,7 +213,7 @@ def test_away_from_the_ends_it_is_scipys_and_the_same_rate_is_a_copy(rng):
     x = torch.from_numpy(rng.standard_normal((3, 400)))
     x -= x.mean(-1, keepdim=True)
     expected = scipy.signal.resample_poly(x.numpy(), 3, 5, axis=-1)
-    ours = middle(resample(x, 500.0, 300.0), 10)
+    ours = resample(x, 500.0, 300.0)[:, 10:-10]
     np.testing.assert_allclose(ours, expected[:, 10:-10], rtol=0, atol=1e-13)
     same = resample(x, 92.3, 92.3)
     assert torch.equal(same, x)
