@@ -19,7 +19,6 @@ from tactslip_torch.onset.events import (
 
 LATENCY = LatencyParts(look_ahead_s=0.0125, bin_s=0.05)
 RULES = EventRules(settle_s=0.1)
-QUICK = {"num_resamples": 50}
 
 
 def watched(alarms=(), onsets=(1.0,), slides=None, speeds=None, **more):
@@ -30,17 +29,14 @@ def watched(alarms=(), onsets=(1.0,), slides=None, speeds=None, **more):
     return Watched(**(facts | more))
 
 
-def event_metrics(many, rules, latency):
-    return pooled_metrics([recording_events(one, rules, latency) for one in many], **QUICK)
+def events_of(one, rules=RULES):
+    return recording_events(one, rules, LATENCY)
 
 
-def outcomes(*args, rules=RULES, **more):
-    events = recording_events(watched(*args, **more), rules, LATENCY)
-    return [onset.outcome for onset in events.onsets]
-
-
-def false_alarms(*args, rules=RULES, **more):
-    return recording_events(watched(*args, **more), rules, LATENCY).false_alarms_s
+def metrics_of(*events):
+    metrics = pooled_metrics(events, num_resamples=50)
+    json.dumps(metrics, allow_nan=False)
+    return metrics
 
 
 # By loops ----------------------------------------------------------------------------------------
@@ -148,36 +144,37 @@ def by_loops(made, found=500, early=200, settle=100):
     return told, false, quiet
 
 
-def test_every_onset_and_alarm_is_judged_as_the_loops_do(rng):
-    seen = Counter()
-    for number in range(80):
-        made = random_recording(rng, number)
-        told, false, quiet = by_loops(made)
-        events = recording_events(as_watched(made), RULES, LATENCY)
+@pytest.fixture(scope="module")
+def many():
+    """Recordings, what the loops say of each, and its events."""
+    rng = np.random.default_rng(0)
+    made = [random_recording(rng, number) for number in range(80)]
+    return [(one, by_loops(one), events_of(as_watched(one))) for one in made]
+
+
+def test_every_onset_and_alarm_counts_as_the_loops_say(many):
+    for made, (told, false, quiet), events in many:
         got = [(o.outcome, o.num_alarms) for o in events.onsets]
         assert got == [(outcome, num) for outcome, num, _ in told], made
         for onset, (_, _, delay) in zip(events.onsets, told, strict=True):
             assert onset.delay_s == delay / 1000 if delay is not None else math.isnan(onset.delay_s)
         assert [round(1000 * alarm) for alarm in events.false_alarms_s] == false, made
         assert events.quiet_s == pytest.approx(quiet / 1000, abs=1e-9), made
-        seen.update(outcome for outcome, _, _ in told)
-    assert min(seen[outcome] for outcome in ("found", "early", "missed")) >= 3
 
 
-def test_numbers_of_many_are_sums_of_what_the_loops_count(rng):
-    made = [random_recording(rng, number) for number in range(60)]
-    told = [by_loops(one) for one in made]
-    metrics = event_metrics([as_watched(one) for one in made], RULES, LATENCY)
-    onsets = [onset for one, _, _ in told for onset in one]
+def test_numbers_of_many_are_sums_of_what_the_loops_count(many):
+    metrics = metrics_of(*(events for _, _, events in many))
+    onsets = [onset for _, (told, _, _), _ in many for onset in told]
     counts = Counter(outcome for outcome, _, _ in onsets)
     for outcome in ("found", "early", "missed"):
-        assert metrics[f"num_{outcome}"] == counts[outcome] > 0
+        assert metrics[f"num_{outcome}"] == counts[outcome] > 2
         assert metrics[outcome]["value"] == pytest.approx(counts[outcome] / len(onsets))
     assert metrics["num_onsets"] == len(onsets) == sum(counts.values())
-    false, quiet_ms = sum(len(f) for _, f, _ in told), sum(q for _, _, q in told)
+    false = sum(len(false) for _, (_, false, _), _ in many)
+    minutes = sum(quiet for _, (_, _, quiet), _ in many) / 6e4
     assert metrics["num_false_alarms"] == false
-    assert metrics["quiet_hours"] == pytest.approx(quiet_ms / 3.6e6)
-    assert metrics["false_alarms_per_minute"]["value"] == pytest.approx(false / (quiet_ms / 6e4))
+    assert metrics["quiet_hours"] == pytest.approx(minutes / 60)
+    assert metrics["false_alarms_per_minute"]["value"] == pytest.approx(false / minutes)
     per_hour = {end: 60 * v for end, v in metrics["false_alarms_per_minute"].items()}
     assert metrics["false_alarms_per_hour"] == pytest.approx(per_hour)
     alarms = sum(num for _, num, _ in onsets)
@@ -187,52 +184,48 @@ def test_numbers_of_many_are_sums_of_what_the_loops_count(rng):
     assert metrics["delay_ms"]["p95"]["value"] == pytest.approx(np.quantile(delays, 0.95))
     steps = np.quantile(delays, np.arange(21) / 20)
     np.testing.assert_allclose(metrics["delay_ms"]["quantiles"], steps, rtol=1e-12)
-    json.dumps(metrics, allow_nan=False)
 
 
 def test_rounding_moves_no_alarm_over_an_edge():
     assert 0.9 < 1.1 - 0.2  # as floats see it
-    assert outcomes([0.9], [1.1]) == ["early"]
     assert 0.18 + 0.5 < 0.68
-    assert outcomes([0.68], [0.18]) == ["found"]
+    for alarm, onset, outcome in ((0.9, 1.1, "early"), (0.68, 0.18, "found")):
+        (found,) = events_of(watched([alarm], [onset])).onsets
+        assert found.outcome == outcome
 
 
 def test_the_settling_time_is_of_bin_and_look_ahead_unless_it_is_given():
     last = 3.0 + 0.05 + 0.0125 + 0.05
-    for alarm, expected in ((last, ()), (last + 1e-6, (last + 1e-6,))):
-        assert false_alarms([alarm], rules=EventRules()) == expected
-    assert false_alarms([3.3], rules=EventRules(settle_s=0.4)) == ()
+    false = events_of(watched([last, last + 1e-6]), EventRules()).false_alarms_s
+    assert false == (last + 1e-6,)
+    assert events_of(watched([3.3]), EventRules(settle_s=0.4)).false_alarms_s == ()
 
 
 # The numbers -------------------------------------------------------------------------------------
 
 
 def test_nothing_to_say_is_none_and_never_a_quotient_of_zeros():
-    no_time = watched([1.1], watched_s=((0.9, 2.0),))
-    metrics = event_metrics([no_time], RULES, LATENCY)
+    metrics = metrics_of(events_of(watched([1.1], watched_s=((0.9, 2.0),))))  # at no quiet time
     assert metrics["false_alarms_per_minute"] is metrics["false_alarms_per_hour"] is None
     assert metrics["found"]["value"] == 1.0
-    no_onset = watched([1.1, 2.2], ())
-    metrics = event_metrics([no_onset], RULES, LATENCY)
+    metrics = metrics_of(events_of(watched([1.1, 2.2], ())))  # without an onset
     names = ("found", "early", "missed", "alarms_per_slip", "delay_ms", "latency_ms")
     names += ("onset_error_ms", "delay_first_ms", "slid_mm")
     assert [metrics[name] for name in names] == [None] * 9
     assert metrics["false_alarms_per_minute"]["value"] == pytest.approx(12.0)
     assert metrics["per_speed"] == {}
-    missed = event_metrics([watched()], RULES, LATENCY)
+    missed = metrics_of(events_of(watched()))
     assert missed["missed"]["value"] == 1.0
     assert missed["delay_ms"] is missed["latency_ms"] is None
-    nothing = pooled_metrics([], **QUICK)
+    nothing = metrics_of()
     assert nothing["num_recordings"] == 0
     assert nothing["found"] is nothing["false_alarms_per_hour"] is None
-    for one in (metrics, missed, nothing):
-        json.dumps(one, allow_nan=False)
 
 
 @pytest.mark.parametrize("positive", [(), (math.nan,), (1.4,)], ids=["unknown", "none", "later"])
 def test_without_a_decision_before_the_alarm_all_of_the_delay_is_bin_fill(positive):
     one = watched([1.3], first_positive_s=positive)
-    (onset,) = recording_events(one, RULES, LATENCY).onsets
+    (onset,) = events_of(one).onsets
     assert (onset.delay_s, onset.decision_s) == (0.3, 0.0)
     assert onset.bin_fill_s == pytest.approx(0.3 - 0.0125)
 
@@ -255,7 +248,7 @@ def test_delays_from_the_onset_and_the_first_release(
     found = [onset.delay_s, onset.delay_first_s, onset.slid_mm, onset.bin_fill_s, onset.decision_s]
     assert found == pytest.approx([delay, first, slid, fill, decision], abs=1e-12)
     assert LATENCY.look_ahead_s + fill + decision == pytest.approx(delay)
-    metrics = pooled_metrics([events], **QUICK)
+    metrics = metrics_of(events)
     for name, value in (("delay_ms", 1000 * delay), ("delay_first_ms", 1000 * first)):
         assert metrics[name]["median"]["value"] == pytest.approx(value)
     assert metrics["slid_mm"]["p95"]["value"] == pytest.approx(slid, abs=1e-12)
@@ -268,9 +261,8 @@ def test_delays_from_the_onset_and_the_first_release(
 def test_the_same_recording_of_two_detectors_is_drawn_as_one():
     """Else pooling a recording with itself would make its intervals narrower."""
     many = [watched([1.0 + 0.01 * n], recording=str(n)) for n in range(1, 12)]
-    events = [recording_events(one, RULES, LATENCY) for one in many]
-    once = pooled_metrics(events, **QUICK)
-    twice = pooled_metrics([*events, *events], **QUICK)
+    events = [events_of(one) for one in many]
+    once, twice = metrics_of(*events), metrics_of(*events, *events)
     assert twice["num_recordings"] == once["num_recordings"] == 11
     assert twice["num_onsets"] == 2 * once["num_onsets"]
     median = twice["delay_ms"]["median"]

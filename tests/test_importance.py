@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from sklearn.metrics import balanced_accuracy_score
 from small_detector import HAND, raw_bins, small_detector
 from test_commands import BAD_INPUT, TINY, composed
 
@@ -66,23 +67,10 @@ def ranking_of(refit, num_features=6, allowed=None, most_correlation=1.0):
 # Accuracy and its draws --------------------------------------------------------------------------
 
 
-def by_hand(is_right, bins, recordings):
-    """Mean over groups of the mean of both recalls, bin by bin; recordings as often as named."""
-    means = []
-    for group in sorted(set(bins.group.tolist())):
-        recalls = []
-        for value in (False, True):
-            hits = [
-                bool(is_right[i])
-                for recording in recordings
-                for i in range(len(bins.is_slip))
-                if bins.recording[i] == recording
-                and bins.group[i] == group
-                and bool(bins.is_slip[i]) is value
-            ]
-            recalls.append(sum(hits) / len(hits))
-        means.append(sum(recalls) / 2)
-    return sum(means) / len(means)
+def by_sklearn(scores, bins):
+    """Mean over groups of the balanced accuracy of each."""
+    groups = [bins.group == group for group in bins.group.unique()]
+    return np.mean([balanced_accuracy_score(bins.is_slip[g], scores[g] >= 0) for g in groups])
 
 
 def test_a_paired_interval_is_nothing_between_equals_and_holds_the_difference():
@@ -113,7 +101,7 @@ def test_a_result_is_that_of_machines_fitted_without_each_group():
             own = train.group == group
             rest = TrainingBins(z[~own], train.is_slip[~own], refit.weights[~own])
             scores[own] = fit_machine(rest, penalty)(z[own])
-        accuracy = by_hand((scores >= 0) == train.is_slip, train, range(len(train.recording_names)))
+        accuracy = by_sklearn(scores, train)
         error = refit.weights @ (torch.where(train.is_slip, 1.0, -1.0) - scores).square()
         merit = (accuracy, -float(error / refit.weights.sum()))
         if best is None or merit > best[0]:

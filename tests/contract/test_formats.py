@@ -586,35 +586,32 @@ def test_parquet_tables(tmp_path, rows):
 # Messages: MCAP and rosbag2 --------------------------------------------------------------------
 
 
+def in_mcap(*how):
+    return lambda folder, topics: write_mcap(folder / "a.mcap", topics, How(*how))
+
+
+def in_bag(*how):
+    return lambda folder, topics: write_bag(folder / "bag", topics, *how)
+
+
 @pytest.mark.parametrize(
-    ("packing", "is_chunked", "is_indexed"),
-    [("none", False, False), ("none", True, True), ("lz4", True, False), ("zstd", True, True)],
+    "written",
+    [
+        *(in_mcap("none", False, False), in_mcap("none"), in_mcap("lz4", True, False), in_mcap()),
+        *(in_bag(), in_bag("sqlite3", "message"), in_bag("mcap"), in_bag("mcap", "storage")),
+    ],
 )
-def test_stamped_messages_in_mcap(tmp_path, packing, is_chunked, is_indexed):
+def test_stamped_messages(tmp_path, written):
     sent, values = wrenches(500)
-    path = write_mcap(tmp_path / "a.mcap", [sent], How(packing, is_chunked, is_indexed))
+    path = written(tmp_path, [Sent("/rosout", WRENCH, sent.messages[:3]), sent])
     samples, names, since, _ = read(path)
     np.testing.assert_array_equal(samples, values)
     assert names[:2] == ("wrench.force.x", "wrench.force.y")
-    np.testing.assert_array_equal(
-        since, np.arange(500) * STEP_NS / 1e9
-    )  # though stamps are of 2023
+    stamps_s = np.arange(500) * STEP_NS / 1e9  # though those of the file are of 2023
+    np.testing.assert_array_equal(since, stamps_s)
     chosen = Reading(channels=("wrench.torque.z", 0))
     np.testing.assert_array_equal(read(path, chosen)[0], values[[5, 0]])
     assert "'nope'" in refused(path, Reading(channels=("nope",)))
-
-
-@pytest.mark.parametrize(
-    ("storage", "mode"),
-    [("sqlite3", "none"), ("sqlite3", "message"), ("mcap", "none"), ("mcap", "storage")],
-)
-def test_stamped_messages_in_rosbag2(tmp_path, storage, mode):
-    sent, values = wrenches(500)
-    other = Sent("/rosout", WRENCH, sent.messages[:3])
-    samples, names, since, _ = read(write_bag(tmp_path / "bag", [other, sent], storage, mode))
-    np.testing.assert_array_equal(samples, values)
-    assert names[0] == "wrench.force.x"
-    np.testing.assert_array_equal(since, np.arange(500) * STEP_NS / 1e9)
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
