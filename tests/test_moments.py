@@ -176,17 +176,14 @@ def test_one_class_is_not_enough_and_neither_is_no_feature():
         SufficientStats(1, {"x": float("nan")})
 
 
-def make_recordings(num=9, seed=0):
-    rng = np.random.default_rng(seed)
-    recordings = []
-    for number in range(num):
-        size = int(rng.integers(0, 12))
-        features = rng.standard_normal((size, NUM)) * 10.0 ** rng.integers(-4, 4, NUM)
-        features[:, 3] = rng.choice([0.0, -0.0], size)  # ranges must not show which came first
-        features = torch.from_numpy(features.astype(np.float32))
-        is_slip = torch.from_numpy(rng.uniform(size=size) < 0.6)
-        recordings.append((f"M{number % 3}/{number}", f"M{number % 3}", features, is_slip))
-    return recordings
+SIZES = torch.tensor([1e-4, 1.0, 1e3, 0.0]).double()
+"""Of features; ranges must not show whether 0 or -0 came first."""
+
+
+def make_recordings(seed=0):
+    """The same bins, their features of other sizes."""
+    batches = make_batches(seed=seed)
+    return [(name, name[:2], (z * SIZES).float(), is_slip) for name, z, is_slip, _ in batches]
 
 
 def statistics_of(recordings, sample_bins=3):

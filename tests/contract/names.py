@@ -35,11 +35,9 @@ TRACEBACK_VARIABLE = "TACTSLIP_TRACEBACK"
 # Configuration ---------------------------------------------------------------------------------
 
 KEYS = {
-    "bin_ms": "labels.bin_ms",
     "channels": "data.channels",
     "cycles": "data.cycles",
     "dtype": "features.dtype",
-    "engine": "features.backend",
     "every_decision": "decisions",
     "experiment": "+exp",
     "folder": "hydra.run.dir",
@@ -82,7 +80,6 @@ METRICS = "metrics.json"
 CHECKPOINT = "last.ckpt"
 BIN_GRAPH = "model.onnx"
 STREAM_GRAPH = "stream.onnx"
-SIDECAR = "{}.json"
 ONSETS = ("onsets.json", "onsets.csv")
 MANIFEST = "manifest.csv"
 DECISIONS = "{}_decisions.csv"
