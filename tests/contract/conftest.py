@@ -38,10 +38,8 @@ class Trained(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def command():
-    runner = Runner()
-    yield runner
-    runner.close()
+def command() -> Runner:
+    return Runner()
 
 
 @pytest.fixture(scope="session")

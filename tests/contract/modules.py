@@ -7,13 +7,13 @@ A module is executed if code of one of its functions runs; importing it is not e
 
 from __future__ import annotations
 
-import json
 import runpy
-import subprocess
 import sys
 import tempfile
 import threading
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -28,7 +28,7 @@ from .names import (
     sample_recording,
     settings,
 )
-from .running import ROOT, environment
+from .running import ROOT, SERVER
 
 FOLDER = ROOT / PACKAGE
 
@@ -38,9 +38,10 @@ def executed_by(action: Callable[[], Any]) -> list[str]:
     found: set[str] = set()
 
     def watch(frame: FrameType, event: str, _: Any) -> None:
-        path = frame.f_code.co_filename
-        if path.startswith(str(FOLDER)) and path not in found and not _is_importing(frame):
-            found.add(path)
+        code = frame.f_code
+        is_new = code.co_filename.startswith(str(FOLDER)) and code.co_filename not in found
+        if is_new and code.co_name != "<module>" and not _is_importing(frame):
+            found.add(code.co_filename)
 
     before = sys.gettrace()
     threading.settrace(watch)
@@ -71,25 +72,14 @@ def counted(modules: list[str]) -> list[str]:
 def of_training(folder: Path) -> list[str]:
     """Modules that ``train +exp=quick`` executes, in a process of its own; it leaves its run."""
     words = settings(experiment="quick", workers=0, cache=folder / "cache", folder=folder / "run")
-    command = [f"{PACKAGE}.train", *words]
-    program = f"from contract import modules; modules.print_of({command!r})"
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=folder,
-        env=environment(),
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-    )
-    modules: list[str] = json.loads(done.stdout.splitlines()[-1])
-    return modules
+    with ProcessPoolExecutor(1, SERVER) as pool:
+        return pool.submit(_of_command, [f"{PACKAGE}.train", *words]).result()
 
 
-def print_of(command: list[str]) -> None:
-    """Become a command, and print what it executed as the last line."""
-    sys.argv = command
-    modules = executed_by(lambda: runpy.run_module(command[0], run_name="__main__", alter_sys=True))
-    print(json.dumps(modules))
+def _of_command(arguments: list[str]) -> list[str]:
+    sys.argv = arguments
+    command = partial(runpy.run_module, arguments[0], run_name="__main__", alter_sys=True)
+    return executed_by(command)
 
 
 def of_push(detector: SlipDetector, samples: np.ndarray) -> list[str]:

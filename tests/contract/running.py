@@ -1,16 +1,18 @@
 """Commands run to their end, each in a process of its own that need not import everything anew.
 
-One process imports the libraries and the commands' modules, reads requests from its input and
-carries out each in a fork, as ``python`` would: arguments, folder, output and exit status.
+A server of ``multiprocessing`` imports the libraries once; a command is a fork of it that becomes
+what ``python`` would be: arguments, folder, output and exit status.
 """
 
 from __future__ import annotations
 
-import json
+import multiprocessing
 import os
-import subprocess
+import runpy
 import sys
 import time
+import traceback
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +20,11 @@ from typing import NamedTuple
 from .names import PACKAGE
 
 ROOT = Path(__file__).parents[2]
+SERVER = multiprocessing.get_context("forkserver")
+"""Starts processes in which the libraries are imported."""
+SERVER.set_forkserver_preload(
+    [__name__, "hydra", "lightning", "matplotlib.pyplot", "onnx", "onnxruntime", "scipy.signal"]
+)
 
 
 class Ran(NamedTuple):
@@ -40,30 +47,22 @@ def environment(**more: str) -> dict[str, str]:
 
 
 class Runner:
-    """Runs commands. To be closed."""
-
-    def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", "from contract import running; running._serve()"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=environment(),
-            cwd=ROOT,
-        )
+    """Runs commands, one at a time."""
 
     def start(self, folder: Path, command: str, *overrides: str) -> int:
         """Start a command in a folder; the id of its process. ``wait`` must follow."""
         folder.mkdir(parents=True, exist_ok=True)
-        self._folder = folder
-        request = {"folder": str(folder), "arguments": arguments_of(command, *overrides)}
-        self._process.stdin.write(json.dumps(request) + "\n")
-        self._process.stdin.flush()
-        return int(self._process.stdout.readline())
+        self._folder, given = folder, (folder, arguments_of(command, *overrides))
+        self._process = SERVER.Process(target=_become, args=given)
+        self._process.start()
+        assert self._process.pid is not None
+        return self._process.pid
 
     def wait(self) -> Ran:
         """Wait for the command that was started."""
-        status = int(self._process.stdout.readline())
+        self._process.join()
+        status = self._process.exitcode
+        assert status is not None
         said = [(self._folder / name).read_text() for name in (".stdout", ".stderr")]
         return Ran(status, *said)
 
@@ -78,47 +77,19 @@ class Runner:
         assert ran.status == 0, ran.err
         return ran.out
 
-    def close(self) -> None:
-        self._process.stdin.close()
-        self._process.wait(60)
-        self._process.stdout.close()
 
-
-def _serve() -> None:
-    """Carry out requests until there is no input left."""
-    import importlib
-
-    import matplotlib
+def _become(folder: Path, arguments: Sequence[str]) -> None:
+    """Become ``python -m module ...``, and end."""
     import torch
 
-    matplotlib.use("agg")
     torch.set_num_threads(1)
-    importlib.import_module(PACKAGE).SlipDetector  # noqa: B018  # imports most of the package
-    for heavy in ("hydra", "lightning", "matplotlib.pyplot", "onnx", "onnxruntime", "scipy.signal"):
-        importlib.import_module(heavy)
-    for line in sys.stdin:
-        request = json.loads(line)
-        pid = os.fork()
-        if pid == 0:
-            _carry_out(Path(request["folder"]), request["arguments"])
-        print(pid, flush=True)
-        _, ended = os.waitpid(pid, 0)
-        print(os.waitstatus_to_exitcode(ended), flush=True)
-
-
-def _carry_out(folder: Path, arguments: Sequence[str]) -> None:
-    """In the fork: become ``python -m module ...``, and end."""
-    import runpy
-    import traceback
-    import warnings
-
     os.chdir(folder)
+    here = environment()
+    os.environ.clear()
+    os.environ.update(here)
     for name, descriptor in ((".stdout", 1), (".stderr", 2)):
         opened = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(opened, descriptor)
-    os.close(0)
-    os.open(os.devnull, os.O_RDONLY)
-    sys.stdin = open(0, closefd=False)  # noqa: SIM115
     assert arguments[0] == "-m"
     sys.argv = list(arguments[1:])
     warnings.filterwarnings("ignore", module="runpy")  # the module was imported before

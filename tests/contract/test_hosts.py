@@ -251,14 +251,7 @@ def assert_refused(ran, words, status):
     assert not missing, line
 
 
-SOME_SLOW = [
-    name if place % 2 == 0 else pytest.param(name, marks=pytest.mark.slow)
-    for place, name in enumerate(WRONG_FILES)
-]
-"""Each starts a host: every second one is for the slow tests."""
-
-
-@pytest.mark.parametrize("wrong", SOME_SLOW)
+@pytest.mark.parametrize("wrong", WRONG_FILES)
 def test_a_wrong_file_is_one_line_and_a_failing_exit(host, wrong, stream, recording, tmp_path):
     which, change, words = WRONG_FILES[wrong]
     model, own = copied(stream, tmp_path), Path(shutil.copy(recording, tmp_path))
