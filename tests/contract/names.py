@@ -116,13 +116,10 @@ HOSTS = {
     "python": "{python} {export}/python/detect.py",
     "c": "{build}/detect",
     "node": "node {export}/node/detect.mjs",
-    "web": "node {export}/web/shot.mjs",
 }
 BUILD_C_HOST = "make -C {export}/c CC=gcc PYTHON={python} BUILD={build}"
 HOST_OPTIONS = {"every": "--decisions", "chunk": "--chunk", "threshold": "--threshold"}
 HOST_OPTIONS |= {"rate": "--rate"}
-"""Beside model and recording, which the web host takes as options of these names."""
-WEB_OPTIONS = ("--model", "--recording", "--output")
 
 # Recordings in files ---------------------------------------------------------------------------
 

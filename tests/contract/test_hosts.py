@@ -1,7 +1,9 @@
-"""The four hosts of an exported stream decide what the package decides, and refuse the same."""
+"""Hosts of an exported stream decide what the package decides, and refuse the same.
+
+The page in a browser is asked in ``tests/test_host_all.py``.
+"""
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -19,8 +21,7 @@ from .recordings import samples_of
 
 pytestmark = pytest.mark.onnx
 
-BROWSER = Path(os.environ.get("CHROMIUM", "/usr/bin/chromium"))
-NEEDS = {"python": [], "c": ["gcc", "make"], "node": ["node"], "web": ["node"]}
+NEEDS = {"python": [], "c": ["gcc", "make"], "node": ["node"]}
 SAMPLES = samples_of("D", 1)[1500:5500]
 BROKEN = SAMPLES.copy()
 BROKEN[2500:2510, 1:3] = np.nan
@@ -51,13 +52,11 @@ def build(places):
 def words_of(name, places, build):
     """The words of a host's command; built or installed before."""
     missing = [program for program in NEEDS[name] if shutil.which(program) is None]
-    if name == "web" and not BROWSER.exists():
-        missing.append(f"the browser {BROWSER}")
     if missing:
         pytest.skip(f"not installed: {', '.join(missing)}")
     if name == "c":
         build()
-    if name in ("node", "web"):
+    if name == "node":
         hosts.installed(EXPORT / name)
     return names.HOSTS[name].format(**places).split()
 
@@ -121,16 +120,6 @@ def test_a_host_decides_what_the_package_decides(
         assert ran.summary["alarms"] > 0
     else:
         assert expected != truth(SAMPLES, detector=selected.detector)
-
-
-@pytest.mark.slow
-def test_the_page_decides_what_the_package_decides(places, build, stream, selected, recording):
-    files = (stream, recording, recording.with_name("page.png"))
-    words = [word for pair in zip(names.WEB_OPTIONS, files, strict=True) for word in pair]
-    host = words_of("web", places, build)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CHROMIUM", str(BROWSER))
-        hosts.assert_same(run_host(host, *words), truth(SAMPLES, detector=selected.detector))
 
 
 def test_missing_samples_are_flagged_and_told_once(host, stream, selected, tmp_path):
