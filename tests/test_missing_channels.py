@@ -57,6 +57,12 @@ def by_quadrature(head, gaussians, z, lost):
     return first, second - first**2
 
 
+@pytest.fixture
+def expected(rng):
+    """Mean and variance of bins, given which features are missing."""
+    return partial(expected_score, head_of(rng), gaussians_of(rng))
+
+
 @pytest.mark.parametrize("lost", [[2], [0, 6], [1, 3, 4, 5], list(range(NUM))], ids=str)
 def test_mean_and_variance_are_those_of_the_mixture(lost, rng):
     head, gaussians = head_of(rng), gaussians_of(rng)
@@ -69,8 +75,7 @@ def test_mean_and_variance_are_those_of_the_mixture(lost, rng):
         np.testing.assert_allclose([mean[row], variance[row]], expected, rtol=1e-9)
 
 
-def test_bins_that_miss_other_features_are_judged_each_by_their_own(rng):
-    expected = partial(expected_score, head_of(rng), gaussians_of(rng))
+def test_bins_that_miss_other_features_are_judged_each_by_their_own(expected, rng):
     z = torch.from_numpy(rng.uniform(-1, 1, (40, NUM)))
     is_missing = torch.from_numpy(rng.integers(0, 4, (40, 1)) == np.arange(NUM) % 4)
     z[is_missing] = torch.nan  # what stands there does not matter
@@ -80,8 +85,7 @@ def test_bins_that_miss_other_features_are_judged_each_by_their_own(rng):
         torch.testing.assert_close(found, torch.cat(each), rtol=1e-12, atol=1e-12)
 
 
-def test_gradients_in_what_is_observed(rng):
-    expected = partial(expected_score, head_of(rng), gaussians_of(rng))
+def test_gradients_in_what_is_observed(expected, rng):
     is_missing = torch.zeros(3, NUM).bool()
     is_missing[:2, [1, 5]] = True
     z = torch.from_numpy(rng.uniform(-1, 1, (3, NUM))).requires_grad_()
@@ -91,9 +95,8 @@ def test_gradients_in_what_is_observed(rng):
     assert torch.equal(slope[:2, [1, 5]], torch.zeros(2, 2, dtype=torch.float64))
 
 
-def test_threads_may_share_what_is_kept(rng):
+def test_threads_may_share_what_is_kept(expected):
     """Once a KeyError, where one thread forgot what another had just found."""
-    expected = partial(expected_score, head_of(rng), gaussians_of(rng))
     masks = torch.eye(3, NUM, dtype=torch.bool)
     z = torch.zeros(1, NUM, dtype=torch.float64)
     alone = [float(expected(z, mask[None])[0]) for mask in masks]

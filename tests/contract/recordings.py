@@ -8,6 +8,7 @@ import csv
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from .names import MANIFEST, settings
 
@@ -33,6 +34,12 @@ def samples_of(material: str, trial: int, version: int = 0) -> np.ndarray:
     samples[is_sliding, :2] *= 2  # so that channels of both kinds are worth selecting
     samples[:, :2] += 1 + 0.1 * rng.standard_normal(2)
     return samples.astype(np.float32)
+
+
+def bins_of(detector, samples: np.ndarray, step: int = 97) -> torch.Tensor:
+    """Raw bins of a recording with the context that a detector needs, ``[N, C, n]``."""
+    length = detector.context_before + detector.pool.bin_samples + detector.context_after
+    return torch.from_numpy(samples.T.astype(np.float64)).unfold(1, length, step).transpose(0, 1)
 
 
 def write_recording(path: Path, samples: np.ndarray) -> Path:

@@ -19,6 +19,7 @@ from .recordings import (
     SEEN,
     SLIDE_S,
     TRIALS,
+    bins_of,
     of_set,
     samples_of,
     split_of_set,
@@ -42,9 +43,7 @@ def table(path):
 
 def probe(detector):
     """Scores of some raw bins, to tell two detectors apart."""
-    length = detector.context_before + detector.pool.bin_samples + detector.context_after
-    bins = torch.from_numpy(samples_of("D", 3).T.copy()).double().unfold(1, length, 397)
-    return detector.score_raw(bins.transpose(0, 1))
+    return detector.score_raw(bins_of(detector, samples_of("D", 3)))
 
 
 # Train, evaluate, detect -------------------------------------------------------------------------

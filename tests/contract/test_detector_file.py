@@ -4,22 +4,20 @@ import pytest
 import torch
 
 from .names import SlipDetector
-from .recordings import samples_of
+from .recordings import bins_of, samples_of
 
 
 @pytest.fixture(scope="module")
 def bins(trained):
-    """Raw bins of a held-out recording with their context, ``[N, C, n]``, volts."""
-    detector = trained.detector
-    length = detector.context_before + detector.pool.bin_samples + detector.context_after
-    return torch.from_numpy(samples_of("D", 1).T.copy()).unfold(1, length, 97).transpose(0, 1)
+    """Raw bins of a held-out recording, volts."""
+    return bins_of(trained.detector, samples_of("D", 1))
 
 
 def test_a_saved_detector_scores_as_before(trained, bins, tmp_path):
-    before = trained.detector.predict_raw(bins.double())
+    before = trained.detector.predict_raw(bins)
     trained.detector.save(tmp_path / "again.pt")
     loaded = SlipDetector.load(tmp_path / "again.pt")
-    after = loaded.predict_raw(bins.double())
+    after = loaded.predict_raw(bins)
     torch.testing.assert_close(after.score, before.score, rtol=1e-12, atol=1e-12)
     assert torch.equal(after.is_valid, before.is_valid)
     assert loaded.info == trained.detector.info
@@ -29,7 +27,7 @@ def test_a_saved_detector_scores_as_before(trained, bins, tmp_path):
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_broken_channel_is_flagged_and_the_score_stays_finite(trained, bins, bad):
-    x = bins.double()
+    x = bins.clone()
     x[3, 2, 40] = bad
     predicted = trained.detector.predict_raw(x)
     assert predicted.score.isfinite().all()
@@ -39,7 +37,7 @@ def test_a_broken_channel_is_flagged_and_the_score_stays_finite(trained, bins, b
 
 def test_scores_have_gradients_to_the_volts(trained, bins):
     """Along a line through the volts the derivative is what central differences say."""
-    x = bins[5:6].double().requires_grad_()
+    x = bins[5:6].clone().requires_grad_()
     (slope,) = torch.autograd.grad(trained.detector.score_raw(x).sum(), x)
     direction = torch.from_numpy(samples_of("A", 1)[: x.shape[-1]].T.copy()).double()[None]
     direction = direction - direction.mean(-1, keepdim=True)

@@ -10,7 +10,7 @@ import torch
 from . import names
 from .conftest import RECIPES
 from .names import BIN_GRAPH, BIN_INPUT, BIN_OUTPUTS, STREAM_GRAPH
-from .recordings import NAMES, samples_of
+from .recordings import NAMES, bins_of, samples_of
 
 pytestmark = pytest.mark.onnx
 
@@ -40,9 +40,8 @@ def session_of(path):
 
 def kinds_of_bin(detector):
     """Raw bins by kind, float32 ``[N, C, n]``, so that both sides read the same numbers."""
-    length = detector.context_before + detector.pool.bin_samples + detector.context_after
-    samples = samples_of("D", 2).T
-    plain = np.lib.stride_tricks.sliding_window_view(samples, length, 1).swapaxes(0, 1)[::211]
+    plain = bins_of(detector, samples_of("D", 2), 211).float().numpy()
+    length = plain.shape[-1]
     time = np.arange(length)
     broken = plain.copy()
     broken[::2, 1, 60] = np.nan
@@ -70,7 +69,7 @@ def test_the_bin_graph_scores_as_the_detector(exported, kind):
     session, bins = session_of(folder / BIN_GRAPH), kinds[kind].astype(precision)
     found = dict(zip(BIN_OUTPUTS, session.run(BIN_OUTPUTS, {BIN_INPUT: bins}), strict=True))
     expected = detector.predict_raw(torch.from_numpy(bins).double())
-    ordinary = detector.predict_raw(torch.from_numpy(kinds["ordinary"].copy()).double()).score
+    ordinary = detector.predict_raw(torch.from_numpy(kinds["ordinary"]).double()).score
     scores = expected.score.numpy()
     bound = CLOSE[precision] * (float(ordinary.std()) + np.abs(scores))
     assert (np.abs(found["score"] - scores) <= bound).all()

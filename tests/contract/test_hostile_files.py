@@ -28,7 +28,7 @@ import pytest
 import scipy.io
 import torch
 from foreign_files import LVM, stored
-from message_bags import Sent, json_message, write_mcap
+from message_bags import Sent, json_message, wrenches, write_bag, write_mcap
 
 from tactslip_torch import Recording
 from tactslip_torch.commands.stopping import BAD_INPUT as ONE_LINE
@@ -165,6 +165,7 @@ THEIRS = {
     "mat": {"packed.mat": write_arrays, "73.mat": write_arrays},
     "parquet": {"a.parquet": write_parquet},
     "mcap": {"a.mcap": write_json},
+    "rosbag2": {"bag": lambda path: write_bag(path, [wrenches(10)[0]])},
 }
 
 
@@ -182,7 +183,11 @@ def seeds(tmp_path_factory):
         for file, write in THEIRS.get(name, {}).items():
             paths.append(folder / name / file)
             write(paths[-1])
-        assert all(is_read(lambda path, form=form: looked(form, path), path) for path in paths)
+        assert all(is_read(partial(looked, form), path) for path in paths)
+        assert [form.is_ours(path) for path in paths] == [True] + [False] * (len(paths) - 1)
+        for path in paths[1:]:
+            with pytest.raises(ValueError, match=f"{path.name}.*no recording of ours"):
+                form.load(path)
         found[name] = paths
     return found
 

@@ -11,15 +11,13 @@ from . import names
 from .conftest import train
 from .names import settings
 from .recordings import HELD_OUT as HELD_OUT_MATERIALS
-from .recordings import SEEN, TRIALS, samples_of, write_set
+from .recordings import SEEN, TRIALS, bins_of, samples_of, write_set
 from .running import wait_for
 
 
 def scores_of(detector):
-    """Scores of raw bins of recordings that no set holds."""
-    length = detector.context_before + detector.pool.bin_samples + detector.context_after
-    samples = torch.from_numpy(samples_of("E", 1).T.copy()).double()
-    return detector.score_raw(samples.unfold(1, length, 97).transpose(0, 1))
+    """Scores of raw bins of a recording that no set holds."""
+    return detector.score_raw(bins_of(detector, samples_of("E", 1)))
 
 
 def trained_on(detector):
