@@ -284,11 +284,14 @@ def test_an_absent_class_is_named(tmp_path):
 def test_every_experiment_runs_fast(name, tmp_path, tmp_path_factory):
     """One recording of each pass, or two; the whole set is named, not simulated."""
     cache = tmp_path_factory.getbasetemp() / "features"  # made by the first experiment of a kind
-    overrides = (f"+exp={name}", "num_workers=0", f"cache={cache}", "export=false")
+    overrides = f"+exp={name}", "num_workers=0", f"cache={cache}", "export=false", "baselines=false"
     # the first recordings of these are of scenes without slip
     num = {"confound": 2, "deploy": 2, "onset": 7, "biotacsp_dos": 2}.get(name, 1)
-    told = write_biotac(tmp_path / "biotac") if name == "biotacsp_dos" else []
-    if name in ("deploy", "onset"):
-        told = ["~recipe.scene_weights"]  # of scenes that one recording does not have
+    told = {
+        "biotacsp_dos": write_biotac(tmp_path / "biotac"),
+        "deploy": ["~recipe.scene_weights"],  # of scenes that one recording does not have
+        "onset": ["~recipe.scene_weights"],
+        "leave_one_material_out": ["split.materials=[M1,wood]"],
+    }.get(name, [])
     _, metrics = run_train(tmp_path / "run", *overrides, *told, f"trainer.fast_dev_run={num}")
     assert metrics["splits"]

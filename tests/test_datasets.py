@@ -12,7 +12,7 @@ from hydra.utils import instantiate
 from test_commands import composed
 
 from tactslip_torch.data.file_recordings import FileRecordings, file_digest
-from tactslip_torch.data.formats import named_format
+from tactslip_torch.data.formats import Reading, named_format, open_file
 from tactslip_torch.data.public_sets import STEMS, authors_raw, named_recordings, nominal
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.hand import Channel, HandLayout
@@ -355,14 +355,11 @@ def with_speed(path):
     return content
 
 
-@pytest.mark.parametrize(
-    ("name", "isolate"),
-    [("a.npz", False), ("a.csv", False), pytest.param("a.csv", True, marks=pytest.mark.slow)],
-)
-def test_a_speed_above_a_threshold_is_slip(tmp_path, name, isolate):
+@pytest.mark.parametrize("name", ["a.npz", "a.csv"])
+def test_a_speed_above_a_threshold_is_slip(tmp_path, name):
     content = with_speed(tmp_path / name)
     manifest(tmp_path, f"{name},wood", columns="file,material")
-    reading = {"speed": "speed", "speed_unit": "m/s", "isolate": isolate}
+    reading = {"speed": "speed", "speed_unit": "m/s"}
     source = FileRecordings(tmp_path, reading=reading, speed_over=5.0)
     assert torch.allclose(first(source).double(), content)  # the speed is no channel
     times = source.timeline(source.ids[0])
@@ -374,6 +371,13 @@ def test_a_speed_above_a_threshold_is_slip(tmp_path, name, isolate):
     manifest(tmp_path, f"{name},wood,0,0.5,,")  # who says more is believed
     source = FileRecordings(tmp_path, reading=reading, speed_over=5.0)
     assert source.timeline(source.ids[0]).onsets_s == (0.5,)
+
+
+@pytest.mark.slow
+def test_a_reader_in_a_process_of_its_own_hands_on_the_speed(tmp_path):
+    with_speed(tmp_path / "a.csv")
+    with open_file(tmp_path / "a.csv", Reading(speed="speed", isolate=True)) as opened:
+        assert torch.equal(opened.speed.read(0, 600)[0].double(), SPEED)
 
 
 def test_a_speed_that_is_not_there_is_one_line(tmp_path):
