@@ -25,10 +25,10 @@ HOSTILE = (
 
 @cache
 def detectors():
+    """By the native engine, and the same by torch."""
     made = alarming_detector()
-    return made, SlipDetector(
-        made.pool, made.channel_filter, made.selected, made.scaler, made.head, backend="torch"
-    )
+    parts = made.pool, made.channel_filter, made.selected, made.scaler, made.head
+    return made, SlipDetector(*parts, backend="torch")
 
 
 @cache

@@ -1,5 +1,7 @@
 """Intervals over recordings: against lists drawn one by one, SciPy, and how often they hold."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -31,14 +33,12 @@ def test_numbers_are_those_of_the_lists_drawn(few, rng):
     tensors = torch.from_numpy(values), torch.from_numpy(recording)
     made = [(bootstrap.mean(*tensors), np.mean), (bootstrap.deviation(*tensors), np.std)]
     for share in (0.0, 0.5, 0.95, 1.0):
-        number = bootstrap.quantile(*tensors, share)
-        made.append((number, lambda own, share=share: np.quantile(own, share)))
+        made.append((bootstrap.quantile(*tensors, share), partial(np.quantile, q=share)))
     for number, of in made:
         low, high = np.quantile([of(own) for own in lists], [0.32, 0.68])
         value = of(values)
-        assert number == pytest.approx(
-            {"value": value, "low": min(low, value), "high": max(high, value)}
-        )
+        expected = {"value": value, "low": min(low, value), "high": max(high, value)}
+        assert number == pytest.approx(expected)
 
 
 def test_a_ratio_agrees_with_scipys_bootstrap(rng):

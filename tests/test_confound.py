@@ -43,14 +43,9 @@ class SmallScenes(NoiseRecordings):
 
 
 SMALL = (
-    "data._target_=test_confound.SmallScenes",
-    "data.materials=[a,b,c]",
-    "data.cycles=2",
-    "split.seen=[a,b]",
-    "split.unseen=[c]",
-    "split.train_fraction=0.5",
-    "cache=off",
-    "num_workers=0",
+    *("data._target_=test_confound.SmallScenes", "data.materials=[a,b,c]", "data.cycles=2"),
+    *("split.seen=[a,b]", "split.unseen=[c]", "split.train_fraction=0.5"),
+    *("cache=off", "num_workers=0"),
 )
 
 
@@ -59,11 +54,9 @@ def ran(tmp_path_factory):
     """``+exp=confound`` on the small scenes: the folder, what it printed, what it returned."""
     folder = tmp_path_factory.mktemp("confound")
     recipe = ("recipe=robust", "recipe.num_features=10", "recipe.penalties=[0.1,1.0]")
+    told = *SMALL, "+exp=confound", *recipe, "recipe.sample_bins=100", "export=false"
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        returned = train(
-            composed(*SMALL, "+exp=confound", *recipe, "recipe.sample_bins=100", "export=false"),
-            folder,
-        )
+        returned = train(composed(*told), folder)
     return folder, printed.getvalue(), returned
 
 
@@ -79,12 +72,10 @@ def test_a_run_on_several_scenes_leaves_table_figure_and_scores_by_fold(ran):
     for name in ("confound.png", "confusion.png", *(f"{fold}/detector.pt" for fold in folds)):
         assert (folder / name).is_file(), name
     for role in ("test", "unseen"):  # the same bins of every scene
-        counts = [
-            {scene: scores["num_bins"] for scene, scores in of["splits"][role]["per_scene"].items()}
-            for of in folds.values()
-        ]
-        assert counts[0] == counts[1]
-        assert len(counts[0]) == 8
+        scenes = [of["splits"][role]["per_scene"] for of in folds.values()]
+        one, other = ({name: s["num_bins"] for name, s in own.items()} for own in scenes)
+        assert one == other
+        assert len(one) == 8
     places = [(fold, role) for fold in folds for role in ("train", "test", "unseen")]
     for kind in ("splits", "events"):  # each fold's own, and no sums
         assert metrics[kind] == {f"{f}/{role}": folds[f][kind][role] for f, role in places}
@@ -97,13 +88,9 @@ def test_a_run_on_several_scenes_leaves_table_figure_and_scores_by_fold(ran):
 # A saved detector --------------------------------------------------------------------------------
 
 
-def evaluated(ran, folder, *overrides):
-    model = f"model={ran[0] / 'with_scenes' / 'detector.pt'}"
-    return evaluate(composed(*SMALL, model, *overrides, name="evaluate"), folder)
-
-
 def test_evaluate_counts_bins_that_both_folds_hold_out_once(ran, tmp_path):
-    metrics = evaluated(ran, tmp_path, "+exp=confound", "cache=off")
+    model = f"model={ran[0] / 'with_scenes' / 'detector.pt'}"
+    metrics = evaluate(composed(*SMALL, model, "+exp=confound", name="evaluate"), tmp_path)
     trained = json.loads((ran[0] / "metrics.json").read_text())["folds"]["with_scenes"]
     for role in ("train", "test", "unseen"):  # with_scenes trains on all that protocol does
         assert metrics["splits"][role]["confusion"] == trained["splits"][role]["confusion"]
