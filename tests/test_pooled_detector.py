@@ -46,19 +46,6 @@ def noise_like(samples, size=1e-9):
     return size * torch.randn(samples.shape, generator=generator, dtype=torch.float64)
 
 
-# What it is --------------------------------------------------------------------------------------
-
-
-def test_it_pools_both_kinds_and_leaves_out_what_jumps(detector):
-    assert detector.pooling is not None
-    assert detector.pooling.kinds == ("SG", "PVDF")
-    assert all(name.is_pooled for name in detector.selected_names)
-    jumping = {"mode", "cv", "entropy", "median", "iqr"}
-    assert not jumping & {name.descriptor for name in detector.extractor.names}
-    assert detector.head.is_linear
-    assert detector.gaussians is None
-
-
 def test_a_damaged_pooling_is_refused(detector, tmp_path):
     broken = copy.deepcopy(detector)
     broken.pooling.knee[0] = -1.0

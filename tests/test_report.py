@@ -44,13 +44,12 @@ REASON = "nobody looked"
 
 
 def scores_of(seed=0, scenes=("paper",)):
-    rng = np.random.default_rng(seed)
+    rng, number = np.random.default_rng(seed), range(500)
     truth = torch.from_numpy(rng.random(500) < 0.75)
     predicted = truth ^ torch.from_numpy(rng.random(500) < 0.1)
-    materials = ["ABS" if i % 2 else "acrylic" for i in range(500)]
-    speeds = [(60.0, 20.0, 40.0)[i % 3] for i in range(500)]
-    return bin_metrics(truth, predicted, materials, speeds, [scenes[i // 6 % len(scenes)] for i in
-                                                            range(500)])  # fmt: skip
+    kinds = (("acrylic", "ABS"), (60.0, 20.0, 40.0), np.repeat(scenes, 6).tolist())
+    materials, speeds, of_scenes = ([kind[i % len(kind)] for i in number] for kind in kinds)
+    return bin_metrics(truth, predicted, materials, speeds, of_scenes)
 
 
 def metrics_of(**more):
@@ -59,39 +58,25 @@ def metrics_of(**more):
 
 
 def features():
-    rows = []
-    for number, channel in enumerate(HandLayout.paper24().channels):
-        component = "raw" if channel.kind == "SG" else f"{'AD'[number % 2]}{1 + number % 4}"
-        row = {"channel": channel.name, "component": component, "domain": "time"}
-        row |= {"descriptor": ("kurtosis", "std", "energy")[number % 3]}
-        rows.append(row | {"name": str(number), "kind": channel.kind, "finger": channel.finger})
-    return rows
+    return [
+        {"name": str(number), "channel": channel.name, "domain": "time", "kind": channel.kind}
+        | {"component": "raw" if channel.kind == "SG" else ("A1", "D2", "A3", "D4")[number % 4]}
+        | {"descriptor": ("kurtosis", "std", "energy")[number % 3], "finger": channel.finger}
+        for number, channel in enumerate(HandLayout.paper24().channels)
+    ]
 
 
-def events_of(seed=0, *, quiet_s=60.0, compute_s=None, num=20):
-    """Of recordings with one slip each: some found, some early, some missed, some false alarms."""
-    rng = np.random.default_rng(seed)
-    many = []
-    for number in range(num):
-        alarms = [float(time) for time in rng.uniform(4.0, 3.0 + quiet_s / num, rng.poisson(2))]
-        if (kind := rng.choice(["found", "early", "missed"], p=[0.7, 0.1, 0.2])) != "missed":
-            alarms.append(0.9 if kind == "early" else 1.0 + rng.exponential(0.05))
-        many.append(
-            Watched(
-                recording=str(number),
-                material="M1",
-                scene="paper",
-                duration_s=3.0 + quiet_s / num,
-                alarms_s=tuple(sorted(alarms)),
-                onset_estimates_s=(),
-                onsets_s=(1.0,),
-                sliding_s=((1.0, 2.0),),
-                speeds_mm_s=(20.0,),
-            )
+def events_of(quiet_s=60.0, compute_s=None):
+    """Of twenty recordings with a slip each, found ever later, early or missed; false alarms."""
+    duration_s, rules = 3.0 + quiet_s / 20, EventRules(settle_s=0.1)
+    events = []
+    for number in range(20):
+        alarms_s = {0: (0.9,), 1: ()}.get(number % 10, (1 + 0.01 * number, 4.0 + 0.05 * number))
+        watched = Watched(
+            *(str(number), "M1", "paper", duration_s, alarms_s, ()),
+            *((1.0,), ((1.0, 2.0),), (20.0,)),
         )
-    latency = LatencyParts(0.0125, 0.05, compute_s)
-    rules = EventRules(settle_s=0.1)
-    events = [recording_events(one, rules, latency) for one in many]
+        events.append(recording_events(watched, rules, LatencyParts(0.0125, 0.05, compute_s)))
     return pooled_metrics(events, num_resamples=50)
 
 
@@ -118,13 +103,8 @@ BY_ROLE = {
 def choice(size, penalty, **scores):
     known = [score for score in scores.values() if score is not None]
     kernel = {"kind": "polynomial", "degree": 2, "offset": 0.5}
-    return {
-        "num_features": size,
-        "kernel": kernel,
-        "penalty": penalty,
-        "mean": sum(known) / len(known),
-        "balanced_accuracy": scores,
-    }
+    found = {"mean": sum(known) / len(known), "balanced_accuracy": scores}
+    return {"num_features": size, "kernel": kernel, "penalty": penalty, **found}
 
 
 CHOICES = [
@@ -141,21 +121,17 @@ def tuning():
     history = [{"held_loss": 0.3, "loss": 0.4}, {"held_loss": 0.2, "loss": 0.3}]
     ways = {"recipe": won, "grid": won, "tuned": won | {"steps": 1}}
     held = [{"held": name, "history": history, **ways} for name in ("M1", "M2")]
-    splits = {"test": split_metrics([[9, 1], [2, 8]])}
-    return {
+    recipe = {"test": split_metrics([[9, 1], [2, 8]])}
+    start, found = {"penalty": 1.0, "offset": 0.5}, {"penalty": 2.0, "offset": 0.25}
+    told = {"steps": 1, "bins": 40, "seconds": 3.0, "fit_s": 1.0, **found}
+    told |= {
         "held": held,
         "history": history,
-        "splits": {"recipe": splits, "grid": splits},
-        "start": {"penalty": 1.0, "offset": 0.5},
-        "penalty": 2.0,
-        "offset": 0.25,
-        "steps": 1,
-        "bins": 40,
-        "seconds": 3.0,
-        "fit_s": 1.0,
-        "learned": ["penalty", "offset", "scales"],
-        "scales": {f"f{i}": 1 + i / 10 for i in range(8)},
+        "splits": {"recipe": recipe, "grid": recipe},
+        "start": start,
     }
+    told |= {"learned": ["penalty", "offset", "scales"]}
+    return told | {"scales": {f"f{i}": 1 + i / 10 for i in range(8)}}
 
 
 # Tables ----------------------------------------------------------------------------------------
@@ -165,12 +141,8 @@ def test_cells_are_text_and_repeated_labels_are_left_blank():
     rows = [("x", 1, None), ("x", 2, True), ("y", 2, False)]
     shown = [dict(zip("abc", row, strict=True)) for row in rows]
     assert table([]) == ""
-    assert table(shown, merged=2).splitlines() == [
-        "a  b    c",
-        "x  1    -",
-        "   2  yes",
-        "y  2   no",
-    ]
+    lines = ["a  b    c", "x  1    -", "   2  yes", "y  2   no"]
+    assert table(shown, merged=2).splitlines() == lines
 
 
 @pytest.mark.parametrize(
@@ -376,18 +348,13 @@ def traces_of(films, view=(0.0, 1.4), num_decisions=130):
 
 
 @pytest.fixture
-def films(rng):
-    return np.arange(3)[:, None] + rng.standard_normal((3, 2800))
-
-
-@pytest.fixture
-def draw(drawn, tmp_path, films):
+def draw(drawn, tmp_path, rng):
     """Draws traces; their figure."""
 
-    def drawing(traces=None, *, alarms=ALARMS, truth=TRUTH, title="", **options):
-        path, traces = tmp_path / "onsets.png", traces or traces_of(films)
-        entry = {"alarms": alarms, "truth": truth}
-        onset_figure(traces, entry, path, title=title, **options)
+    def drawing(traces=None, alarms=ALARMS, **options):
+        path, films = tmp_path / "onsets.png", np.arange(3)[:, None] + rng.normal(size=(3, 2800))
+        entry = {"alarms": alarms, "truth": TRUTH}
+        onset_figure(traces or traces_of(films), entry, path, title="SIMULATED a.npz", **options)
         assert_png(path)
         return drawn[-1]
 
@@ -406,14 +373,10 @@ def marks_of(figure):
     return found
 
 
-def legend_of(figure):
-    return {text.get_text() for text in figure.legends[0].get_texts()}
-
-
 def test_marks_stand_where_things_happened(draw):
-    figure = draw(title="SIMULATED recording a.npz")
+    figure = draw()
     films, _, chance = figure.axes
-    assert figure.get_suptitle() == "SIMULATED recording a.npz"
+    assert figure.get_suptitle() == "SIMULATED a.npz"
     expected = {
         **{(place, "invalid"): [(0.6, 0.8)] for place in range(3)},
         (0, "slip"): [(0.5, 1.2)],
@@ -433,7 +396,8 @@ def test_marks_stand_where_things_happened(draw):
     assert to_hex(markers.get_color()) == ALARM.lower()
     np.testing.assert_allclose(chance.lines[0].get_ydata().max(), 0.95)
     assert chance.lines[0].get_drawstyle() == "steps-post"  # a decision holds until the next
-    assert legend_of(figure) >= {"decided: slip", "onset, true", "not valid", "abstains"}
+    legend = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert legend >= {"decided: slip", "onset, true", "not valid", "abstains"}
 
 
 def test_an_onset_classifier_has_a_panel_with_its_threshold(draw):
@@ -474,24 +438,18 @@ def onsets_of(*entries, simulated=True):
     return onsets_table(content).splitlines()
 
 
-def test_every_alarm_has_its_outcome():
-    outcomes = [(a["outcome"], a["true_onset_s"], a["delay_s"]) for a in entry()["alarms"]]
-    assert outcomes == [
-        ("false", None, None),
-        ("found", 1.0, pytest.approx(0.05)),
-        ("repeated", 1.0, pytest.approx(0.5)),
-        ("early", 3.0, pytest.approx(-0.1)),
-        ("late", 5.0, pytest.approx(0.7)),
-    ]
-
-
 def test_the_table_says_what_is_simulated_what_is_wrong_and_what_it_leaves_out():
     lines = onsets_of(entry())
     assert lines[0].startswith("SIMULATED")
-    assert lines[2].split() == ["a.npz", "0.300", "0.290", "0.90", "onset", "yes", *"--", "false"]
-    assert lines[3].split() == ["1.050", "1.040", "0.90", "onset", "yes", "1.000", "0.050", "found"]
-    assert lines[4].split()[4] == "NO"
-    assert lines[6].split() == [*"-----", "5.000", "-", "missed"]
+    assert lines[2].split()[:6] == ["a.npz", "0.300", "0.290", "0.90", "onset", "yes"]
+    assert [line.split()[-4:] for line in lines[2:]] == [
+        ["yes", "-", "-", "false"],
+        ["yes", "1.000", "0.050", "found"],
+        ["NO", "1.000", "0.500", "repeated"],
+        ["yes", "3.000", "-0.100", "early"],
+        ["-", "5.000", "-", "missed"],
+        ["yes", "5.000", "0.700", "late"],
+    ]
     many = onsets_of(*[entry()] * 20, simulated=False)
     assert many[-1] == "and 80 more, see onsets.csv"
     assert "SIMULATED" not in many[0]
@@ -534,27 +492,17 @@ def recording_of(seed=0):
     return Recording(samples, 2000.0, "M1", speeds, (2.0, 5.0), slides, non_slip_s=handled)
 
 
-@pytest.fixture
-def draw_signals(drawn, tmp_path):
-    """Draws recordings; their figure."""
-
-    def drawing(*recordings, views=None):
-        rows = list(zip(("M1", "M6"), recordings, strict=False))
-        signals_figure(rows, CHANNELS, tmp_path / "a.png", title="SIMULATED", views=views)
-        assert_png(tmp_path / "a.png")
-        return drawn[-1]
-
-    return drawing
-
-
 def lines_of(axes):
     """Lines of channels: those with a channel's name."""
     return {line.get_label(): line for line in axes.lines if line.get_label() in HAND.names}
 
 
-def test_gauges_stand_left_films_right_one_recording_a_row_with_every_extreme(draw_signals):
-    recording = recording_of()
-    figure = draw_signals(recording, recording_of(seed=1))
+def test_gauges_stand_left_films_right_one_recording_a_row_with_every_extreme(drawn, tmp_path):
+    recording, path = recording_of(), tmp_path / "a.png"
+    rows = [("M1", recording), ("M6", recording_of(seed=1))]
+    signals_figure(rows, CHANNELS, path, title="SIMULATED")
+    assert_png(path)
+    (figure,) = drawn
     panels = np.array(figure.axes).reshape(2, 3)
     for (measured, gauges, films), name in zip(panels, ("M1", "M6"), strict=True):
         assert measured.get_ylabel() == f"{name}\nvolts"
@@ -581,9 +529,11 @@ def test_gauges_stand_left_films_right_one_recording_a_row_with_every_extreme(dr
     [(None, [2.0, 5.0], [(2.0, 4.0), (5.0, 6.5), (6.75, 7.5)]), ((3.0, 4.5), [], [(3.0, 4.0)])],
 )
 def test_onsets_are_marked_and_slides_and_handling_shaded_as_far_as_in_view(
-    draw_signals, view, onsets, spans
+    drawn, tmp_path, view, onsets, spans
 ):
-    figure = draw_signals(recording_of(), views=view and [view])
+    rows, views = [("M1", recording_of())], view and [view]
+    signals_figure(rows, CHANNELS, tmp_path / "a.png", title="SIMULATED", views=views)
+    (figure,) = drawn
     for axes in figure.axes:
         marks = [line for line in axes.lines if line.get_linestyle() == "-."]
         assert [line.get_xdata()[0] for line in marks] == onsets

@@ -3,7 +3,8 @@
 import sys
 from collections import deque
 from importlib.machinery import ModuleSpec
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -35,12 +36,9 @@ def bag(path, kind):
         sent = Sent("/tactile", ARRAY, list(zip(logged, content, strict=True)))
         return write_bag(path, [sent]), {"samples": "/tactile"}
     jitter = np.random.default_rng(0).uniform(-5e4, 5e4, len(at))
-    stamps = START_NS + (at + jitter).astype(np.int64)
-    rows = np.concatenate([samples, np.zeros((len(samples), 2))], 1)
-    messages = [
-        (stamp + 10**6, wrench(row, stamp))
-        for stamp, row in zip(stamps.tolist(), rows, strict=True)
-    ]
+    stamps = (START_NS + (at + jitter).astype(np.int64)).tolist()
+    rows = np.pad(samples, ((0, 0), (0, 2)))
+    messages = [(at + 10**6, wrench(row, at)) for at, row in zip(stamps, rows, strict=True)]
     del messages[3000:3020]
     sent = Sent("/tactile", WRENCH, messages)
     return write_bag(path, [sent]), {"samples": "/tactile", "channels": FORCES}
@@ -61,46 +59,36 @@ def made(kind):
 def ros(monkeypatch):
     """A pretended ``rclpy``: ``messages`` come, what is published is in ``published``."""
     world = SimpleNamespace(messages=deque(), published={}, kind=None, on_end=None, take=None)
+    rclpy = MagicMock()
+    rclpy.__spec__ = ModuleSpec("rclpy", None)
 
-    class Node:
-        resolve_topic_name = staticmethod(lambda topic: topic)
-        get_topic_names_and_types = staticmethod(lambda: [("/tactile", [world.kind])])
-        get_logger = staticmethod(lambda: SimpleNamespace(info=print))
-        destroy_node = staticmethod(lambda: None)
+    def subscribe(kind, topic, callback, profile, *, raw):
+        assert (topic, raw) == ("/tactile", True)
+        world.take = callback
 
-        def create_subscription(self, kind, topic, callback, profile, *, raw):
-            assert raw
-            assert topic == "/tactile"
-            world.take = callback
+    def publisher(kind, topic, depth):
+        def publish(message):
+            content = STORE.serialize_cdr(message, message.__msgtype__)
+            world.published.setdefault(topic, []).append(content)
 
-        def create_publisher(self, kind, topic, depth):
-            def publish(message):
-                name = message.__msgtype__
-                world.published.setdefault(topic, []).append(STORE.serialize_cdr(message, name))
+        return SimpleNamespace(publish=publish)
 
-            return SimpleNamespace(publish=publish)
+    def spin_once(timeout_sec):
+        if world.take is not None and world.messages:
+            world.take(world.messages.popleft())
+        elif world.take is not None:
+            world.on_end()
 
-    class Executor:
-        add_node = remove_node = lambda self, node: None
-
-        def spin_once(self, timeout_sec):
-            if world.take is not None and world.messages:
-                world.take(world.messages.popleft())
-            elif world.take is not None:
-                world.on_end()
-
-    def module(name, **content):
-        one = ModuleType(name)
-        one.__spec__ = ModuleSpec(name, None)
-        vars(one).update(content)
-        monkeypatch.setitem(sys.modules, name, one)
-
-    module("rclpy", ok=lambda: True, create_node=lambda name: Node())
-    module("rclpy.executors", SingleThreadedExecutor=Executor)
-    quality = SimpleNamespace(BEST_EFFORT=1)
-    module("rclpy.qos", QoSProfile=lambda **_: None, ReliabilityPolicy=quality)
-    module("rosidl_runtime_py")
-    module("rosidl_runtime_py.utilities", get_message=lambda kind: lambda: made(kind))
+    node = rclpy.create_node.return_value
+    node.resolve_topic_name.side_effect = lambda topic: topic
+    node.get_topic_names_and_types.side_effect = lambda: [("/tactile", [world.kind])]
+    node.create_subscription, node.create_publisher = subscribe, publisher
+    rclpy.executors.SingleThreadedExecutor.return_value.spin_once = spin_once
+    rclpy.utilities.get_message = lambda kind: lambda: made(kind)
+    modules = {"rclpy": rclpy, "rclpy.executors": rclpy.executors, "rclpy.qos": rclpy.qos}
+    modules |= {"rosidl_runtime_py": rclpy, "rosidl_runtime_py.utilities": rclpy.utilities}
+    for name, content in modules.items():
+        monkeypatch.setitem(sys.modules, name, content)
     return world
 
 
@@ -113,9 +101,8 @@ def stamped(content, kind):
 @pytest.mark.parametrize("kind", ["wrench", "array"])
 def test_the_bridge_publishes_the_alarms_that_detect_finds(kind, model, ros, tmp_path):  # noqa: F811
     place, said = bag(tmp_path / "bag", kind)
-    options = [f"reading.{name}={value}" for name, value in said.items() if name == "samples"]
+    options = ["reading.samples=/tactile", "decisions=true", "figure=false"]
     options += [f"reading.channels=[{','.join(FORCES)}]"] if "channels" in said else []
-    options += ["decisions=true", "figure=false"]
     (wanted,) = detected(model, place, tmp_path / "out", *options)["recordings"]
     decided = rows_of(tmp_path / "out" / "bag_decisions.csv")
     with Reader(place) as reader:
@@ -134,10 +121,7 @@ def test_the_bridge_publishes_the_alarms_that_detect_finds(kind, model, ros, tmp
     begin = START_NS / 1e9 if kind == "wrench" else 0.0
     atol = 2e-4 if kind == "wrench" else 1e-8  # the jitter of stamps
     for name, of in (("probability", "x"), ("is_on", "y"), ("is_valid", "z")):
-        values = [{"True": 1.0, "False": 0.0}.get(row[name]) for row in decided]
-        values = [
-            float(row[name]) if v is None else v for v, row in zip(values, decided, strict=True)
-        ]
+        values = [float({"True": 1, "False": 0}.get(row[name], row[name])) for row in decided]
         np.testing.assert_allclose([getattr(m.vector, of) for _, m in states], values, rtol=1e-9)
     assert ({m.vector.z for _, m in states} == {0.0, 1.0}) == (kind == "wrench")
     times = [float(row["available_s"]) for row in decided]
@@ -164,18 +148,17 @@ def test_messages_that_cannot_be_read_are_told_and_passed_over(model):  # noqa: 
     assert late.time_s[0] == pytest.approx((START_NS + 2 * 10**7) / 1e9, abs=1e-6)
 
 
-WRONG = {
-    "names": (WRENCH, wrench(range(6), START_NS), None, "numbers called wrench.force.x"),
-    "few": (ARRAY, array([1.0, 2.0]), None, "/ft has 2 channels, and none is"),
-    "many": (ARRAY, array(np.ones(5)), None, "/ft has 5 channels, the detector 4; say which"),
-    "type": ("my_msgs/msg/Skin", b"", None, "no definition of my_msgs/msg/Skin"),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_a_topic_that_does_not_fit_is_one_line(name, model):  # noqa: F811
-    kind, content, reading, words = WRONG[name]
-    messages = TopicMessages(Topic("/ft", kind), SlipDetector.load(model), reading)
+@pytest.mark.parametrize(
+    ("kind", "content", "words"),
+    [
+        (WRENCH, wrench(range(6), START_NS), "numbers called wrench.force.x"),
+        (ARRAY, array([1.0, 2.0]), "/ft has 2 channels, and none is"),
+        (ARRAY, array(np.ones(5)), "/ft has 5 channels, the detector 4; say which"),
+        ("my_msgs/msg/Skin", b"", "no definition of my_msgs/msg/Skin"),
+    ],
+)
+def test_a_topic_that_does_not_fit_is_one_line(kind, content, words, model):  # noqa: F811
+    messages = TopicMessages(Topic("/ft", kind), SlipDetector.load(model))
     with pytest.raises(ValueError, match=words) as caught:
         messages.take(content)
     assert "\n" not in str(caught.value)

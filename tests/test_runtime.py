@@ -79,7 +79,6 @@ def test_a_forked_child_makes_its_own_threads():
         time.sleep(0.01)
     if ended == (0, 0):
         os.kill(child, 9)
-        os.waitpid(child, 0)
     assert ended == (child, 0)
 
 
@@ -141,9 +140,7 @@ def test_a_failure_leaves_the_old_content_and_no_temporary_file(tmp_path, old):
     for text in ("half", ""):
         with pytest.raises(RuntimeError, match="power is out"):
             write(text)
-        assert names_in(tmp_path) == ([] if old is None else ["a.txt"])
-    if old is not None:
-        assert path.read_text() == old
+        assert [path.read_text() for path in tmp_path.iterdir()] == ([] if old is None else [old])
 
 
 # --- tables -------------------------------------------------------------------------------------
@@ -211,23 +208,18 @@ def test_a_flipped_byte_is_refused_in_one_line_wherever_it_counts(saved):
     assert num_refused > len(certain)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"digest": "0" * 32},
-        {"facts": "{}"},
-        {"tensors": [1, 2]},
-        {"tensors": {3: torch.zeros(2), "a": torch.zeros(2)}},
-        {"tensors": {"float": torch.zeros(3).to_sparse()}},
-    ],
-)
+MISFITS = [{"digest": "0" * 32}, {"facts": "{}"}, {"tensors": [1, 2]}]
+MISFITS += [{"tensors": {3: torch.zeros(2), "a": torch.zeros(2)}}]
+MISFITS += [{"tensors": {"float": torch.zeros(3).to_sparse()}}]
+
+
+@pytest.mark.parametrize("change", MISFITS)
 def test_content_that_does_not_fit_its_digest_is_refused(saved, change):
     content = torch.load(saved, weights_only=True) | change
-    torch.save(content, saved)
-    assert refusal(saved) == f"{saved} is damaged or no file of ours; make it again"
-    content.pop(next(iter(change)))
-    torch.save(content, saved)
-    assert refusal(saved) == f"{saved} is damaged or no file of ours; make it again"
+    without = {name: value for name, value in content.items() if name not in change}
+    for each in (content, without):
+        torch.save(each, saved)
+        assert refusal(saved) == f"{saved} is damaged or no file of ours; make it again"
 
 
 class Trap:

@@ -113,9 +113,8 @@ def test_the_rerun_recording_holds_the_same(run, model):  # noqa: F811
         rows = part.to_record_batch().to_pydict()
         name = next((n for n in rows if n.endswith(":scalars") or n.endswith(":text")), None)
         if name and "time" in rows:
-            found.setdefault(part.entity_path, []).extend(
-                zip(rows["time"], rows[name], strict=True)
-            )
+            pairs = zip(rows["time"], rows[name], strict=True)
+            found.setdefault(part.entity_path, []).extend(pairs)
     found = {name: sorted(rows) for name, rows in found.items()}
     known = FORMATS["npz"].load(place / "a.npz").recording.samples
     for kind in HAND.kinds:
