@@ -21,6 +21,8 @@ HOSTILE = (
     *("tone without gain", "constant and dither", "synchronous", "mixed magnitudes"),
     *("offset 1e6, vibration 1e-6", "denormal", "nan"),
 )
+"""What is lost in rounding, and is flagged."""
+SOME_SLOW = [k if k in HOSTILE else pytest.param(k, marks=pytest.mark.slow) for k in ALL]
 
 
 @cache
@@ -68,7 +70,11 @@ def joined(parts):
     return [torch.cat(each) for each in zip(*parts, strict=True)]
 
 
-def check(kind, num, dtype, beside):
+@pytest.mark.onnx
+@pytest.mark.parametrize("beside", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", SOME_SLOW)
+def test_every_kind_of_input_is_decided_alike(kind, beside):
+    num, dtype = 24, torch.float64 if beside else torch.float32
     native, by_torch = detectors()
     bins = bins_by(kind, (num, len(HAND), 150), dtype, beside)
     expected = native.predict_raw(bins)[:2]
@@ -85,17 +91,3 @@ def check(kind, num, dtype, beside):
     stream = StreamingDetector(native, dtype=dtype)
     parts = [*map(stream.push, whole.T.split(37)), stream.flush()]
     assert_agree(joined((each.score, each.is_valid) for each in parts), offline, "stream")
-
-
-@pytest.mark.onnx
-@pytest.mark.parametrize("kind", HOSTILE)
-def test_what_is_lost_in_rounding_is_flagged_by_all(kind):
-    check(kind, 24, torch.float32, beside=False)
-
-
-@pytest.mark.onnx
-@pytest.mark.slow
-@pytest.mark.parametrize("beside", [False, True])
-@pytest.mark.parametrize("kind", ALL)
-def test_every_kind_of_input_is_decided_alike(kind, beside):
-    check(kind, 80, torch.float64 if beside else torch.float32, beside)

@@ -8,27 +8,12 @@ from hypothesis import strategies as st
 
 from tactslip_torch.data.clock import even_clock, nominal_rate, snapped_rate
 from tactslip_torch.data.file_recordings import EvenSamples
+from tactslip_torch.data.formats import Samples
 
 RATE = 2000.0
 RATES = (92.31, 98.0, 101.0, 700.0, 900.0, 1000.0, 1024.0, 1300.0, 2000.0)
 UNITS = (0.0, 1e-6, 1e-3, 1e-2)
 ROUNDED = [(r, u) for r in RATES for u in UNITS if u * r <= (2.2 if u < 1e-2 else 1.2)]
-
-
-class Kept:
-    """Samples in memory."""
-
-    def __init__(self, values):
-        self.values, self.dtype = values, values.dtype
-        self.num_channels, self.num_samples = values.shape
-
-    def read(self, first, stop):
-        assert 0 <= first <= stop <= self.num_samples
-        return self.values[:, first:stop].clone()
-
-
-def clock_of(seconds, stated_hz=None, name="a.csv"):
-    return even_clock(np.asarray(seconds, np.float64), stated_hz, name)
 
 
 def ticks(num, dropped=(), rate=RATE):
@@ -42,6 +27,10 @@ def rounded(rate, unit, left, seed=0):
     start = torch.rand(1, generator=torch.Generator().manual_seed(seed)).double() / 100
     seconds = left.double() / rate + start
     return (seconds / unit).floor() * unit if unit else seconds
+
+
+def clock_of(seconds, stated_hz=None):
+    return even_clock(np.asarray(seconds, np.float64), stated_hz, "a.csv")
 
 
 def missing_ticks(clock):
@@ -63,16 +52,14 @@ def test_what_was_dropped_is_found_and_filled(gaps, jitter, seed):
     found = clock_of(seconds + late - late[0], RATE)
     assert (found.num_samples, missing_ticks(found)) == (1000, sorted(dropped))
     assert found.jitter_s <= jitter / RATE + 1e-12
-    values = torch.stack([left.double(), -left.double()])
-    ramp = torch.arange(1000).double()
+    kept = Samples("a.csv", np.stack([left, -left]).astype(float), time_axis=1)
+    ramp = torch.arange(1000).double().expand(2, -1) * torch.tensor([[1.0], [-1.0]])
     holed = ramp.clone()
-    holed[sorted(dropped)] = torch.nan
-    whole = EvenSamples(Kept(values), found).read(0, 1000)
-    torch.testing.assert_close(whole, torch.stack([holed, -holed]), equal_nan=True)
-    bridged = EvenSamples(Kept(values), found, most_bridged=1000)  # a ramp is its own bridge
+    holed[:, sorted(dropped)] = torch.nan
+    torch.testing.assert_close(EvenSamples(kept, found).read(0, 1000), holed, equal_nan=True)
+    bridged = EvenSamples(kept, found, most_bridged=1000)  # a ramp is its own bridge
     for first, stop in ((0, 1000), (17, 333), (500, 501), (990, 2000), (40, 40)):
-        part = bridged.read(first, stop)
-        torch.testing.assert_close(part, torch.stack([ramp, -ramp])[:, first:stop])
+        torch.testing.assert_close(bridged.read(first, stop), ramp[:, first:stop])
 
 
 @pytest.mark.parametrize(("rate", "unit"), ROUNDED)
