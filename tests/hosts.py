@@ -80,24 +80,18 @@ def saved(path: Path, samples: np.ndarray) -> Path:
     return path
 
 
-_EXPORTED: dict[tuple[str, bool], Path] = {}
+_EXPORTED: dict[bool, Path] = {}
 
 
-def exported(folder_factory: Any, precision: str = "float32", *, with_onset: bool = False) -> Path:
-    """A folder with ``model.onnx``, ``stream.onnx`` and their sidecars, made once in a session.
-
-    Args:
-        folder_factory: pytest's ``tmp_path_factory``.
-        precision: of the graphs.
-        with_onset: whether the detector has an onset classifier.
-    """
-    if (precision, with_onset) not in _EXPORTED:
-        folder: Path = folder_factory.mktemp(f"exported_{precision}")
+def exported(folder_factory: Any, *, with_onset: bool = False) -> Path:
+    """A folder with ``model.onnx``, ``stream.onnx`` and their sidecars, made once in a session."""
+    if with_onset not in _EXPORTED:
+        folder: Path = folder_factory.mktemp("exported")
         with pytest.MonkeyPatch.context() as patch:  # the hosts are asked here, not the graph
             patch.setattr(export, "check_model", lambda *given: {"worst_sd": 0.0})
-            export.export_detector(alarming_detector(with_onset), folder, precision=precision)
-        _EXPORTED[precision, with_onset] = folder
-    return _EXPORTED[precision, with_onset]
+            export.export_detector(alarming_detector(with_onset), folder)
+        _EXPORTED[with_onset] = folder
+    return _EXPORTED[with_onset]
 
 
 def copied(model: Path, folder: Path) -> Path:
@@ -111,10 +105,10 @@ def sidecar_of(model: Path) -> Path:
     return model.with_name(f"{model.name}.json")
 
 
-def truncated(path: Path, share: float = 0.5) -> Path:
-    """The same file, cut off."""
+def truncated(path: Path) -> Path:
+    """The same file, cut off in its middle."""
     content = path.read_bytes()
-    path.write_bytes(content[: int(len(content) * share)])
+    path.write_bytes(content[: len(content) // 2])
     return path
 
 
