@@ -1,6 +1,13 @@
+"""Kernels, the machine that is fitted to training bins, and derivatives through the fit."""
+
+import json
+import math
+
 import numpy as np
+import oracles
 import pytest
 import torch
+from scipy.spatial.distance import cdist
 from sklearn.kernel_ridge import KernelRidge
 
 from tactslip_torch.model import fit
@@ -11,10 +18,108 @@ from tactslip_torch.model.kernels import (
     Polynomial,
     QuadraticForm,
     RadialBasis,
+    collapse,
+    kernel_from_dict,
+    machine_of,
 )
 
 FOLDING = [PAPER_KERNEL, Polynomial(2, 1.5), Polynomial(2, 0.0), Polynomial(1, 0.5)]
 KEEPING = [Polynomial(3, 0.5), Polynomial(4, 1.0), RadialBasis(0.3)]
+KERNELS = [*FOLDING, *KEEPING]
+
+
+def by_definition(kernel, a, b):
+    if isinstance(kernel, Polynomial):
+        return oracles.kernel(a, b, kernel.degree, kernel.offset)
+    return np.exp(-kernel.gamma * cdist(a, b, "sqeuclidean"))
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=str)
+def test_a_kernel_is_its_definition_with_derivatives_and_comes_back_from_json(kernel, rng):
+    a, b = (torch.from_numpy(rng.standard_normal((num, 3))) for num in (3, 4))
+    expected = by_definition(kernel, a.numpy(), b.numpy())
+    found = kernel(a, b).numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+    assert torch.autograd.gradcheck(kernel, (a.requires_grad_(), b.requires_grad_()))
+    assert torch.autograd.gradgradcheck(kernel, (a, b))
+    assert torch.autograd.gradcheck(lambda a: kernel(a, a), a)
+    assert kernel_from_dict(json.loads(json.dumps(kernel.to_dict()))) == kernel
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({}, "must be one of polynomial, radial basis, got None"),
+        ({"kind": "radial basis"}, "{} does not describe a radial basis kernel"),
+        ({"kind": "polynomial", "degree": "2"}, "does not describe a polynomial kernel"),
+        ({"kind": "polynomial", "degree": 0}, "degree of the kernel .* got 0"),
+        ({"kind": "polynomial", "offset": math.nan}, "offset .* at least 0, got nan"),
+        ({"kind": "radial basis", "gamma": 0.0}, "gamma .* positive and finite, got 0"),
+    ],
+)
+def test_what_describes_no_kernel_is_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        kernel_from_dict(values)
+
+
+# Heads ----------------------------------------------------------------------------------------
+
+
+def terms_of(rng, num_bins=20, num_features=4):
+    """Bins and the weight of each in a sum of kernels."""
+    support = torch.from_numpy(rng.uniform(-1, 1, (num_bins, num_features)))
+    return support, torch.from_numpy(rng.standard_normal(num_bins))
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=str)
+def test_a_head_is_the_sum_over_its_bins(kernel, rng, device):
+    support, beta = terms_of(rng)
+    head = machine_of(support, beta, kernel).to(device)
+    assert isinstance(head, QuadraticForm if kernel.collapses else KernelSum)
+    z = torch.from_numpy(rng.uniform(-1, 1, (6, 4))).to(device)
+    terms = by_definition(kernel, z.cpu().numpy(), support.numpy()) * beta.numpy()
+    error = np.abs(head(z).cpu().numpy() - terms.sum(-1))
+    assert (error <= 1e-11 * np.abs(terms).sum(-1)).all()
+    single = machine_of(support, beta, kernel).to(device).float()
+    oracles.assert_manners(lambda z: (head if z.dtype == torch.float64 else single)(z), z)
+    assert torch.autograd.gradcheck(head, z.requires_grad_())
+    bad = torch.zeros(2, 4, dtype=torch.float64, device=device)
+    bad[1, 2] = torch.nan
+    assert head(bad).isnan().tolist() == [False, True]
+    numbers = sum(value.numel() for value in head.state_dict().values())
+    assert (head.num_features, head.cost.num_bytes) == (4, 8 * numbers)
+
+
+def test_a_form_is_folded_in_float64_and_gradients_reach_its_bins(rng):
+    """20 000 terms that cancel: sums in float32 would be off in the third digit."""
+    support = torch.from_numpy(rng.uniform(-1, 1, (20000, 3))).float()
+    beta = torch.from_numpy(rng.choice([-1e4, 1e4], 20000)).float()
+    z = torch.from_numpy(rng.uniform(-1, 1, (5, 3)))
+    terms = PAPER_KERNEL(z, support.double()) * beta
+    error = (collapse(support, beta)(z) - terms.sum(-1)).abs()
+    assert bool((error <= 1e-10 * terms.abs().sum(-1)).all())
+    few = [part.requires_grad_() for part in terms_of(rng, 5, 3)]
+    for kernel in (PAPER_KERNEL, Polynomial(1), RadialBasis(0.3)):
+        assert torch.autograd.gradcheck(lambda s, b, k=kernel: machine_of(s, b, k)(z), few)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: collapse(torch.zeros(2, 3), torch.ones(2), Polynomial(3)), r"does not fold .*Sum"),
+        (lambda: KernelSum(torch.zeros(5, 2), torch.zeros(4), Polynomial(3)), r"\(5, 2\) and \(4,"),
+        (
+            lambda: QuadraticForm(*map(torch.zeros, ((2, 3), (3,), ()))),
+            r"\(2, 3\), \(3,\) and \(\)",
+        ),
+    ],
+)
+def test_what_makes_no_head_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+# Fit -----------------------------------------------------------------------------------------
 
 
 def draw(rng, num_bins, num_features=3, weighted=False):
@@ -25,15 +130,13 @@ def draw(rng, num_bins, num_features=3, weighted=False):
     return TrainingBins(z, is_slip, weights)
 
 
-def ridge(bins, penalty, kernel=PAPER_KERNEL):
-    """The same machine from scikit-learn."""
-    if isinstance(kernel, Polynomial):
-        kind = {"kernel": "poly", "degree": kernel.degree, "gamma": 1, "coef0": kernel.offset}
-    else:
-        kind = {"kernel": "rbf", "gamma": kernel.gamma}
+def ridge(bins, penalty, kernel, new):
+    """What the same machine of scikit-learn says of new bins."""
+    own = bins.features.numpy()
     weights = None if bins.weights is None else bins.weights.numpy()
-    model = KernelRidge(alpha=1 / penalty, **kind)
-    return model.fit(bins.features.numpy(), bins.targets.numpy(), sample_weight=weights)
+    model = KernelRidge(alpha=1 / penalty, kernel="precomputed")
+    model.fit(by_definition(kernel, own, own), bins.targets.numpy(), sample_weight=weights)
+    return model.predict(by_definition(kernel, new, own))
 
 
 @pytest.mark.parametrize(
@@ -50,7 +153,7 @@ def test_bins_that_do_not_fit_together_are_refused(is_slip, weights, message):
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("kernel", [*FOLDING, *KEEPING], ids=str)
+@pytest.mark.parametrize("kernel", KERNELS, ids=str)
 @pytest.mark.parametrize("num_bins", [10, 60])
 def test_every_machine_equals_kernel_ridge(num_bins, kernel, weighted, rng):
     """Three features have ten monomials: the dual up to ten bins, the primal above if it folds."""
@@ -60,7 +163,7 @@ def test_every_machine_equals_kernel_ridge(num_bins, kernel, weighted, rng):
     for penalty in (0.05, 3.0):
         machine = fit_machine(bins, penalty, kernel)
         assert isinstance(machine, QuadraticForm if kernel in FOLDING else KernelSum)
-        expected = ridge(bins, penalty, kernel).predict(new)
+        expected = ridge(bins, penalty, kernel, new)
         actual = machine(torch.from_numpy(new)).numpy()
         np.testing.assert_allclose(actual, expected, rtol=1e-10, atol=1e-10)
 

@@ -26,16 +26,6 @@ def random_bins(seed, num_bins=500):
     return truth, truth ^ (torch.rand(num_bins, generator=generator) < 0.1)
 
 
-def labels(num_bins=500, scenes=("taps", "paper", "grips")):
-    """Material, speed, scene and position of each bin."""
-    return (
-        [("iron", "ABS", "wood")[i * i % 7 % 3] for i in range(num_bins)],
-        [(60.0, 40.0, 20.0, 100.0)[i % 4] for i in range(num_bins)],
-        [scenes[i % len(scenes)] for i in range(num_bins)],
-        [None if i % 10 == 0 else i * 7 % 60 - 30 for i in range(num_bins)],
-    )
-
-
 def test_scores_equal_scikit_learn():
     truth, predicted = random_bins(0)
     confusion = confusion_matrix(truth, predicted)
@@ -52,8 +42,10 @@ def test_scores_equal_scikit_learn():
 
 def test_groups_are_scores_of_their_own_bins():
     truth, predicted = random_bins(1)
-    materials, speeds, scenes, places = labels(scenes=("paper",))
-    scores = bin_metrics(truth, predicted, materials, speeds, scenes, places)
+    materials = [("iron", "ABS", "wood")[i * i % 7 % 3] for i in range(500)]
+    speeds = [60.0, 40.0, 20.0, 100.0] * 125
+    places = [None if i % 10 == 0 else i * 7 % 60 - 30 for i in range(500)]
+    scores = bin_metrics(truth, predicted, materials, speeds, ["paper"] * 500, places)
     assert list(scores["per_material"]) == list(dict.fromkeys(materials))
     assert list(scores["per_speed"]) == ["20", "40", "60", "100"]
     for kind, given in (("per_material", materials), ("per_speed", [f"{s:g}" for s in speeds])):
