@@ -13,23 +13,21 @@ import random
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import mean
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from hydra.utils import instantiate
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import SEEN_ROLE, FittedMachine, composed, small_recipe, statistics_from
-from benchmarks.tables import COLORS, LIGHT, Report, Table, by, percent
+from benchmarks.tables import Report, Table, by, percent
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.model.calibration import ABSTAIN, NON_SLIP, SLIP, Abstention, fit_platt
 from tactslip_torch.model.fit import HeldOut
 from tactslip_torch.report.metrics import CLASSES, answer_counts, answer_metrics
 from tactslip_torch.simulation import SEEN_MATERIALS
 
-OURS = "recordings as units, ours"
 MEASURES = {
     "covered": "coverage %",
     "abstained": "abstained %",
@@ -58,9 +56,10 @@ class Abstaining(Benchmark):
         "thresholds of abstention were set"
     )
     quick = (
-        'overrides=[data.cycles=4,"data.materials=[M1,M4,iron]"] num_held_out=1 splits=2 '
+        'overrides=[data.cycles=3,"data.materials=[M1,M4,iron]"] num_held_out=1 splits=1 '
         "train_bins=30 scored_bins=40 num_features=20 penalties=[0.001] coverages=[0.5,0.8]"
     )
+    charts: ClassVar = {"": [(f"{role}: {of}", "coverage") for role, of in SEEN_ROLE.items()]}
     overrides: tuple[str, ...] = ()
     num_held_out: int = 4
     splits: int = 8
@@ -96,32 +95,14 @@ class Abstaining(Benchmark):
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Means over splits by role."""
         num = len({tuple(row["held_out"]) for row in numbers["rows"]})
-        found = {}
-        for role, words in SEEN_ROLE.items():
-            cells = []
-            own = [row for row in numbers["rows"] if row["role"] == role]
-            for (way, asked), of in by(own, "way", "asked").items():
-                row: dict[str, object] = {"thresholds by": way, "asked %": f"{100 * asked:g}"}
-                row |= {title: percent(mean(one[n] for one in of)) for n, title in MEASURES.items()}
-                cells.append(row | {"least coverage %": percent(min(r["covered"] for r in of))})
-            note = f"Means over {num} choices of held-out materials."
-            found[f"{role}: {words}"] = Table(cells, note)
-        return found
-
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Coverage kept against coverage asked for."""
-        panels = drawing.subplots(1, len(SEEN_ROLE), sharey=True)
-        for axes, (role, words) in zip(panels, SEEN_ROLE.items(), strict=True):
-            rows = [row for row in numbers["rows"] if row["role"] == role]
-            asked = sorted({row["asked"] for row in rows})
-            for color, ((way,), own) in zip(COLORS, by(rows, "way").items(), strict=False):
-                kept = [mean(row["covered"] for row in of) for of in by(own, "asked").values()]
-                axes.plot(asked, kept, "o-", color=color, label=way)
-            axes.plot(asked, asked, "--", color=LIGHT)
-            axes.set(title=words, xlabel="coverage asked for")
-        panels[0].set_ylabel("coverage kept")
-        handles = panels[0].get_legend_handles_labels()
-        drawing.legend(*handles, loc="outside lower center", ncols=3)
+        found: dict[str, list[dict[str, object]]] = {}
+        for (role, way, asked), of in by(numbers["rows"], "role", "way", "asked").items():
+            row: dict[str, object] = {"thresholds by": way, "asked %": f"{100 * asked:g}"}
+            row |= {title: percent(mean(one[n] for one in of)) for n, title in MEASURES.items()}
+            row["least coverage %"] = percent(min(one["covered"] for one in of))
+            found.setdefault(f"{role}: {SEEN_ROLE[role]}", []).append(row)
+        note = f"Means over {num} choices of held-out materials."
+        return {title: Table(rows, note) for title, rows in found.items()}
 
 
 def _choices(names: Sequence[str], sizes: Abstaining) -> list[tuple[str, ...]]:
@@ -139,21 +120,21 @@ def _thresholds(
     """Way, coverage, and the scores below and above which a bin has an answer."""
     sample = machine.statistics.sample.bins()
     every = torch.arange(len(sample.is_slip))
-    groups = {"bin": every, "recording": sample.recording, "material": sample.group}
     bins = machine.plan.training_bins(sample)
-    held = {
-        name: HeldOut(bins, group, machine.plan.kernel).at(machine.plan.penalty).scores
-        for name, group in groups.items()
-    }
-    platt = fit_platt(held["material"], sample.is_slip, machine.weights)
+
+    def without(groups: Tensor) -> Tensor:
+        return HeldOut(bins, groups, machine.plan.kernel).at(machine.plan.penalty).scores
+
+    by_bin, by_recording, by_material = map(without, (every, sample.recording, sample.group))
+    platt = fit_platt(by_material, sample.is_slip, machine.weights)
     for coverage in coverages:
-        for way, left_out, unit in (
-            (OURS, "recording", sample.recording),
-            ("the same, material left out", "material", sample.recording),
-            ("bins as units", "bin", every),
+        for way, scores, unit in (
+            ("recordings as units, ours", by_recording, sample.recording),
+            ("the same, material left out", by_material, sample.recording),
+            ("bins as units", by_bin, every),
         ):
             try:
-                found = Abstention.fit(held[left_out], sample.is_slip, unit, coverage)
+                found = Abstention.fit(scores, sample.is_slip, unit, coverage)
                 yield way, coverage, found.low, found.high
             except ValueError:  # too few recordings for any answer
                 yield way, coverage, -math.inf, math.inf

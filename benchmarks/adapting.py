@@ -9,19 +9,18 @@ too, features ranked and scaled anew).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from statistics import mean, median
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import FittedMachine, Trained
-from benchmarks.tables import COLORS, Report, Table, by, limits, percent
+from benchmarks.tables import Report, Table, by, limits, percent
 from benchmarks.timing import timed
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.statistics import TrainingStatistics
@@ -37,6 +36,7 @@ from tactslip_torch.training.adaptation import (
     solve,
     statistics_of,
 )
+from tactslip_torch.training.recipe import best_threshold
 
 AUTO, SLIP_FREE, ONE, SHIFT, CEILING = "auto", "slip-free", "weight 1", "threshold", "ceiling"
 BinsByName = dict[str, RecordingBins]
@@ -72,10 +72,11 @@ class Adapting(Benchmark):
     title = "A new material from a few recordings"
     about = "balanced accuracy on a new material and on the old ones, by recordings that are added"
     quick = (
-        "training=[+exp=quick,recipe=robust,data.cycles=4,recipe.num_features=10,"
-        '"recipe.penalties=[0.0003]",split.train_fraction=0.75] counts=[1,2] draws=1 '
-        "train_fraction=0.6 limited=2"
+        "training=[+exp=quick,recipe=robust,data.cycles=4,recipe.num_features=10,num_workers=0,"
+        '"recipe.penalties=[0.0003]",split.train_fraction=0.75,baselines=false] counts=[1,2] '
+        "draws=1 train_fraction=0.6 limited=2"
     )
+    charts: ClassVar = {"": [("New material", ""), ("Old materials' test recordings", "")]}
     training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
     counts: tuple[int, ...] = (1, 2, 5, 10)
     draws: int = 3
@@ -117,20 +118,17 @@ class Adapting(Benchmark):
         """Limits, new and old materials, and how the weight was chosen."""
         rows, found = numbers["rows"], {}
         for key, title in (("new", "New material"), ("old", "Old materials' test recordings")):
-            cells = [
-                {"way": way, "recordings": count}
-                | {
-                    material: _cell([one[key] for one in of if one["material"] == material])
-                    for (material,) in by(rows, "material")
-                }
-                for (way, count), of in by(rows, "way", "count").items()
-            ]
-            found[title] = Table(
-                cells, "Balanced accuracy, %, median of draws (lowest to highest)."
-            )
+            cells = []
+            for (way, count), of in by(rows, "way", "count").items():
+                row = {"way, recordings": f"{way}, {count}"}
+                for (material,), own in by(of, "material").items():
+                    row[material] = _cell([one[key] for one in own])
+                cells.append(row)
+            note = "Balanced accuracy, %, median of draws (lowest to highest)."
+            found[title] = Table(cells, note)
         weights = [
             {"weight of a new bin": f"{factor:g}"}
-            | {f"{key} %": percent(mean(row[key] for row in these)) for key in _KEYS}
+            | {f"{key} %": percent(mean(row[key] for row in these)) for key in ("new", "old")}
             for (factor,), these in by(numbers["weights"], "factor").items()
         ]
         note = "Where each training material in turn is new; means over them."
@@ -145,27 +143,8 @@ class Adapting(Benchmark):
         about = {"How the weight was chosen": Table(weights, note)}
         return {"Limits": limits(goals), **found, **about}
 
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """New and old against the number of recordings."""
-        panels = drawing.subplots(1, 2)
-        rows = numbers["rows"]
-        for axes, key, title in zip(panels, _KEYS, ("new material", "old materials"), strict=True):
-            for place, way in enumerate((AUTO, SLIP_FREE, ONE, SHIFT)):
-                these = by((row for row in rows if row["way"] in (way, "before")), "count")
-                means = [mean(100 * row[key] for row in of) for of in these.values()]
-                counts = [count for (count,) in these]
-                axes.plot(counts, means, "o-", color=COLORS[place], label=way)
-            axes.set(title=title, xlabel="recordings added")
-        panels[0].set_ylabel("balanced accuracy, %, mean of materials")
-        panels[0].legend()
-
-
-_KEYS = ("new", "old")
-
 
 def _cell(values: Sequence[float]) -> str:
-    if not values:
-        return "-"
     spread = f" ({percent(min(values))} to {percent(max(values))})" if len(values) > 1 else ""
     return percent(median(values)) + spread
 
@@ -187,7 +166,9 @@ def _adapted(
     """Scores after these recordings are brought to the detector in one way."""
     head = subject.before.head
     if way == SHIFT:
-        return _scores(head, new, old, best_shift(head, *_joined(chosen)))
+        z, is_slip = _joined(chosen)
+        best = best_threshold(head(z)[:, None], is_slip)
+        return _scores(head, new, old, best.threshold if best.sign > 0 else 0.0)
     if way == ONE:
         after = subject.statistics.reweighed(dict.fromkeys(chosen, 1.0), chosen)
         machine = after.machine
@@ -245,43 +226,26 @@ def _weights(subject: _Subject, sizes: Adapting) -> Iterator[dict[str, Any]]:
                 for place, name in enumerate(solved.known.material_names)
                 if name != material and bool((of := solved.known.material == place).any())
             ]
-            new = _score(solved.head, others or bins, 0.0)
+            new = _score(solved.head, others or bins)
             yield {"material": material, "factor": factor, "new": new, "old": mean(old)}
 
 
-def best_shift(head: Head, z: Tensor, is_slip: Tensor) -> float:
-    """What to add to scores so that balanced accuracy on these bins is best.
-
-    Example:
-        >>> best_shift(lambda z: z[:, 0], torch.tensor([[-2.0], [-1.0]]), torch.tensor([0, 1]) > 0)
-        1.5
-    """
-    scores = head(z).sort()
-    truth = is_slip[scores.indices].double()
-    zero = truth.new_zeros(1)
-    missed, quiet = torch.cat([zero, truth.cumsum(0)]), torch.cat([zero, (1 - truth).cumsum(0)])
-    recalls = (missed[-1] - missed) / missed[-1].clamp(min=1) + quiet / quiet[-1].clamp(min=1)
-    place = int(recalls.argmax())
-    values = scores.values
-    return -float((values[max(place - 1, 0)] + values[min(place, len(values) - 1)]) / 2)
-
-
-def _joined(bins: Mapping[str, RecordingBins]) -> tuple[Tensor, Tensor]:
+def _joined(bins: BinsByName) -> tuple[Tensor, Tensor]:
     own = list(bins.values())
     return torch.cat([one.z for one in own]), torch.cat([one.is_slip for one in own])
 
 
-def _score(head: Head, bins: BinsByName, shift: float) -> float:
+def _score(head: Head, bins: BinsByName, threshold: float = 0.0) -> float:
     z, is_slip = _joined(bins)
-    return float(mean_recall(head(z) + shift >= 0, is_slip))
+    return mean_recall(head(z) >= threshold, is_slip)
 
 
 def _scores(
-    head: Head, new: BinsByName, old: Sequence[BinsByName], shift: float = 0.0
+    head: Head, new: BinsByName, old: Sequence[BinsByName], threshold: float = 0.0
 ) -> dict[str, float]:
     """Of the new material, and the mean over old ones."""
-    olds = [_score(head, bins, shift) for bins in old]
-    return {"new": _score(head, new, shift), "old": mean(olds)}
+    olds = [_score(head, bins, threshold) for bins in old]
+    return {"new": _score(head, new, threshold), "old": mean(olds)}
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ from benchmarks.subjects import (
     raw_bins,
     stream_samples,
 )
-from benchmarks.tables import Report, Spread, Table
+from benchmarks.tables import Table, times
 from benchmarks.timing import in_fresh_process, interleaved, on_threads, timed
 from tactslip_torch import SlipDetector, StreamingDetector
 from tactslip_torch.deploy.export import export_detector
@@ -89,7 +89,7 @@ class Deployment(Benchmark):
         "the main job's detector exported to ONNX and run by onnxruntime, beside the package, on "
         "1 thread"
     )
-    bars = (("Bins", "us a bin"), ("A stream", "us a push"))
+    charts: ClassVar = {"": (("Bins", "us a bin"), ("A stream", "us a push"))}
     quick = "recordings=1 evaluated=16 rounds=2 bulk=[4] push=100 streamed_s=2.0 starts=1"
     libraries = ("onnxruntime", "onnx")
     recordings: int = 33
@@ -114,52 +114,20 @@ class Deployment(Benchmark):
                 export = partial(export_detector, main.detector(), place, precision=precision)
                 seconds, _ = timed(export)
                 for name in ("model.onnx", "stream.onnx"):
-                    row = {"file": f"{name}, {precision}", "seconds": seconds}
-                    files.append(row | {"bytes": (place / name).stat().st_size})
-            return {
-                "files": files,
-                "bins": _bins(main, Path(folder), self),
-                "streams": _streams(main, Path(folder), self),
-                "starts": _starts(Path(folder), self.starts),
-                "push": self.push,
+                    row = {"file": f"{name}, {precision}"}
+                    row["kB"] = f"{(place / name).stat().st_size / 1e3:,.0f}"
+                    files.append(row | {"s to make both and check them": f"{seconds:.1f}"})
+            note = (
+                "Error of scores in standard deviations of the reference's; flips: bins that are "
+                "decided otherwise."
+            )
+            tables = {
+                "Bins": Table(_bins(main, Path(folder), self), note),
+                "A stream": Table(_streams(main, Path(folder), self)),
+                "Files": Table(files),
+                "A first score in a fresh process": Table(_starts(Path(folder), self.starts)),
             }
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Bins, streams, files, starts."""
-        bins = [
-            {"way": row["way"]}
-            | {f"us a bin, {of} at once": Spread(*us) for of, us in row["us"].items()}
-            | {"error": row["error"], "flips": row["flips"]}
-            for row in numbers["bins"]
-        ]
-        push = f"us a push of {numbers['push']} samples"
-        streams = [
-            {"way": row["way"], push: Spread.of(row["seconds"], 1e6), "error": row["error"]}
-            for row in numbers["streams"]
-        ]
-        files = [
-            {
-                "file": row["file"],
-                "kB": f"{row['bytes'] / 1e3:,.0f}",
-                "s to make both and check them": f"{row['seconds']:.1f}",
-            }
-            for row in numbers["files"]
-        ]
-        parts = ("import", "load", "first")
-        starts = [
-            {"way": row["way"]} | {f"{of} s": f"{median(row[f'{of}_s']):.2f}" for of in parts}
-            for row in numbers["starts"]
-        ]
-        note = (
-            "Error of scores in standard deviations of the reference's; flips: bins that are "
-            "decided otherwise."
-        )
-        return {
-            "Bins": Table(bins, note),
-            "A stream": Table(streams),
-            "Files": Table(files),
-            "A first score in a fresh process": Table(starts),
-        }
+            return {"tables": tables}
 
 
 def _bins(main: MainJobDetector, folder: Path, sizes: Deployment) -> list[dict[str, Any]]:
@@ -168,25 +136,20 @@ def _bins(main: MainJobDetector, folder: Path, sizes: Deployment) -> list[dict[s
         ways[f"onnxruntime, {precision}"] = bin_scores(folder / precision / "model.onnx")
         ways[f"tactslip_torch, {precision}"] = partial(_score, main.detector(dtype), dtype)
     ways[REFERENCE] = partial(_score, main.detector(FLOAT64, "torch"), FLOAT64)
-    us: dict[str, dict[str, Spread]] = {name: {} for name in ways}
+    rows: dict[str, dict[str, Any]] = {name: {"way": name} for name in ways}
     for size in (1, *sizes.bulk):
         say(f"deployment: {size} bins at once")
         bins = raw_bins(size)
         timings = interleaved({n: partial(way, bins) for n, way in ways.items()}, sizes.rounds)
         for name, timing in timings.items():
-            us[name][str(size)] = Spread.of(timing["seconds"], 1e6 / size)
+            rows[name][f"us a bin, {size} at once"] = times(timing["seconds"], 1e6 / size)
     evaluated = raw_bins(sizes.evaluated, min(sizes.recordings, 12))
     scores = {n: np.asarray(way(evaluated), np.float64).ravel() for n, way in ways.items()}
     exact = scores[REFERENCE]
-    return [
-        {
-            "way": name,
-            "us": us[name],
-            "error": float(np.abs(own - exact).max() / exact.std()),
-            "flips": int(((own >= 0) != (exact >= 0)).sum()),
-        }
-        for name, own in scores.items()
-    ]
+    for name, own in scores.items():
+        rows[name]["error"] = float(np.abs(own - exact).max() / exact.std())
+        rows[name]["flips"] = int(((own >= 0) != (exact >= 0)).sum())
+    return list(rows.values())
 
 
 def _score(detector: SlipDetector, dtype: torch.dtype, samples: torch.Tensor) -> Any:
@@ -213,8 +176,15 @@ def _streams(main: MainJobDetector, folder: Path, sizes: Deployment) -> list[dic
     calls = {n: partial(_next_push, of, endless(samples, sizes.push)) for n, of in pushes.items()}
     timings = interleaved(calls, sizes.rounds, block_s=0.02)
     exact = scores["tactslip_torch, float64"]
-    errors = {name: float(np.abs(of - exact).max() / exact.std()) for name, of in scores.items()}
-    return [{"way": n, "seconds": timings[n]["seconds"], "error": errors[n]} for n in pushes]
+    push = f"us a push of {sizes.push} samples"
+    return [
+        {
+            "way": name,
+            push: times(timings[name]["seconds"], 1e6),
+            "error": float(np.abs(of - exact).max() / exact.std()),
+        }
+        for name, of in scores.items()
+    ]
 
 
 def _scores_of(pushed: Any) -> Array:
@@ -236,7 +206,8 @@ def _starts(folder: Path, num: int) -> list[dict[str, Any]]:
         say(f"deployment: fresh processes with {way}")
         given = {"path": str(folder / file), "bin_path": str(folder / "bin.npy")}
         found = [in_fresh_process("benchmarks.starts:first_score", **given) for _ in range(num)]
-        rows.append({"way": way} | {part: [one[part] for one in found] for part in found[0]})
+        parts = {part: median(one[part] for one in found) for part in found[0]}
+        rows.append({"way": way} | {f"{part} s": f"{of:.2f}" for part, of in parts.items()})
     return rows
 
 

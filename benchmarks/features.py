@@ -9,16 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from benchmarks.harness import Benchmark, Job
-from benchmarks.peers import arrays, loop, others, rockets
+from benchmarks.peers import arrays, loop, others
 from benchmarks.subjects import FLOAT32, FLOAT64, labelled_bins
-from benchmarks.tables import Report, Spread, Table
+from benchmarks.tables import Table, times
 from benchmarks.timing import interleaved, on_threads
 from tactslip_torch import FeaturePool, HandLayout
 
@@ -39,7 +39,7 @@ class Features(Benchmark):
 
     title = "Features: the whole pool"
     about = "all features of filtered simulated bins of 24 channels and 50 ms"
-    bars = (("Time and error", "us a bin"),)
+    charts: ClassVar = {"": (("Time and error", "us a bin"),)}
     quick = "bins=32 slow_bins=4 num_kernels=168 rounds=2"
     libraries = ("PyWavelets", "ptwt", "tsfel", "aeon")
     bins: int = 4096
@@ -53,7 +53,7 @@ class Features(Benchmark):
         some, _ = labelled_bins(1)
         bins = some[torch.arange(self.bins) % len(some)].clone()
         few = bins[: self.slow_bins]
-        rocket = rockets.mini_rocket(bins[:64].numpy(), self.threads, self.num_kernels)
+        rocket = others.mini_rocket(bins[:64].numpy(), self.threads, self.num_kernels)
         names = [(n.channel, n.component, n.domain, n.descriptor) for n in FeaturePool(HAND).names]
         windows = bins.float().numpy()
         ways: dict[str, tuple[int, Callable[[], Any]]] = {
@@ -73,33 +73,19 @@ class Features(Benchmark):
             for name, (num, call) in ways.items():
                 found = torch.as_tensor(np.atleast_2d(call()))
                 is_same = found.shape[1] == truth.shape[1] and "Rocket" not in name
-                error = feature_error(found, truth) if is_same else None
-                row = {"way": name, "features": found.shape[1], "bins": num, "error": error}
-                rows.append(row | {"seconds": timings[name]["seconds"]})
-        return {"threads": self.threads, "rows": rows}
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Time of a bin and error of each way."""
+                us = times(timings[name]["seconds"], 1e6 / num)
+                row = {"way": name, "features": found.shape[1], "us a bin": us, "bins a call": num}
+                rows.append(row | {"error": _error(found, truth) if is_same else None})
         note = (
-            f"{numbers['threads']} threads where a way takes threads. Error: the largest, over "
+            f"{self.threads} threads where a way takes threads. Error: the largest, over "
             "the larger of the reference's magnitude and its column's standard deviation; of "
             "entropy and mode, which step, the 99th percentile. NaN of the loop, which has no "
             "rule for constants, is left out."
         )
-        rows = [
-            {
-                "way": row["way"],
-                "features": row["features"],
-                "us a bin": Spread.of(row["seconds"], 1e6 / row["bins"]),
-                "bins a call": row["bins"],
-                "error": row["error"],
-            }
-            for row in numbers["rows"]
-        ]
-        return {"Time and error": Table(rows, note)}
+        return {"tables": {"Time and error": Table(rows, note)}}
 
 
-def feature_error(found: Tensor, reference: Tensor) -> float:
+def _error(found: Tensor, reference: Tensor) -> float:
     """The largest relative error; of descriptors that step, the 99th percentile."""
     num = min(len(found), len(reference))
     size = torch.maximum(reference[:num].abs(), reference.std(0, correction=0))

@@ -11,15 +11,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
 from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import Array
-from benchmarks.tables import Report, Spread, Table, limits, number
+from benchmarks.tables import Table, limits, number, times
 from benchmarks.timing import interleaved, on_threads, paired_ratio
 from tactslip_torch.data.formats import FORMATS, Archived, pieces
 from tactslip_torch.simulation.simulate import SimulatedRecordings
@@ -41,7 +42,7 @@ class Formats(Benchmark):
 
     title = "Files"
     about = "a simulated recording of 24 channels at 2 kHz in float32, in every format on 1 thread"
-    bars = (("Reading", ("whole, ms", "by stretches, ms", "by its library, ms")),)
+    charts: ClassVar = {"": (("Reading", ("whole, ms", "by stretches, ms", "by its library, ms")),)}
     quick = "duration_s=1.0 rounds=2"
     libraries = ("h5py", "mcap", "rosbags", "pyarrow")
     duration_s: float = 14.0
@@ -73,45 +74,30 @@ class Formats(Benchmark):
                 calls |= {f"{name} {way}": call for way, call in ways.items()}
             say(f"formats: {self.rounds} rounds of {len(calls)} calls")
             timings = interleaved(calls, self.rounds)
-            rows = [
-                {
-                    "format": name,
-                    "ending": FORMATS[name].endings[0],
-                    "bytes": _bytes(path),
-                    "library": _LIBRARIES[name][0],
-                    "seconds": {way: timings[f"{name} {way}"]["seconds"] for way in WAYS},
-                }
-                for name, path in files.items()
-            ]
-        return {"rows": rows, "sample_bytes": samples.numel() * samples.element_size()}
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Limits, reading and writing."""
-        rows, reading, writing, goals = numbers["rows"], [], [], []
-        for row in rows:
-            ms, file = (
-                {way: Spread.of(of, 1e3) for way, of in row["seconds"].items()},
-                row["ending"],
-            )
+            bytes_of = {name: _bytes(path) for name, path in files.items()}
+        reading, writing, goals = [], [], []
+        for name, size in bytes_of.items():
+            seconds = {way: timings[f"{name} {way}"]["seconds"] for way in WAYS}
+            ms = {way: times(of, 1e3) for way, of in seconds.items()}
+            file = FORMATS[name].endings[0]
             reading.append(
                 {
                     "file": f".{file}",
                     "whole, ms": ms[LOAD],
                     "by stretches, ms": ms[STRETCHES],
-                    "library": row["library"],
+                    "library": _LIBRARIES[name][0],
                     "by its library, ms": ms[LIBRARY],
-                    "library / whole": paired_ratio(
-                        row["seconds"][LIBRARY], row["seconds"][LOAD]
-                    ).median,
+                    "library / whole": paired_ratio(seconds[LIBRARY], seconds[LOAD]).median,
                 }
             )
-            size = {"kB": f"{row['bytes'] / 1e3:,.0f}"}
-            size["bytes / samples"] = number(row["bytes"] / numbers["sample_bytes"])
-            writing.append({"file": f".{file}", "ms": ms[SAVE]} | size)
-            if row["format"] in LIMITED:
+            row = {"file": f".{file}", "ms": ms[SAVE], "kB": f"{size / 1e3:,.0f}"}
+            part = size / (samples.numel() * samples.element_size())
+            writing.append(row | {"bytes / samples": number(part)})
+            if name in LIMITED:
                 for way in (LOAD, STRETCHES):
-                    goals.append((f".{file} {way}, median", ms[way].median, 100, "ms"))
-        return {"Limits": limits(goals), "Reading": Table(reading), "Writing": Table(writing)}
+                    goals.append((f".{file} {way}, median", median(ms[way]), 100, "ms"))
+        tables = {"Limits": limits(goals), "Reading": Table(reading), "Writing": Table(writing)}
+        return {"tables": tables}
 
 
 def _recording(duration_s: float) -> Archived:

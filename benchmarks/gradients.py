@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torch.nn.functional import softplus
 
 from benchmarks.harness import Benchmark, Job, say
 from benchmarks.model import synthetic_bins
-from benchmarks.tables import Report, Spread, Table
+from benchmarks.tables import Table
 from benchmarks.timing import in_fresh_process, peak_bytes, timed
 from tactslip_torch.model.fit import (
     HeldOut,
@@ -60,7 +60,7 @@ class Gradients(Benchmark):
 
     title = "Gradients through the fit"
     about = "a loss and its gradient in features, C, c and weights, on synthetic bins"
-    bars = (("Forward and back", ("forward, s", "backward, s")),)
+    charts: ClassVar = {"": (("Forward and back", ("forward, s", "backward, s")),)}
     quick = "problems=[[fit,200,12,true],[left_out,200,12,true]] rounds=1"
     is_simulated = False
     problems: tuple[Problem, ...] = (
@@ -84,30 +84,23 @@ class Gradients(Benchmark):
                     given = {"problem": problem, "way": way, "threads": self.threads}
                     answer = in_fresh_process("benchmarks.gradients:one_way", **given)
                     rounds.setdefault((about, way), []).append(answer)
-        rows = [{"problem": of, "way": way, "rounds": own} for (of, way), own in rounds.items()]
-        return {"threads": self.threads, "rows": rows}
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Seconds, memory and difference of every way."""
         cells = []
-        peers = {r["problem"]: r["rounds"][0] for r in numbers["rows"] if r["way"] == PEER}
-        for row in numbers["rows"]:
-            rounds, peer, differs = row["rounds"], peers.get(row["problem"]), None
-            if peer is not None and row["way"] == OURS:
-                ours, theirs = np.array([rounds[0]["gradient"], peer["gradient"]])
+        for (about, way), own in rounds.items():
+            peer, differs = rounds.get((about, PEER)), None
+            if peer is not None and way == OURS:
+                ours, theirs = np.array([own[0]["gradient"], peer[0]["gradient"]])
                 differs = float(np.abs((ours - theirs) / theirs).max())
-            seconds = [of["backward_s"] for of in rounds if of["backward_s"] is not None]
             cells.append(
                 {
-                    "bins x features": f"{row['problem']}: {row['way']}",
-                    "forward, s": Spread.of([of["forward_s"] for of in rounds]),
-                    "backward, s": Spread.of(seconds) if seconds else None,
-                    "memory, MB": median(of["bytes"] for of in rounds) / 1e6,
+                    "bins x features": f"{about}: {way}",
+                    "forward, s": [of["forward_s"] for of in own],
+                    "backward, s": None if way == FORWARD else [of["backward_s"] for of in own],
+                    "memory, MB": median(of["bytes"] for of in own) / 1e6,
                     "off autograd": differs,
                 }
             )
-        note = f"{numbers['threads']} threads; memory: the most beyond what was held before."
-        return {"Forward and back": Table(cells, note)}
+        note = f"{self.threads} threads; memory: the most beyond what was held before."
+        return {"tables": {"Forward and back": Table(cells, note)}}
 
 
 def one_way(problem: tuple[Any, ...], way: str, threads: int) -> dict[str, Any]:

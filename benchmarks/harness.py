@@ -12,15 +12,16 @@ from __future__ import annotations
 import argparse
 import hashlib
 import inspect
+import io
 import json
 import os
 import platform
 import re
 import shutil
-import subprocess
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, fields, replace
 from importlib import metadata
 from pathlib import Path
@@ -32,13 +33,14 @@ from omegaconf import OmegaConf
 from threadpoolctl import threadpool_info  # type: ignore[import-untyped]
 
 from benchmarks import RESULTS, ROOT
-from benchmarks.tables import Report, Table, bars
+from benchmarks.tables import Report, Table, chart
+from tactslip_torch.__main__ import run
+from tactslip_torch.commands.stopping import errors_in_one_line, stopping
 from tactslip_torch.features.cache import source_digest
 from tactslip_torch.report import style
 from tactslip_torch.runtime import whole_file
 
 QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"
-EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
 def say(text: str) -> None:
@@ -96,7 +98,7 @@ def trained(overrides: Sequence[str], folder: Path, cache: Path) -> dict[str, An
         cache: of features.
 
     Raises:
-        RuntimeError: if the training fails.
+        SystemExit: if the training fails, which has said why.
     """
     given = [*overrides, "export=false", f"cache={cache}"]
     return result_of("train", given, folder, "metrics.json")
@@ -116,18 +118,16 @@ def result_of(command: str, overrides: Sequence[str], folder: Path, name: str) -
     """The JSON file ``name`` that ``tactslip COMMAND`` leaves in the folder, made by this code.
 
     Raises:
-        RuntimeError: if the command fails, which has said why.
+        SystemExit: if the command fails, which has said why.
     """
-    made_by, note = " ".join([code_digest(), *overrides]), folder / "made_by.txt"
-    if not note.exists() or note.read_text(encoding="utf-8") != made_by:
-        note.unlink(missing_ok=True)
-        given = ["-m", "tactslip_torch", command, *overrides, f"hydra.run.dir='{folder}'"]
-        say(" ".join(given))
-        done = subprocess.run([sys.executable, *given], stdout=subprocess.DEVNULL, check=False)
-        if done.returncode:
-            raise RuntimeError(f"tactslip {command} failed; see above")
-        write_text(note, made_by)
-    found: dict[str, Any] = json.loads((folder / name).read_text(encoding="utf-8"))
+
+    def made() -> Any:
+        say(" ".join(["tactslip", command, *overrides]))
+        with redirect_stdout(io.StringIO()):
+            run(command, [*overrides, f"hydra.run.dir='{folder}'"])
+        return json.loads((folder / name).read_text(encoding="utf-8"))
+
+    found: dict[str, Any] = resumed(folder / f"{command}.json", [command, *overrides], made)
     return found
 
 
@@ -168,19 +168,9 @@ def between_markers(text: str, name: str, content: str) -> str:
     return f"{before}{start}\n{content}\n{end}{rest.split(end, 1)[1]}"
 
 
-def finish(drawing: Figure, report: Report, about: str, path: Path) -> None:
-    """Title, and the file.
-
-    Args:
-        drawing: with its axes drawn.
-        report: tells whether it was quick, and whether data are simulated.
-        about: the title; that data are simulated is added.
-        path: of the PNG.
-    """
-    quick = "; QUICK, means nothing" if report["quick"] else ""
-    simulated = ", simulated" if report.get("simulated", True) else ""
-    drawing.suptitle(f"{about}{simulated}{quick}")
-    style.save(drawing, path)
+def put_between(page: Path, name: str, content: str) -> None:
+    """Replace what stands between the markers of that name in a page."""
+    write_text(page, between_markers(page.read_text(encoding="utf-8"), name, content))
 
 
 # --------------------------------------------------------------------------------- benchmarks
@@ -214,8 +204,8 @@ class Benchmark(ABC):
         is_page: whether the section is a page of its own, with the page's title above it.
         has_headings: whether the section has its own; else the page says the rest.
         is_simulated: whether its data are.
-        bars: what the figure shows: of each panel the title of a table, and how the names of the
-            columns begin that are its bars.
+        charts: by the ending of a figure's file name, of each panel the title of a table, and how
+            the names of the columns begin that it shows.
         drawn: patterns of figures that a command leaves in the folder ``numbers["folder"]``, and
             what their names end in here.
     """
@@ -230,7 +220,7 @@ class Benchmark(ABC):
     is_page: ClassVar[bool] = False
     has_headings: ClassVar[bool] = True
     is_simulated: ClassVar[bool] = True
-    bars: ClassVar[tuple[tuple[str, str | tuple[str, ...]], ...]] = ()
+    charts: ClassVar[Mapping[str, Sequence[tuple[str, str | tuple[str, ...]]]]] = {}
     drawn: ClassVar[Mapping[str, str]] = {}
 
     def __init_subclass__(cls) -> None:
@@ -238,30 +228,42 @@ class Benchmark(ABC):
 
     @abstractmethod
     def measure(self, job: Job) -> dict[str, Any]:
-        """The numbers, JSON-able."""
+        """The numbers, JSON-able: ``"tables"`` by title, or what ``tables`` makes them of."""
 
-    @abstractmethod
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Tables by title."""
+        return {title: Table(*of) for title, of in numbers["tables"].items()}
 
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Fill the figure: ``bars`` of the tables, unless a subject draws something else."""
-        panels = drawing.subplots(len(self.bars), squeeze=False)[:, 0]
-        for axes, (title, starts) in zip(panels, self.bars, strict=True):
-            names, columns = self.tables(numbers)[title].columns(starts)
-            bars(axes, names, columns, next(iter(columns)) if len(columns) == 1 else title)
+    def draw(self, numbers: Report, drawing: Figure, ending: str) -> None:
+        """Fill the figure of that ending: ``charts``, unless a subject draws something else."""
+        tables = self.tables(numbers)
+        panels = [of for of in self.charts[ending] if of[0] in tables]
+        shown = [(title, *tables[title].columns(starts)) for title, starts in panels]
+        heights = [len(names) + 3 for _, names, _ in shown]
+        drawing.set_size_inches(9.2, max(4.8, 0.22 * sum(heights)))
+        places = drawing.subplots(len(shown), squeeze=False, height_ratios=heights)[:, 0]
+        for axes, (title, names, columns) in zip(places, shown, strict=True):
+            only = next(iter(columns)) if len(columns) == 1 else ""
+            chart(axes, names, columns, f"{title}: {only}" if only else title)
 
     @style.styled
     def figures(self, report: Report, path: Path) -> None:
-        """Write the figure, and take those of a command."""
+        """Write the figures, and take those of a command."""
+        numbers = report["numbers"]
         for pattern, ending in self.drawn.items():
-            for left in Path(report["numbers"].get("folder", path / "none")).glob(pattern):
+            for left in Path(numbers.get("folder", path / "none")).glob(pattern):
                 with whole_file(path.with_stem(f"{path.stem}{ending}")) as temporary:
                     shutil.copy(left, temporary)
-        if self.bars or type(self).draw is not Benchmark.draw:
-            drawing = Figure(figsize=(8.2, 4.8), layout="constrained")
-            self.draw(report["numbers"], drawing)
-            finish(drawing, report, self.title, path)
+        simulated = ", simulated" if report["simulated"] else ""
+        quick = "; QUICK, means nothing" if report["quick"] else ""
+        titles = self.tables(numbers)
+        for ending, panels in self.charts.items():
+            if panels and not any(title in titles for title, _ in panels):
+                continue
+            drawing = Figure(figsize=(9.2, 4.8), layout="constrained")
+            self.draw(numbers, drawing, ending)
+            drawing.suptitle(f"{self.title}{simulated}{quick}")
+            style.save(drawing, path.with_stem(f"{path.stem}{ending}"))
 
     def section(self, report: Report) -> str:
         """What stands between the markers of the page, in Markdown."""
@@ -283,32 +285,24 @@ class Benchmark(ABC):
             parts += [f"{'##' if self.is_page else '###'} {title}", table.markdown()]
         return "\n\n".join(parts)
 
-    def text(self, report: Report) -> str:
-        """What is printed."""
-        lines = [
-            self.about,
-            f"machine   {', '.join(report['machine'].values())}",
-            f"versions  {', '.join(f'{name} {of}' for name, of in report['versions'].items())}",
-            *(["SIMULATED: nothing about a real hand"] if report["simulated"] else []),
-            *([QUICK_LINE] if report["quick"] else []),
-        ]
-        tables = self.tables(report["numbers"]).items()
-        return "\n\n".join(["\n".join(lines), *(f"{of}\n{table.text()}" for of, table in tables)])
-
     def publish(self, report: Report, folder: Path) -> None:
-        """Print tables; write figure and page section, of a quick run a page of its own."""
-        print(self.text(report))
+        """Print and write the page section, of a quick run a page of its own; write figures."""
+        section = self.section(report)
+        print(section)
         self.figures(report, folder / f"{self.name}.png")
         page = folder / f"{self.name}.md" if report["quick"] else ROOT / self.page
-        markers, content = self.markers or self.name, self.section(report)
         if report["quick"]:
-            write_text(page, content + "\n")
+            write_text(page, section + "\n")
         else:
-            write_text(page, between_markers(page.read_text(encoding="utf-8"), markers, content))
+            put_between(page, self.markers or self.name, section)
         print(f"section in {page}")
 
     def run(self, arguments: Sequence[str] | None = None) -> int:
-        """Entry point; the exit status."""
+        """Entry point; the exit status, 0.
+
+        Raises:
+            SystemExit: with status 2 for bad input, said in one line; 130 or 143 when stopped.
+        """
         parser = argparse.ArgumentParser(
             prog=f"python -m benchmarks.{self.name}", description=f"{self.title}: {self.about}."
         )
@@ -326,28 +320,20 @@ class Benchmark(ABC):
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{self.name}.json"
         if given.render:
-            if not path.exists():
-                parser.error(f"--render needs {path}; leave --render out, which measures")
-            report = json.loads(path.read_text(encoding="utf-8"))
+            report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
             if "numbers" not in report:
-                parser.error(f"{path} was kept by earlier code; leave --render out, which measures")
+                text = f"--render needs {path}, made by present code; leave it out, which measures"
+                parser.error(text)
             self.publish(report, folder)
             return 0
         runs = (folder / "runs" if given.quick else outputs) / self.name
         resized = [text for text in given.overrides if text.startswith("sizes.")]
         overrides = tuple(text for text in given.overrides if text not in resized)
-        try:
+        with stopping(), errors_in_one_line():
             asked = self._with(self.quick.split()) if given.quick else self
             asked = asked._with([text.removeprefix("sizes.") for text in resized])
             machine = machine_description()  # before the load of the measurement
             numbers = asked.measure(Job(runs, overrides, given.quick))
-        except KeyboardInterrupt:
-            return EXIT_INTERRUPTED
-        except (FileNotFoundError, ValueError, RuntimeError) as error:
-            if os.environ.get("TACTSLIP_TRACEBACK"):
-                raise
-            print(f"error: {error}", file=sys.stderr)
-            return EXIT_FAILED if isinstance(error, RuntimeError) else EXIT_BAD_INPUT
         report = {
             "code": code_digest(),
             "simulated": self.is_simulated,

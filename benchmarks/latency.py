@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from sklearn.svm import SVC
 
 from benchmarks.deployment import bin_scores
 from benchmarks.harness import Benchmark, Job, say
-from benchmarks.peers import loop, others, rockets
+from benchmarks.peers import loop, others
 from benchmarks.subjects import (
     FLOAT32,
     FLOAT64,
@@ -30,7 +30,7 @@ from benchmarks.subjects import (
     labelled_bins,
     raw_bins,
 )
-from benchmarks.tables import Report, Table, limits, number
+from benchmarks.tables import Table, limits, number
 from benchmarks.timing import interleaved, on_threads
 from tactslip_torch import FeaturePool, HandLayout
 from tactslip_torch.deploy.export import export_detector
@@ -60,7 +60,7 @@ class Latency(Benchmark):
         "one raw bin of 24 channels with its context to a score, the features that the main job "
         "selects, one bin at a time on 1 thread"
     )
-    bars = (("One bin to its score", ("median, us", "99th percentile, us")),)
+    charts: ClassVar = {"": (("One bin to its score", ("median, us", "99th percentile, us")),)}
     quick = "recordings=1 bins=4 looped=1 rounds=2 block_s=0.002 num_kernels=168"
     libraries = ("PyWavelets", "onnxruntime", "aeon")
     recordings: int = 8
@@ -81,15 +81,25 @@ class Latency(Benchmark):
             calls = {name: _in_turn(score, samples) for name, score in ways.items()}
             timings = interleaved(calls, self.rounds, block_s=self.block_s, most_calls=60)
             exact = _scores(ways[REFERENCE], samples)
-            rows = []
+            ours_s, rows = timings[OURS]["p50_s"], []
             for name, score in ways.items():
                 some = samples[: self.looped] if "loop" in name else samples
                 found = _scores(score, some)
                 error = np.abs(found - exact[: len(found)]).max() / max(exact.std(), 1e-12)
-                is_other = name in OTHER_MACHINES
-                row = {"way": name, "error": None if is_other else float(error)}
-                rows.append(row | timings[name])
-        return {"rows": rows}
+                of = timings[name]
+                rows.append(
+                    {
+                        "way": name,
+                        "median, us": 1e6 * of["p50_s"],
+                        "99th percentile, us": 1e6 * of["p99_s"],
+                        "of ours": f"{number(of['p50_s'] / ours_s)} x",
+                        "error": None if name in OTHER_MACHINES else float(error),
+                    }
+                )
+        note = "Error of scores in standard deviations of the reference's; - another machine."
+        goal = ("a bin to its score, float32", 1e3 * ours_s, 1e3 * MOST_S, "ms")
+        tables = {"Limits": limits([goal]), "One bin to its score": Table(rows, note)}
+        return {"tables": tables}
 
     def _ways(self) -> dict[str, Score]:
         """From one raw bin ``[1, C, n + 2 * context]``, float32, to its score."""
@@ -126,27 +136,9 @@ class Latency(Benchmark):
     def _rocket(self) -> Score:
         bins, is_slip = labelled_bins(self.recordings)
         say("latency: MiniRocket")
-        scores = rockets.fit(bins.numpy(), is_slip.numpy(), num_kernels=self.num_kernels).score
+        scores = others.fit(bins.numpy(), is_slip.numpy(), num_kernels=self.num_kernels).score
         filters = ChannelFilter(WINDOW_LENGTHS)
         return lambda samples: scores(filters.valid(samples.double()).float().numpy())
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Seconds and errors of every way."""
-        rows = numbers["rows"]
-        ours = next(row for row in rows if row["way"] == OURS)
-        cells = [
-            {
-                "way": row["way"],
-                "median, us": 1e6 * row["p50_s"],
-                "99th percentile, us": 1e6 * row["p99_s"],
-                "of ours": f"{number(row['p50_s'] / ours['p50_s'])} x",
-                "error": row["error"],
-            }
-            for row in rows
-        ]
-        note = "Error of scores in standard deviations of the reference's; - another machine."
-        goal = ("a bin to its score, float32", 1e3 * ours["p50_s"], 1e3 * MOST_S, "ms")
-        return {"Limits": limits([goal]), "One bin to its score": Table(cells, note)}
 
 
 def _in_turn(score: Score, samples: torch.Tensor) -> Callable[[], Any]:

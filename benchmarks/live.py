@@ -7,7 +7,6 @@ the first decision on it, whether one was lost, and the memory and load of the p
 
 from __future__ import annotations
 
-import gc
 import json
 import os
 import pty
@@ -21,9 +20,10 @@ import tty
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import psutil
@@ -33,7 +33,7 @@ from matplotlib.figure import Figure
 from benchmarks import ROOT
 from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import RATE_HZ, Array
-from benchmarks.tables import Report, Table, limits
+from benchmarks.tables import Report, Table, limits, lines
 from benchmarks.timing import growth_mb
 from tactslip_torch import SlipDetector, StreamingDetector, sample_recording
 
@@ -61,7 +61,8 @@ class Live(Benchmark):
         f"channels at 2 kHz, {FRAME_SAMPLES} samples a frame, a line for each decision; from when "
         "a sample was sent to when the line of the first decision on it could be read"
     )
-    quick = "seconds=4.0 settled_s=1.0 checked_s=4.0"
+    quick = "seconds=2.0 settled_s=0.5 checked_s=2.0"
+    charts: ClassVar = {"": ()}
     seconds: float = 600.0
     settled_s: float = 60.0
     checked_s: float = 60.0
@@ -72,57 +73,54 @@ class Live(Benchmark):
             folder = Path(name)
             SlipDetector.pretrained("paper24-sim").save(folder / "detector.pt")
             rows = [_fed(kind, folder, self) for kind in ("pseudo-terminal", "socket")]
-        return {"rows": rows, "settled_s": self.settled_s}
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Limits, and what was measured."""
         goals, shown = [], []
-        for row in numbers["rows"]:
-            kind, bound_ms = row["source"], row["look_ahead_ms"] + row["hop_ms"] + MARGIN_MS
-            growth = growth_mb(row, numbers["settled_s"])
-            p50, p99, most = (row["latency_ms"][key] for key in ("50", "99", "100"))
+        for row in rows:
+            kind, ms, late_ms = row["source"], row["latency_ms"], row["late_ms"]
+            bound_ms = row["look_ahead_ms"] + row["hop_ms"] + MARGIN_MS
             memory = f"{kind}: resident memory, growth after it has settled"
             goals += [
-                (f"{kind}: sample to line, 99th percentile", p99, bound_ms, "ms"),
+                (f"{kind}: sample to line, 99th percentile", ms["99"], bound_ms, "ms"),
                 (f"{kind}: samples lost", row["sent"] - row["received"], 0, ""),
-                (memory, growth, MOST_GROWTH_MB, "MB"),
+                (memory, growth_mb(row, self.settled_s), MOST_GROWTH_MB, "MB"),
                 (f"{kind}: decisions unlike those of StreamingDetector", row["unlike"], 0, ""),
             ]
             shown.append(
                 {
                     "source": kind,
                     "samples": f"{row['sent']:,}",
-                    "median, ms": p50,
-                    "99 %, ms": p99,
-                    "longest, ms": most,
-                    "of it computing and waiting, median, ms": row["late_ms"]["50"],
-                    "99 %, us": 1e3 * row["late_ms"]["99"],
-                    "of a core": row["cpu_s"] / row["seconds"],
+                    "median, ms": ms["50"],
+                    "99 %, ms": ms["99"],
+                    "longest, ms": ms["100"],
+                    "of it computing and waiting, median, ms": late_ms["50"],
+                    "99 %, us": 1e3 * late_ms["99"],
+                    "of a core": row["cpu_s"] / self.seconds,
                     "resident, MB": row["resident_bytes"][-1] / 1e6,
-                    "machine's load": f"{row['load']:.1f}",
+                    "machine's load": f"{os.getloadavg()[0]:.1f}",
                 }
             )
-        row = numbers["rows"][0]
         parts = f"{row['look_ahead_ms']:g} ms of look-ahead, {row['hop_ms']:g} ms of hop"
         note = f"Of the limit {parts} and {MARGIN_MS:g} ms of margin."
-        return {"Limits": limits(goals), "From a sample to its line": Table(shown, note)}
+        tables = {"Limits": limits(goals), "From a sample to its line": Table(shown, note)}
+        return {"tables": tables, "rows": rows}
 
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Latency by share of samples, and memory over time."""
+    def draw(self, numbers: Report, drawing: Figure, ending: str) -> None:
+        """Latency by part of samples, and memory over time."""
         latency, memory = drawing.subplots(2, 1)
-        for row in numbers["rows"]:
-            shares = [float(share) for share in row["latency_ms"]]
-            latency.plot(list(row["latency_ms"].values()), shares, label=row["source"])
-            memory.plot(row["at_s"], np.asarray(row["resident_bytes"]) / 1e6, label=row["source"])
-        latency.set(xlabel="ms from a sample to its line", ylabel="% of samples")
-        latency.legend()
-        memory.set(xlabel="s of stream", ylabel="resident, MB")
+        rows = {row["source"]: row for row in numbers["rows"]}
+        shown = {n: (list(of["latency_ms"].values()), of["latency_ms"]) for n, of in rows.items()}
+        parts = {name: (ms, list(map(float, at))) for name, (ms, at) in shown.items()}
+        lines(latency, parts, "ms from a sample to its line", "% of samples")
+        held = {n: (of["at_s"], np.divide(of["resident_bytes"], 1e6)) for n, of in rows.items()}
+        lines(memory, held, "s of stream", "resident, MB")
 
 
 def _fed(kind: str, folder: Path, sizes: Live) -> dict[str, Any]:
     """Feed one source, and what came of it."""
     say(f"live: {sizes.seconds:g} s of stream into a {kind}")
-    frames, samples = _frames()
+    samples = sample_recording().samples.T.contiguous().numpy().astype("<f4")
+    samples = samples[: len(samples) // FRAME_SAMPLES * FRAME_SAMPLES]
+    frames = cycle([of.tobytes() for of in np.split(samples, len(samples) // FRAME_SAMPLES)])
+    came: list[tuple[float, dict[str, Any]]] = []
     with ExitStack() as stack:
         source, send = _terminal(stack) if kind == "pseudo-terminal" else _socket(stack)
         command = [sys.executable, "-m", "tactslip_torch", "stream", "model=detector.pt"]
@@ -131,13 +129,12 @@ def _fed(kind: str, folder: Path, sizes: Live) -> dict[str, Any]:
         pipe: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         run = stack.enter_context(subprocess.Popen(command, cwd=folder, env=environment, **pipe))
         stack.callback(run.kill)
-        lines: list[tuple[float, bytes]] = []
         is_ready = threading.Event()
 
         def read() -> None:
             assert run.stdout is not None
             for line in run.stdout:
-                lines.append((time.monotonic(), line))
+                came.append((time.monotonic(), json.loads(line)))
                 if b"connected" in line:
                     is_ready.set()
 
@@ -147,78 +144,59 @@ def _fed(kind: str, folder: Path, sizes: Live) -> dict[str, Any]:
         if not is_ready.wait(120):
             run.kill()
             raise RuntimeError(f"tactslip stream does not begin: {run.communicate()[1].decode()}")
-        process = psutil.Process(run.pid)
-        at_s: list[float] = []
-        resident: list[int] = []
-        num = round(sizes.seconds * RATE_HZ / FRAME_SAMPLES)
-        sent_s = np.empty(num)
-        gc.collect()
+        process, at_s, resident = psutil.Process(run.pid), list[float](), list[int]()
+        sent_s = np.empty(round(sizes.seconds * RATE_HZ / FRAME_SAMPLES))
         started_s, cpu_s = time.monotonic(), sum(process.cpu_times()[:2])
-        for place in range(num):
-            due_s = started_s + place * FRAME_SAMPLES / RATE_HZ
-            if (wait_s := due_s - time.monotonic()) > 0:
-                time.sleep(wait_s)
-            body = struct.pack("<I", place) + frames[place % len(frames)]
+        for place in range(len(sent_s)):
+            due_s = place * FRAME_SAMPLES / RATE_HZ
+            time.sleep(max(0.0, started_s + due_s - time.monotonic()))
+            body = struct.pack("<I", place) + next(frames)
             sent_s[place] = time.monotonic()
             send(bytes.fromhex(HEADER) + body)
-            if place * FRAME_SAMPLES / RATE_HZ >= len(at_s):
-                at_s.append(place * FRAME_SAMPLES / RATE_HZ)
+            if due_s >= len(at_s):
+                at_s.append(due_s)
                 resident.append(int(process.memory_info().rss))
         time.sleep(1.0)
         cpu_s = sum(process.cpu_times()[:2]) - cpu_s
         run.terminate()
         run.wait(30)
         reading.join(30)
-    detector = SlipDetector.pretrained("paper24-sim")
-    stream = StreamingDetector(detector, dtype=torch.float64)
-    found = [(came_s, json.loads(line)) for came_s, line in lines]
-    decided = [(came_s, row) for came_s, row in found if "score" in row]
-    last = found[-1][1]
+    stream = StreamingDetector(SlipDetector.pretrained("paper24-sim"), dtype=torch.float64)
+    decided = [(came_s, row) for came_s, row in came if "score" in row]
     end = np.rint([row["time_s"] * RATE_HZ for _, row in decided]).astype(int)  # behind the last
-    in_time = end <= num * FRAME_SAMPLES  # those that are flushed wait for what is never sent
+    in_time = end <= len(sent_s) * FRAME_SAMPLES  # those that are flushed wait for what never came
     came_s, end = np.array([came_s for came_s, _ in decided])[in_time], end[in_time]
     late_s = came_s - sent_s[(end - 1) // FRAME_SAMPLES]
     ahead = round(stream.look_ahead_s * RATE_HZ)
     # a sample's first decision is that on the first bin that ends with it or later
-    first = np.searchsorted(end - ahead, np.arange(end[0] - ahead, end[-1] - ahead), side="right")
-    samples_s = np.repeat(sent_s, FRAME_SAMPLES)[end[0] - ahead : end[-1] - ahead]
-    latency_s = came_s[first] - samples_s
-    shares = [0, *range(1, 100, 2), 50, 99, 99.9, 100]
+    which = np.arange(end[0] - ahead, end[-1] - ahead)
+    first = np.searchsorted(end - ahead, which, side="right")
+    latency_s = came_s[first] - np.repeat(sent_s, FRAME_SAMPLES)[which]
     checked = round(min(sizes.checked_s, sizes.seconds) * RATE_HZ)
     expected = stream.push(np.resize(samples, (checked, samples.shape[1])).astype(np.float64))
     pairs = zip(expected.score.tolist(), expected.is_alarm.tolist(), decided, strict=False)
-    unlike = sum(
+    unlike = [
         alarm != row["alarm"] or not abs(score - row["score"]) < 1e-9
         for score, alarm, (_, row) in pairs
-    )
+    ]
 
-    def percentiles_ms(seconds: Array, shares: list[float]) -> dict[str, float]:
-        return {f"{share:g}": 1e3 * float(np.percentile(seconds, share)) for share in shares}
+    def percentiles_ms(seconds: Array, parts: list[float]) -> dict[str, float]:
+        return {f"{part:g}": 1e3 * float(np.percentile(seconds, part)) for part in parts}
 
+    last = came[-1][1]
     return {
         "source": kind,
-        "seconds": sizes.seconds,
-        "sent": num * FRAME_SAMPLES,
+        "sent": len(sent_s) * FRAME_SAMPLES,
         "received": round(last["seconds"] * RATE_HZ) if "decisions" in last else 0,
-        "decisions": len(decided),
-        "unlike": unlike + max(0, len(expected.score) - len(decided)),
-        "events": [row["text"] for _, row in found if "event" in row],
+        "unlike": sum(unlike) + max(0, len(expected.score) - len(decided)),
         "look_ahead_ms": 1e3 * stream.look_ahead_s,
         "hop_ms": 1e3 * stream.hop_s,
-        "latency_ms": percentiles_ms(latency_s, sorted(shares)),
+        "latency_ms": percentiles_ms(latency_s, [*range(0, 99, 2), 99, 99.9, 100]),
         "late_ms": percentiles_ms(late_s, [50, 99, 100]),
         "cpu_s": cpu_s,
         "at_s": at_s,
         "resident_bytes": resident,
-        "load": os.getloadavg()[0],
     }
-
-
-def _frames() -> tuple[list[bytes], Array]:
-    """The sample recording as values of frames, and its samples ``[T, 24]``."""
-    samples = sample_recording().samples.T.contiguous().numpy().astype("<f4")
-    samples = samples[: len(samples) // FRAME_SAMPLES * FRAME_SAMPLES]
-    return [part.tobytes() for part in np.split(samples, len(samples) // FRAME_SAMPLES)], samples
 
 
 def _terminal(stack: ExitStack) -> tuple[str, Callable[[bytes | None], object]]:

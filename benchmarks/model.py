@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from sklearn.svm import SVC
 from torch import Tensor
 
 from benchmarks.harness import Benchmark, Job, say
-from benchmarks.tables import Report, Spread, Table, listed, number, percent
+from benchmarks.tables import Table, listed, number, percent
 from benchmarks.timing import in_fresh_process, interleaved, on_threads, peak_bytes, timed
 from tactslip_torch import SufficientStats
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
@@ -45,7 +45,7 @@ class Model(Benchmark):
 
     title = "Kernel machine at any size"
     about = "the kernel machine of degree 2 on synthetic features, beside scikit-learn"
-    bars = (("Fits", "fit, s"), ("Fits", "a score, us"))
+    charts: ClassVar = {"": (("Fits", "fit, s"), ("Fits", "a score, us"))}
     quick = "num_features=12 fitted=[200] test_bins=100 folded=240 any_bins=10000 rounds=1"
     is_simulated = False
     num_features: int = 120
@@ -61,38 +61,23 @@ class Model(Benchmark):
         """Fits and scores by size, folds, and any number of bins."""
         with on_threads(self.threads):
             fits = [row for num_bins in self.fitted for row in _fits(num_bins, self)]
-            folds = _folds(self)
+            folds, off = _folds(self)
         say(f"model: statistics of {self.any_bins:,} bins in a fresh process")
         given = {"num_bins": self.any_bins, "num_features": self.num_features}
-        any_size = in_fresh_process("benchmarks.model:accumulate", threads=self.threads, **given)
-        return {"fits": fits, "folds": folds, "any_size": any_size | given}
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Fits, folds and any size."""
-        fits = [
-            {
-                "machine": f"{row['way']}, {row['num_bins']:,} bins",
-                "fit, s": Spread.of(row["fit_s"]),
-                "a score, us": 1e6 * row["score_s"],
-                "accuracy %": percent(row["accuracy"]),
-                "off KernelRidge": row["off"],
-            }
-            for row in numbers["fits"]
-        ]
-        seconds, of = numbers["folds"]["seconds"].items(), numbers["any_size"]
-        folds = [{"folds": way, "s": Spread.of(one)} for way, one in seconds]
+        of = in_fresh_process("benchmarks.model:accumulate", threads=self.threads, **given)
         whole = {
-            "bins": f"{of['num_bins']:,}",
-            "bins a second": f"{of['num_bins'] / of['add_s']:,.0f}",
+            "bins": f"{self.any_bins:,}",
+            "bins a second": f"{self.any_bins / of['add_s']:,.0f}",
             "s to solve": of["solve_s"],
             "peak memory, MB": f"{of['peak_bytes'] / 1e6:,.0f}",
         }
         note = "A score: one bin on 1 thread. Off: the largest difference of scores."
-        folded = f"Largest difference of held-out scores: {number(numbers['folds']['off'])}."
         return {
-            "Fits": Table(fits, note),
-            "Folds": Table(folds, folded),
-            "Any number of bins": listed("statistics in a process of its own", whole),
+            "tables": {
+                "Fits": Table(fits, note),
+                "Folds": Table(folds, f"Largest difference of held-out scores: {number(off)}."),
+                "Any number of bins": listed("statistics in a process of its own", whole),
+            }
         }
 
 
@@ -167,18 +152,17 @@ def _fits(num_bins: int, sizes: Model) -> list[dict[str, Any]]:
         scores = np.asarray(scorer(new))
         rows.append(
             {
-                "way": way,
-                "num_bins": num_bins,
-                "fit_s": fits[way if way in fits else "fit_machine"]["seconds"],
-                "score_s": times[way]["p50_s"],
-                "accuracy": float(((scores >= 0) == truth.numpy()).mean()),
-                "off": None if way == "SVC" else float(np.abs(scores - exact).max()),
+                "machine": f"{way}, {num_bins:,} bins",
+                "fit, s": fits[way if way in fits else "fit_machine"]["seconds"],
+                "a score, us": 1e6 * times[way]["p50_s"],
+                "accuracy %": percent(float(((scores >= 0) == truth.numpy()).mean())),
+                "off KernelRidge": None if way == "SVC" else float(np.abs(scores - exact).max()),
             }
         )
     return rows
 
 
-def _folds(sizes: Model) -> dict[str, Any]:
+def _folds(sizes: Model) -> tuple[list[dict[str, Any]], float]:
     say(f"model: {sizes.num_folds} folds of {sizes.folded:,} bins")
     z, is_slip = synthetic_bins(sizes.folded, sizes.num_features)
     groups = torch.arange(len(z)) % sizes.num_folds
@@ -199,7 +183,7 @@ def _folds(sizes: Model) -> dict[str, Any]:
     }
     timings = interleaved(calls, sizes.rounds, block_s=0)
     off = (calls["fit and folds in closed form"]() - refits()).abs().max()
-    return {"seconds": {n: of["seconds"] for n, of in timings.items()}, "off": float(off)}
+    return [{"folds": way, "s": of["seconds"]} for way, of in timings.items()], float(off)
 
 
 if __name__ == "__main__":

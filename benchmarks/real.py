@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from itertools import groupby, islice, product, starmap
 from pathlib import Path
 from statistics import median
@@ -21,7 +21,6 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import torch
 from hydra.utils import instantiate
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
@@ -33,9 +32,9 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from benchmarks.harness import Benchmark, Job
-from benchmarks.peers import rockets
+from benchmarks.peers import others
 from benchmarks.subjects import composed
-from benchmarks.tables import GREY, OURS, PEER, SECOND, THIRD, Report, Table, number, percent
+from benchmarks.tables import Report, Table, chart, limits, lines, listed, number, percent
 from benchmarks.timing import interleaved, on_threads, paired_ratio, timed
 from tactslip_torch import SlipDetector, StreamingDetector
 from tactslip_torch.commands.detect import detect
@@ -63,7 +62,7 @@ SCENES = {
     "t": "stable touch",
 }
 """What the set's folders mean."""
-AIM_BALANCED, AIM_AUC, TIMES_FASTER = 0.952, 0.99, 10.0
+_AIMS, _TIMES_FASTER = {"balanced_accuracy": 0.952, "auc": 0.99}, 10.0
 COVERAGE = 0.95
 HOP_MS = 40.0
 _AT_ONCE = 64
@@ -99,6 +98,7 @@ class Real(Benchmark):
         "hydra_groups=4 trees=5 leaves=[1] regression_penalties=[0.1,1.0] draws=50 rounds=2 batch=8"
     )
     drawn: ClassVar = {"*.png": "_watched"}
+    charts: ClassVar = {"": ()}
     objects: int | None = None
     each: int | None = None
     inner: int = 5
@@ -150,38 +150,27 @@ class Real(Benchmark):
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """All tables, by the heading that they stand under."""
-        objects = {name: name for name in numbers["data"]["objects"]}
         return {
             "The recordings": _data(numbers),
             "Limits": _limits(numbers),
             "Scores": _scores(numbers),
-            "Each object, left out of everything": _groups(numbers, "objects", objects),
-            "Each direction of slip": _groups(numbers, "scenes", SCENES),
+            "Each object, left out of everything": _groups(numbers, "objects"),
+            "Each direction of slip": _groups(numbers, "scenes"),
             "As streams": _streams(numbers),
             "How sure the differences are": _differences(numbers),
             "Time": _times(numbers),
             "What the folds chose": _choices(numbers),
         }
 
-    def draw(self, numbers: Report, drawing: Figure) -> None:
+    def draw(self, numbers: Report, drawing: Figure, ending: str) -> None:
         """Balanced accuracy by object, and the corner of the ROC curves that matters."""
-        drawing.set_size_inches(11.0, 5.2)
-        rows = numbers["methods"]
-        shown = [name for name, row in rows.items() if row["time"] is not None]
-        palette = (OURS, SECOND, PEER, "#f0a07a", THIRD, "#cc79a7", "#56b4e9", "#e69f00")
-        colors = dict(zip(shown, palette, strict=False))
-        dots, curves = drawing.subplots(1, 2, width_ratios=(1.25, 1.0))
-        _draw_objects(dots, rows, colors)
-        for name in shown:
-            row, width = rows[name], 2.0 if name == numbers["ours"] else 1.2
-            label = f"{name}: AUC {100 * row['auc']:.1f} %"
-            x, y = row["curve"]["false_alarms"], row["curve"]["found"]
-            curves.plot(x, y, color=colors[name], lw=width, label=label)
-            curves.plot(1 - row["specificity"], row["sensitivity"], "o", color=colors[name], ms=5)
+        drawing.set_size_inches(9.2, 9.0)
+        dots, curves = drawing.subplots(2, 1)
+        chart(dots, *_groups(numbers, "objects").columns(""), "balanced accuracy by object, %")
+        shown = {n: of["curve"] for n, of in numbers["methods"].items() if of["time"] is not None}
+        rates = {name: (of["false_alarms"], of["found"]) for name, of in shown.items()}
+        lines(curves, rates, "stable touch called slip", "slip detected")
         curves.set(xlim=(0, _CORNER), ylim=(1 - _CORNER, 1.0))
-        curves.set(xlabel="stable touch called slip", ylabel="slip detected")
-        curves.set_title("ROC curves, their corner; dots: at 0, where it decides")
-        drawing.legend(loc="outside lower center", ncols=3)
 
 
 # ------------------------------------------------------------------------------------- windows
@@ -208,12 +197,12 @@ class Windows:
     pool: Array
     pool_s: float
 
-    @property
+    @cached_property
     def objects(self) -> Array:
         """What each window was touched with, ``[N]``, text."""
         return np.array([recording.material for recording in self.recordings])[self.recording]
 
-    @property
+    @cached_property
     def scenes(self) -> Array:
         """How it slid, or that it did not, ``[N]``, text."""
         return np.array([recording.scene for recording in self.recordings])[self.recording]
@@ -310,12 +299,9 @@ def methods_of(
     same = partial(_same_features, windows, sizes)
     found["our features, logistic regression"] = (same, windows.pool_s)
     for name, grid in (("logistic regression", regressions), ("random forest", forests)):
-
-        def fit(train: Array, _: Any, grid: Mapping[str, Any] = grid) -> Fitted:
-            return _best_of(grid, windows, sizes, simple, train, simple_statistics)
-
-        found[f"simple statistics, {name}"] = (fit, seconds / len(simple))
-    mini, multi = rockets.MINI_ROCKET, rockets.MULTI_ROCKET_HYDRA
+        best = partial(_best_of, grid, windows, sizes, simple, simple_statistics)
+        found[f"simple statistics, {name}"] = (best, seconds / len(simple))
+    mini, multi = others.MINI_ROCKET, others.MULTI_ROCKET_HYDRA
     kinds = [(mini, seed, sizes.rocket_kernels) for seed in sizes.rocket_seeds]
     for kind in [*kinds, (multi, sizes.rocket_seeds[0], sizes.multi_rocket_kernels)]:
         rocket = partial(_rocket, windows, *kind, sizes.hydra_groups)
@@ -360,7 +346,7 @@ def _same_features(
         return detector.scaled(detector.extractor(torch.from_numpy(samples)).double()).numpy()
 
     grid = _regressions(sizes, {"": None})  # columns are compressed already
-    return _best_of(grid, windows, sizes, rows, train, describe)
+    return _best_of(grid, windows, sizes, rows, describe, train, detector)
 
 
 def _rocket(
@@ -369,9 +355,7 @@ def _rocket(
     """Features by random convolutions, and ridge with a penalty chosen by objects left out."""
     samples, sizes = windows.samples[train].astype(np.float32), {"num_groups": groups}
     objects, is_slip = windows.objects[train], windows.is_slip[train]
-    made = rockets.fit(
-        samples, is_slip, objects, name=name, seed=seed, num_kernels=kernels, **sizes
-    )
+    made = others.fit(samples, is_slip, objects, name=name, seed=seed, num_kernels=kernels, **sizes)
     return Fitted(made.score, {"alpha": made.alpha})
 
 
@@ -411,8 +395,9 @@ def _best_of(
     windows: Windows,
     sizes: Real,
     rows: Array,
-    train: Array,
     describe: Callable[[Array], Array],
+    train: Array,
+    _: SlipDetector | None,
 ) -> Fitted:
     """The classifier of the grid that is best on training objects left out."""
     objects, choices = windows.objects[train], {"classifier": list(grid.values())}
@@ -637,46 +622,30 @@ def _data(numbers: Report) -> Table:
         "groups of Hydra's kernels": settings["hydra_groups"],
         "trees of the forest": settings["trees"],
     }
-    return Table([{"": name, "number": of} for name, of in rows.items()])
+    return listed("number of", rows)
 
 
 def _limits(numbers: Report) -> Table:
-    """What was wanted of ours, and by how much it is met or missed."""
-    rows, rockets = numbers["methods"], numbers["rockets"]
-    ours = rows[numbers["ours"]]
-    found: list[tuple[str, str, str, bool]] = []
-
-    def row(what: str, key: str, wanted: float, words: str) -> None:
-        value, sign = ours[key], "above" if words == "above" else "at least"
-        measured = f"{percent(value)} %, {100 * (value - wanted):+.2f} points"
-        is_met = value > wanted if words == "above" else value >= wanted
-        found.append((what, measured, f"{sign} {100 * wanted:.4g} %", is_met))
-
-    for rocket in rockets:
-        other = rows[rocket]["balanced_accuracy"]
-        row(f"balanced accuracy above {rocket}", "balanced_accuracy", other, "above")
-    row("balanced accuracy, the aim", "balanced_accuracy", AIM_BALANCED, "")
-    row("AUC, the aim", "auc", AIM_AUC, "")
-    for how, words in (("batched", "many windows at once"), ("alone", "one window alone")):
-        ratio, what = ours["time"][f"{how}_times_faster"]["median"], f"faster than {rockets[0]}"
-        is_met = ratio >= TIMES_FASTER
-        found.append(
-            (f"times {what}: {words}", number(ratio), f"at least {TIMES_FASTER:g}", is_met)
-        )
-    above = [
-        name for name, of in rows.items() if of["balanced_accuracy"] > ours["balanced_accuracy"]
+    """What was wanted of ours, whether it is met, and what is better."""
+    methods, rockets = numbers["methods"], numbers["rockets"]
+    ours = methods[numbers["ours"]]
+    own, key = 100 * ours["balanced_accuracy"], "balanced_accuracy"
+    goals = [
+        (f"balanced accuracy of {name}", own, 100 * methods[name][key], "%") for name in rockets
     ]
+    for measure, words in (("balanced_accuracy", "balanced accuracy"), ("auc", "AUC")):
+        goals.append((f"{words}, the aim", 100 * ours[measure], 100 * _AIMS[measure], "%"))
+    for how, words in (("batched", "many windows at once"), ("alone", "one window alone")):
+        ratio = ours["time"][f"{how}_times_faster"]["median"]
+        goals.append((f"times faster than {rockets[0]}: {words}", ratio, _TIMES_FASTER, ""))
+    above = [name for name, of in methods.items() if 100 * of[key] > own]
+    found = limits(goals, is_least=True)
+    met = [row[""] for row in found.rows].count("met")
     note = (
-        f"{sum(met for *_, met in found)} of {len(found)} limits are met, by {numbers['ours']}. "
+        f"{met} of {len(goals)} limits are met, by {numbers['ours']}. "
         f"Higher in balanced accuracy, of all methods and seeds: {'; '.join(above) or 'none'}."
     )
-    cells = [
-        dict(
-            zip(("limits", "measured", "limit", ""), (*of, "met" if met else "MISSED"), strict=True)
-        )
-        for *of, met in found
-    ]
-    return Table(cells, note)
+    return Table(found.rows, note)
 
 
 def _scores(numbers: Report) -> Table:
@@ -695,13 +664,13 @@ def _scores(numbers: Report) -> Table:
     return Table(rows)
 
 
-def _groups(numbers: Report, kind: str, names: Mapping[str, str]) -> Table:
+def _groups(numbers: Report, kind: str) -> Table:
     """Balanced accuracy on each object, or the part of windows told right in each scene."""
     head = "balanced accuracy %" if kind == "objects" else "windows told right, %"
     return Table(
         [
             {head: method}
-            | {names[name]: percent(row[kind][name], 1) for name in names if name in row[kind]}
+            | {SCENES.get(name, name): percent(of, 1) for name, of in row[kind].items()}
             for method, row in numbers["methods"].items()
         ]
     )
@@ -709,15 +678,14 @@ def _groups(numbers: Report, kind: str, names: Mapping[str, str]) -> Table:
 
 def _streams(numbers: Report) -> Table:
     found = numbers["streams"]
-    of_scene = {words: found["by_scene"].get(name) for name, words in SCENES.items()}
     rows = [
         {
             "whole recordings as streams": words,
-            "recordings": of["recordings"],
-            "with an alarm": of["with_alarm"],
+            "recordings": found["by_scene"][name]["recordings"],
+            "with an alarm": found["by_scene"][name]["with_alarm"],
         }
-        for words, of in of_scene.items()
-        if of
+        for name, words in SCENES.items()
+        if name in found["by_scene"]
     ]
     note = (
         "Each whole recording through `StreamingDetector`, by the machine of the fold that left "
@@ -782,27 +750,6 @@ def _choices(numbers: Report) -> Table:
         text = "; ".join(f"{choice} ({times}x)" for choice, times in counts.most_common())
         cells.append({"method": name, "chosen inside the folds": text})
     return Table(cells)
-
-
-def _draw_objects(axes: Axes, rows: Mapping[str, Any], colors: Mapping[str, str]) -> None:
-    """A line for each method: a dot for each object, the worst named, a bar at all windows."""
-    look: dict[str, Any] = {
-        "textcoords": "offset points",
-        "ha": "center",
-        "va": "center",
-        "size": 7,
-    }
-    for place, (name, row) in enumerate(rows.items()):
-        color, worst = colors.get(name, GREY), row["worst"]
-        values = [100 * value for value in row["objects"].values()]
-        axes.plot(values, [place] * len(values), "o", color=color, ms=5, alpha=0.55, mew=0)
-        axes.plot(100 * row["balanced_accuracy"], place, "|", color=color, ms=20, mew=2)
-        at = 100 * worst["balanced_accuracy"], place
-        axes.annotate(worst["object"], at, (0, -9), color="#555555", **look)
-    axes.set_yticks(range(len(rows)), list(rows))
-    axes.set_ylim(len(rows) - 0.4, -0.6)
-    axes.set_xlabel("balanced accuracy, %: dots objects, bar all windows")
-    axes.set_title("objects that were left out")
 
 
 if __name__ == "__main__":

@@ -9,16 +9,15 @@ whatever the unit.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from hydra.utils import instantiate
-from matplotlib.figure import Figure
 from sklearn.metrics import roc_auc_score
 
 from benchmarks.harness import Benchmark, Job
 from benchmarks.subjects import Array, composed
-from benchmarks.tables import Report, Table, bars
+from benchmarks.tables import Table
 from tactslip_torch.data.recording import RecordingSource, Timeline
 
 WINDOW_S, WINDOWS = 0.25, 4
@@ -52,6 +51,7 @@ class Realism(Benchmark):
     about = "how channels differ and move together, without slip and with it"
     quick = "cycles=1"
     is_simulated = False
+    charts: ClassVar = {"": [("Channels", "")]}
     cycles: int = 6
 
     def measure(self, job: Job) -> dict[str, Any]:
@@ -62,44 +62,23 @@ class Realism(Benchmark):
             "simulated, paper": ["scene=paper", cycles],
             "simulated, hard": ["scene=hard", cycles],
         }
-        found = {}
+        shown: dict[str, dict[str, str]] = {text: {} for text in STATISTICS.values()}
+        areas: dict[str, dict[str, str]] = {text: {} for text in AREAS.values()}
         for name, given in overrides.items():
             source = instantiate(composed("train", given).data, _convert_="all")
-            slip, rest = (_windows(source, is_slip) for is_slip in (True, False))
-            found[name] = {
-                "sample_rate_hz": source.sample_rate_hz,
-                "stretches": {"slip": len(slip), "rest": len(rest)},
-                "slip": _statistics(slip),
-                "rest": _statistics(rest),
-                "areas": _areas(slip, rest),
-            }
-        return {"sets": found}
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Every statistic of every set: rest, then slip."""
-        sets = numbers["sets"].items()
-        rows = [
-            {"statistic": text}
-            | {of: f"{one['rest'][name]:.2f} / {one['slip'][name]:.2f}" for of, one in sets}
-            for name, text in STATISTICS.items()
-        ]
-        rows += [
-            {"statistic": text} | {of: f"{one['areas'][name]:.2f}" for of, one in sets}
-            for name, text in AREAS.items()
-        ]
+            windows = {kind: _windows(source, kind == "slip") for kind in ("rest", "slip")}
+            for kind, own in windows.items():
+                for statistic, value in _statistics(own).items():
+                    shown[STATISTICS[statistic]][f"{name}, {kind}"] = f"{value:.2f}"
+            for area, value in _areas(windows["slip"], windows["rest"]).items():
+                areas[AREAS[area]][name] = f"{value:.2f}"
         note = (
-            f"Rest / slip, windows of {WINDOW_S:g} s. Real: electrodes of one fingertip; "
-            "simulated: films of five fingers. Spreads and wander are of natural logarithms."
+            f"Windows of {WINDOW_S:g} s. Real: electrodes of one fingertip; simulated: films of "
+            "five fingers. Spreads and wander are of natural logarithms."
         )
-        return {"Channels": Table(rows, note)}
-
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Statistics of slip."""
-        series = {
-            name: [of["slip"][statistic] for statistic in STATISTICS]
-            for name, of in numbers["sets"].items()
-        }
-        bars(drawing.subplots(), list(STATISTICS.values()), series, "of slip", is_log=False)
+        channels = Table([{"statistic": text} | of for text, of in shown.items()], note)
+        by_threshold = Table([{"slip by a threshold": text} | of for text, of in areas.items()])
+        return {"tables": {"Channels": channels, "Areas": by_threshold}}
 
 
 def _stretches(times: Timeline, is_slip: bool) -> list[float]:

@@ -7,12 +7,12 @@ from a detector that ``python -m tactslip_torch.train +exp=unseen4`` has left.
 
 from __future__ import annotations
 
-import argparse
 import json
-from pathlib import Path
+import sys
 from typing import Any
 
 from benchmarks import RESULTS
+from benchmarks.harness import keep_numbers, versions
 from tactslip_torch import SlipDetector
 
 KEPT = RESULTS / "selection.json"
@@ -26,16 +26,7 @@ def kept_selection() -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    from benchmarks.harness import keep_numbers, versions
-
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.selection", description=__doc__)
-    parser.add_argument("model", type=Path, help="detector.pt of a training")
-    parser.add_argument("--json", type=Path, default=KEPT, metavar="FILE", help="(%(default)s)")
-    given = parser.parse_args()
-    try:
-        detector = SlipDetector.load(given.model)
-    except (OSError, ValueError) as error:
-        parser.error(str(error))
+    detector = SlipDetector.load(sys.argv[1])
     trained = {name: detector.info.get(name) for name in _KEYS}
     names = [str(name) for name in detector.selected_names]
-    keep_numbers({"trained": trained, "versions": versions(), "names": names}, given.json)
+    keep_numbers({"trained": trained, "versions": versions(), "names": names}, KEPT)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from benchmarks.harness import Benchmark, Job, result_of, trained
-from benchmarks.tables import Report, Table
+from benchmarks.tables import Table
 from tactslip_torch.report.importance import (
     RESELECT_WORDS,
     best_rows,
@@ -33,35 +33,30 @@ class Sensors(Benchmark):
         "selected anew in two ways"
     )
     quick = (
-        'training=[+exp=quick,recipe=robust,recipe.num_features=12,"recipe.penalties=[0.001]"] '
-        "overrides=[bins=20,cache=off,num_workers=0]"
+        'training=[+exp=quick,recipe=robust,recipe.num_features=12,"recipe.penalties=[0.001]",'
+        '"data.materials=[M1,M4,iron]","split.seen=[M1,M4]",baselines=false,num_workers=0] '
+        "overrides=[bins=10,scored_bins=20,gradient_bins=20,most_channels=3,draws=20,num_workers=0]"
     )
     drawn: ClassVar = {"sensors.png": ""}
     training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
     overrides: tuple[str, ...] = ()
 
     def measure(self, job: Job) -> dict[str, Any]:
-        """What the command leaves, by way of selection."""
+        """One by one and the best few, by way of selection and by unit."""
         detector = job.folder / "detector"
         trained(self.training, detector, job.folder / "cache")
         found = {}
-        for way in RESELECT_WORDS:
+        for way, selected in RESELECT_WORDS.items():
             overrides = [f"model={detector / 'detector.pt'}", f"reselect={way}"]
-            overrides += [*self.overrides, *job.overrides]
-            found[way] = result_of("importance", overrides, job.folder / way, "sensors.json")
-        return {"ways": found, "folder": str(job.folder / next(iter(RESELECT_WORDS)))}
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """One by one and the best few, by way of selection and by unit."""
-        found = {}
-        for way, content in numbers["ways"].items():
+            overrides += [f"cache={job.folder / 'cache'}", *self.overrides, *job.overrides]
+            content = result_of("importance", overrides, job.folder / way, "sensors.json")
             for unit in content["best"]:
-                words, is_first = f"{unit}, features {RESELECT_WORDS[way]}", unit == "kind"
+                words, is_first = f"{unit}, features {selected}", unit == "kind"
                 about = "; ".join(lines_about(content)) if is_first else ""
                 found[f"Without one {words}"] = Table(unit_rows(content, unit), about)
                 about = with_all_line(content) if is_first else ""
                 found[f"The best few by {words}"] = Table(best_rows(content, unit), about)
-        return found
+        return {"tables": found, "folder": str(job.folder / next(iter(RESELECT_WORDS)))}
 
 
 if __name__ == "__main__":

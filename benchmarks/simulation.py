@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
 from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import FittedMachine, composed, small_recipe, statistics_from
-from benchmarks.tables import Report, Spread, Table, percent
+from benchmarks.tables import Table, percent, times
 from benchmarks.timing import interleaved, on_threads
 from tactslip_torch.simulation import SEEN_MATERIALS, Dynamics, Scene, simulate, timeline
 from tactslip_torch.simulation.simulate import SimulatedRecordings
@@ -46,7 +46,7 @@ class Simulation(Benchmark):
 
     title = "The simulated hand"
     about = "fidelity levels and time steps: cost, difference to the smallest step, and accuracy"
-    bars = (("Levels and steps", "s a minute"),)
+    charts: ClassVar = {"": (("Levels and steps", "s a minute"),)}
     quick = (
         "steps_us=[250.0,500.0] recordings=1 rounds=1 materials=[M1,M2] cycles=4 train_bins=20 "
         "num_features=10"
@@ -61,35 +61,19 @@ class Simulation(Benchmark):
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Costs and differences by level and step; accuracies by level."""
-        with on_threads(1):
-            return {"costs": _costs(self), "accuracies": _accuracies(self, job.overrides)}
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Costs and accuracies."""
-        costs = [
-            {
-                "level": row["level"] + (f", {row['step_us']:g} us" if row["step_us"] else ""),
-                "s a minute of 24 channels": Spread.of(row["seconds"]),
-                "samples off": row["off"],
-                "onset off, ms": row["onset_ms"],
-            }
-            for row in numbers["costs"]
-        ]
-        levels = numbers["accuracies"]
-        accuracies = [
-            {"balanced accuracy, %": f"trained on {level}"}
-            | {f"on {other}": percent(of[other]) for other in levels}
-            for level, of in levels.items()
-        ]
         note = (
             "Off: the root mean square difference of samples to those of the smallest step, over "
             "their standard deviation, the worst kind of channel; and the largest of onsets."
         )
         about = "Held-out cycles of seen materials; the same cycles on every level."
-        return {
-            "Levels and steps": Table(costs, note),
-            "Trained on one level, evaluated on another": Table(accuracies, about),
-        }
+        with on_threads(1):
+            accuracies = Table(_accuracies(self, job.overrides), about)
+            return {
+                "tables": {
+                    "Levels and steps": Table(_costs(self), note),
+                    "Trained on one level, evaluated on another": accuracies,
+                }
+            }
 
 
 def _costs(sizes: Simulation) -> list[dict[str, Any]]:
@@ -113,9 +97,15 @@ def _costs(sizes: Simulation) -> list[dict[str, Any]]:
         off, onset_ms = None, None
         if step_us not in (None, sizes.steps_us[0]):
             off, onset_ms = _difference(of, scenes[level, sizes.steps_us[0]])
-        seconds = [taken / minutes for taken in timings[str((level, step_us))]["seconds"]]
-        row = {"level": level, "step_us": step_us, "seconds": seconds}
-        rows.append(row | {"off": off, "onset_ms": onset_ms})
+        seconds = timings[str((level, step_us))]["seconds"]
+        rows.append(
+            {
+                "level": level + (f", {step_us:g} us" if step_us else ""),
+                "s a minute of 24 channels": times(seconds, 1 / minutes),
+                "samples off": off,
+                "onset off, ms": onset_ms,
+            }
+        )
     return rows
 
 
@@ -139,7 +129,7 @@ def _difference(scenes: list[Scene], finest: list[Scene]) -> tuple[float, float]
 
 
 @torch.no_grad()
-def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> dict[str, dict[str, float]]:
+def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> list[dict[str, str]]:
     """Balanced accuracy on held-out cycles by the level trained on and the one evaluated on."""
     config = composed("crossval", overrides)
     recipe = small_recipe(config, sizes.train_bins, sizes.num_features)
@@ -153,15 +143,15 @@ def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> dict[str, dict[s
     bins = {
         level: materials.bins_of(sizes.materials, ("test",)) for level, materials in kept.items()
     }
-    found: dict[str, dict[str, float]] = {}
+    rows = []
     for level, materials in kept.items():
         machine = FittedMachine.of(materials.statistics_of(sizes.materials), recipe)
-        found[level] = {
-            other: balanced_accuracy(machine.scores(of.features) >= 0, of.is_slip, of.sample_weight)
-            or 0.0
-            for other, of in bins.items()
-        }
-    return found
+        row: dict[str, str] = {"balanced accuracy, %": f"trained on {level}"}
+        for other, of in bins.items():
+            says = machine.scores(of.features) >= 0
+            row[f"on {other}"] = percent(balanced_accuracy(says, of.is_slip, of.sample_weight))
+        rows.append(row)
+    return rows
 
 
 if __name__ == "__main__":

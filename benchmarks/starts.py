@@ -40,4 +40,4 @@ def first_score(path: str, bin_path: str) -> dict[str, float]:
         with torch.inference_mode():
             detector.score_raw(bins)
     done = time.perf_counter()
-    return {"import_s": imported - started, "load_s": loaded - imported, "first_s": done - loaded}
+    return {"import": imported - started, "load": loaded - imported, "first": done - loaded}

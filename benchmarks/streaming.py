@@ -19,8 +19,9 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import psutil
@@ -37,7 +38,7 @@ from benchmarks.subjects import (
     onset_settings,
     stream_samples,
 )
-from benchmarks.tables import Report, Spread, Table, bars, limits, listed
+from benchmarks.tables import Report, Table, chart, limits, lines, listed
 from benchmarks.timing import growth_mb, in_fresh_process, interleaved, on_threads
 from tactslip_torch import AlarmSettings, SlipDetector, StreamingDetector
 from tactslip_torch.deploy.export import export_detector
@@ -45,7 +46,7 @@ from tactslip_torch.onset.decisions import KEY
 
 HOP, PUSH = 20, 200
 """The settings that the limit is about: a decision every 10 ms, pushes of 100 ms."""
-LEAST_TIMES, MOST_GROWTH_MB = 20.0, 2.0
+MOST_LOAD, MOST_GROWTH_MB = 1 / 20, 2.0
 
 
 @dataclass(frozen=True)
@@ -68,9 +69,9 @@ class Streaming(Benchmark):
         "the main job selects on 1 thread; times faster than the stream runs"
     )
     quick = (
-        "recordings=1 pushes=[20,200] hops=[20,100] rounds=2 watched_s=6.0 settled_s=2.0 "
-        "onset_hops=400"
+        "recordings=1 pushes=[200] hops=[20] rounds=1 watched_s=4.0 settled_s=2.0 onset_hops=310"
     )
+    charts: ClassVar = {"": ()}
     recordings: int = 8
     pushes: tuple[int, ...] = (1, 20, 200, 2000)
     hops: tuple[int, ...] = (10, 20, 50, 100)
@@ -100,79 +101,62 @@ class Streaming(Benchmark):
                 calls[f"{kind} {hop} {push}"] = call
             say(f"streaming: {self.rounds} rounds of {len(calls)} ways")
             timings = interleaved(calls, self.rounds, block_s=0.1, most_calls=2000)
-        rows = [
-            {"way": kind, "hop": hop, "push": push, **timings[f"{kind} {hop} {push}"]}
-            for kind, hop, push in ways
+        speed = [
+            {
+                "way": f"{kind}, hop {_ms(hop)} ms, pushes of {_ms(push)} ms",
+                "times faster": [push / RATE_HZ / seconds for seconds in of["seconds"]],
+                "median push, us": 1e6 * of["p50_s"],
+                "99th percentile, us": 1e6 * of["p99_s"],
+            }
+            for (kind, hop, push), of in zip(ways, timings.values(), strict=True)
         ]
         say(f"streaming: {self.onset_hops} hops of an onset classifier")
         with on_threads(1), torch.no_grad():
             hops = _hops(detector, samples, self.onset_hops)
         say(f"streaming: {self.watched_s:g} s of stream in a fresh process")
         memory = in_fresh_process(f"benchmarks.{self.name}:watch", seconds=self.watched_s)
-        return {"rows": rows, "hops": hops, "memory": memory, "settled_s": self.settled_s}
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Limits, speed and memory."""
-        main = next(r for r in numbers["rows"] if (r["way"], r["hop"], r["push"]) == _MAIN)
-        growth, hops = growth_mb(numbers["memory"], numbers["settled_s"]), numbers["hops"]
-        load = 1 / _times(main).median
-        about = f"load at hop {_ms(HOP)} ms, pushes of {_ms(PUSH)} ms"
+        growth = growth_mb(memory, self.settled_s)
+        load = 1 / median(speed[pairs.index((HOP, PUSH))]["times faster"])
         goals = [
-            (about, load, 1 / LEAST_TIMES, "of a core"),
+            (f"load at hop {_ms(HOP)} ms, pushes of {_ms(PUSH)} ms", load, MOST_LOAD, "of a core"),
             ("resident memory, growth after it has settled", growth, MOST_GROWTH_MB, "MB"),
         ]
-        for host, name, quantile, most_us in _HOP_LIMITS:
-            if host in hops:
-                us = 1e6 * hops[host]["hop"][quantile]
-                goals.append((f"a hop of the onset classifier, {name}", us, most_us, "us"))
-        speed = [
-            {
-                "way": f"{row['way']}, hop {_ms(row['hop'])} ms, pushes of {_ms(row['push'])} ms",
-                "times faster": _times(row),
-                "median push, us": 1e6 * row["p50_s"],
-                "99th percentile, us": 1e6 * row["p99_s"],
-            }
-            for row in numbers["rows"]
-        ]
-        of_hops = [
-            {"host": host, "push": kind, "p50 us": 1e6 * of["p50"], "p99 us": 1e6 * of["p99"]}
-            for host, kinds in hops.items()
-            for kind, of in kinds.items()
-        ]
-        memory = numbers["memory"]
+        for row in hops:
+            if (row["host"], row["push"]) in _HOP_LIMITS:
+                quantile, most_us = _HOP_LIMITS[row["host"], row["push"]]
+                about = f"a hop of the onset classifier, {row['host']}, {quantile}"
+                goals.append((about, row[quantile], most_us, "us"))
         held = {
             "stream watched, s": memory["at_s"][-1],
             "resident at its end, MB": memory["resident_bytes"][-1] / 1e6,
             "growth since it settled, MB": growth,
             "held by the stream itself, kB": memory["state_bytes"] / 1e3,
         }
-        return {
+        tables = {
             "Limits": limits(goals),
             "Speed": Table(speed, "naive: a bin with all its context for every decision."),
             "Hops of an onset classifier": Table(
-                of_hops, "CPU time of one thread, pushes of 5 ms; every fifth completes a bin too."
+                hops, "CPU time of one thread, pushes of 5 ms; every fifth completes a bin too."
             ),
             "Memory": listed("memory", held),
         }
+        return {"tables": tables, "memory": memory}
 
-    def draw(self, numbers: Report, drawing: Figure) -> None:
+    def draw(self, numbers: Report, drawing: Figure, ending: str) -> None:
         """Speed by way, and memory over time."""
         speed, memory = drawing.subplots(2, 1, height_ratios=[2, 1])
-        bars(speed, *self.tables(numbers)["Speed"].columns("times"), "times faster")
-        found = numbers["memory"]
-        memory.plot(found["at_s"], np.asarray(found["resident_bytes"]) / 1e6)
-        memory.set(xlabel="s of stream", ylabel="resident, MB")
+        chart(speed, *self.tables(numbers)["Speed"].columns("times"), "times faster")
+        of = numbers["memory"]
+        held = {"resident": (of["at_s"], np.divide(of["resident_bytes"], 1e6))}
+        lines(memory, held, "s of stream", "resident, MB")
 
 
-_MAIN = ("stream", HOP, PUSH)
 _FIRST_TIMED = 300  # hop, when evidence has its floor
-_HOP_LIMITS = (("Python", "Python, p99", "p99", 300.0), ("C", "C host, median", "p50", 100.0))
+_HOP_LIMITS = {("Python", "hop"): ("p99 us", 300.0), ("C", "hop"): ("p50 us", 100.0)}
 
 
-def _hops(
-    detector: SlipDetector, samples: Array, num: int
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Seconds of CPU of pushes of a hop, those that complete a bin apart; by host."""
+def _hops(detector: SlipDetector, samples: Array, num: int) -> list[dict[str, Any]]:
+    """Time on a CPU of pushes of a hop, those that complete a bin apart; by host."""
     settings = onset_settings(detector, samples)
     assert settings.onset is not None
     hop = settings.decision_samples
@@ -182,9 +166,7 @@ def _hops(
     with TemporaryDirectory() as folder:
         if push := _c_host(detector, settings, Path(folder)):
             hosts["C"] = push
-        seconds: dict[str, dict[str, list[float]]] = {
-            host: {"hop": [], "hop and bin": []} for host in hosts
-        }
+        seconds: dict[tuple[str, str], list[float]] = {}
         for host, push in hosts.items():  # one after the other: they would share the caches
             for place, piece in enumerate(islice(endless(samples, hop), num)):
                 bins = [(x * hop - first) // settings.hop_samples for x in (place, place + 1)]
@@ -192,14 +174,13 @@ def _hops(
                 push(piece)
                 spent = time.thread_time() - started
                 if place >= _FIRST_TIMED:
-                    seconds[host]["hop" if bins[0] == bins[1] else "hop and bin"].append(spent)
-    return {
-        host: {
-            kind: dict(zip(("p50", "p99"), np.quantile(own, (0.5, 0.99)).tolist(), strict=True))
-            for kind, own in kinds.items()
-        }
-        for host, kinds in seconds.items()
-    }
+                    kind = "hop" if bins[0] == bins[1] else "hop and bin"
+                    seconds.setdefault((host, kind), []).append(spent)
+    rows = []
+    for (host, kind), own in seconds.items():
+        p50, p99 = (1e6 * np.quantile(own, (0.5, 0.99))).tolist()
+        rows.append({"host": host, "push": kind, "p50 us": p50, "p99 us": p99})
+    return rows
 
 
 def _c_host(
@@ -260,11 +241,6 @@ def _naive(detector: SlipDetector, samples: Array, hop: int) -> Callable[[], Any
 
 def _next_push(stream: StreamingDetector, samples: Iterator[Array]) -> None:
     stream.push(next(samples))
-
-
-def _times(row: Report) -> Spread:
-    """Seconds of stream over seconds of watching it."""
-    return Spread.of([row["push"] / RATE_HZ / seconds for seconds in row["seconds"]])
 
 
 def _ms(samples: int) -> str:

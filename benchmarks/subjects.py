@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 from omegaconf import DictConfig
@@ -21,7 +19,7 @@ from torch import Tensor
 from benchmarks.harness import say, trained
 from benchmarks.selection import kept_selection
 from tactslip_torch import AlarmSettings, FeaturePool, HandLayout, SlipDetector
-from tactslip_torch.commands.configuration import conf_dir, unknown_choice
+from tactslip_torch.commands.configuration import checked
 from tactslip_torch.commands.crossval import Materials
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource
@@ -36,10 +34,11 @@ from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import KEY
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.onset.rules import Cusum
+from tactslip_torch.runtime import bar, one_thread
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.simulate import SimulatedRecordings
-from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.experiment import feature_maker
+from tactslip_torch.training.datamodule import FeatureMaker, RecordingFeatures, SlipDataModule
+from tactslip_torch.training.experiment import feature_cache, feature_maker
 from tactslip_torch.training.plan import plan_detector
 from tactslip_torch.training.recipe import Recipe
 
@@ -174,19 +173,39 @@ def onset_settings(detector: SlipDetector, samples: Array) -> AlarmSettings:
 
 
 # -------------------------------------------------------------------------- trained detectors
-def composed(name: str, overrides: Sequence[str]) -> DictConfig:
-    """A configuration by its overrides.
+def composed(command: str, overrides: Sequence[str]) -> DictConfig:
+    """The configuration of a command.
 
     Raises:
         ValueError: if an override names what does not exist.
     """
-    if problem := unknown_choice(overrides):
-        raise ValueError(problem)
-    try:
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            return compose(name, list(overrides))
-    except HydraException as error:
-        raise ValueError(str(error)) from None
+    found = checked(command, overrides).composed
+    assert found is not None  # no --help
+    return found.config
+
+
+def features_of_some(
+    config: DictConfig,
+    cache: Path,
+    keep: Callable[[RecordingSource], Sequence[RecordingId]],
+    what: str,
+) -> Iterator[RecordingFeatures]:
+    """The features of some recordings of a set, made by processes and kept.
+
+    Args:
+        config: of ``tactslip train``.
+        cache: of features.
+        keep: which recordings.
+        what: in words, for the progress bar.
+    """
+    source = instantiate(config.data, _convert_="all")
+    maker = feature_maker(source, instantiate(config.labels), **config.features)
+    chosen = keep(source)
+    with feature_cache(str(cache)) as maker.cache, one_thread():  # workers need the processors
+        data = SlipDataModule(
+            maker, Split("benchmark", dict.fromkeys(chosen, "unseen")), config.num_workers
+        )
+        yield from bar(data.loader(["unseen"]), what, "recording", total=len(chosen))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,10 @@
-"""Tables that a terminal and a Markdown page show alike, numbers in them, and bars in figures."""
+"""Tables of a Markdown page, numbers in them, and charts of them."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import cycle, product
 from statistics import mean, median, quantiles, stdev
 from typing import Any, NamedTuple
 
@@ -15,10 +16,8 @@ from tactslip_torch.report import style
 percent = style.percent
 Report = Mapping[str, Any]
 """What a benchmark keeps: ``numbers`` that it measured, and what they were measured on."""
-# Okabe and Ito, told apart by the colour-blind
-OURS, SECOND, THIRD, PEER, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#888888"
-COLORS = (OURS, PEER, THIRD, SECOND, "#cc79a7", "#56b4e9", GREY)
-LIGHT = "#dddddd"
+MOST_BARS = 24
+"""In a chart; more values are dots."""
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -72,18 +71,17 @@ class Spread(NamedTuple):
     high: float
 
     @classmethod
-    def of(cls, values: Sequence[float], factor: float = 1.0) -> Spread:
-        """Median and quartiles, in another unit by a factor.
+    def of(cls, values: Sequence[float]) -> Spread:
+        """Median and quartiles.
 
         Example:
             >>> Spread.of([3.0, 1.0, 2.0])
             Spread(median=2.0, low=1.5, high=2.5)
         """
-        scaled = [factor * value for value in values]
-        if len(scaled) < 2:
-            return cls(*scaled * 3)
-        low, _, high = quantiles(scaled, n=4, method="inclusive")
-        return cls(median(scaled), low, high)
+        if len(values) < 2:
+            return cls(*[*values] * 3)
+        low, _, high = quantiles(values, n=4, method="inclusive")
+        return cls(median(values), low, high)
 
     def text(self, digits: int = 3) -> str:
         """``median (low to high)``."""
@@ -92,11 +90,11 @@ class Spread(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A table that a terminal and a Markdown file show alike.
+    """A table of a Markdown page.
 
     Attributes:
         rows: cells by column, the same columns in each; the first names the row. A fraction is
-            written as ``number`` does, a ``Spread`` as its ``text``, ``None`` as ``-``.
+            written as ``number`` does, several as their ``Spread``, ``None`` as ``-``.
         note: a line below it.
     """
 
@@ -109,14 +107,19 @@ class Table(NamedTuple):
     def columns(
         self, starts: str | tuple[str, ...]
     ) -> tuple[list[str], dict[str, list[float | None]]]:
-        """What names the rows, and by column the numbers of those whose names begin like this."""
-        first, *others = self.rows[0]
-        found = {n: [_middle(row[n]) for row in self.rows] for n in others if n.startswith(starts)}
-        return [str(row[first]) for row in self.rows], found
+        """What names the rows, and the first number of each cell in columns that begin like this.
 
-    def text(self) -> str:
-        """Aligned columns."""
-        return "\n".join(filter(None, [style.table(self._shown()), self.note]))
+        Names are the words before those columns, of the first three.
+        """
+        chosen = [name for name in list(self.rows[0])[1:] if name.startswith(starts)]
+        found = {name: [_first_number(row[name]) for row in self.rows] for name in chosen}
+        names = []
+        for row in self.rows:
+            before = list(row.items())[: min(3, list(row).index(chosen[0]))]
+            words = {name: of for name, of in before if isinstance(of, str)}
+            told = [f"{name} {of}" if of[:1].isdigit() else of for name, of in words.items()]
+            names.append(", ".join(told))
+        return names, found
 
     def markdown(self) -> str:
         """A table of Markdown, columns of numbers to the right and of words to the left."""
@@ -129,14 +132,24 @@ class Table(NamedTuple):
         return "\n".join([*lines, *(["", self.note] if self.note else [])])
 
 
-def _middle(value: Any) -> float | None:
-    return value.median if isinstance(value, Spread) else value
+def _first_number(value: Any) -> float | None:
+    """Such as the mean of ``mean ± sd``; of several numbers the median."""
+    if isinstance(value, str):
+        found = re.match(r"[+-]?[\d,]*\.?\d+", value)
+        return float(found[0].replace(",", "")) if found else None
+    middle: float | None = median(value) if isinstance(value, list) else value
+    return middle
 
 
 def _cell(value: object) -> object:
-    if isinstance(value, Spread):
-        return value.text()
+    if isinstance(value, list):
+        return Spread.of(value).text()
     return number(value) if isinstance(value, float) else value
+
+
+def times(values: Iterable[float], factor: float) -> list[float]:
+    """The values in another unit."""
+    return [factor * value for value in values]
 
 
 def listed(about: str, values: Mapping[str, object]) -> Table:
@@ -144,64 +157,75 @@ def listed(about: str, values: Mapping[str, object]) -> Table:
     return Table([{about: name, "": value} for name, value in values.items()])
 
 
-def limits(rows: Iterable[tuple[str, float, float, str]]) -> Table:
+def limits(rows: Iterable[tuple[str, float, float, str]], *, is_least: bool = False) -> Table:
     """Every limit beside what was measured, met or missed.
 
     Args:
         rows: what was measured, its value, the most that was set for it, and their unit.
+        is_least: whether the least was set in place of the most.
     """
+    sign = ">=" if is_least else "<="
     return Table(
         [
             {
                 "limits": what,
-                "measured": f"{number(measured)} {unit}".strip(),
-                "limit": f"<= {number(most)} {unit}".strip(),
-                "": "met" if measured <= most else "MISSED",
+                "measured": f"{number(measured, 4)} {unit}".strip(),
+                "limit": f"{sign} {number(limit, 4)} {unit}".strip(),
+                "": "met" if (measured >= limit if is_least else measured <= limit) else "MISSED",
             }
-            for what, measured, most, unit in rows
+            for what, measured, limit, unit in rows
         ]
     )
 
 
-def bars(
-    axes: Axes,
-    names: Sequence[str],
-    series: Mapping[str, Sequence[float | None]],
-    about: str,
-    *,
-    is_log: bool = True,
+def chart(
+    axes: Axes, names: Sequence[str], series: Mapping[str, Sequence[float | None]], about: str
 ) -> None:
-    """Horizontal bars, the first on top, each with its value; a colour and a legend by series.
+    """Horizontal bars, each with its value, or dots where they are many; the first row on top.
+
+    The axis of values is logarithmic where bars differ by more than a factor of 20 and are no
+    percentages.
 
     Args:
         axes: to draw on.
-        names: of the groups of bars.
-        series: values by their meaning, one a name; ``None`` leaves a bar out.
+        names: of the rows.
+        series: values by their meaning, one a name, a colour each; ``None`` leaves one out.
         about: labels the axis of values.
-        is_log: whether that axis is logarithmic where values differ by more than a factor of 20.
     """
-    height = 0.8 / len(series)
-    for step, (label, values) in enumerate(series.items()):
-        places = [place + height * (step - (len(series) - 1) / 2) for place in range(len(names))]
-        shown = [(place, of) for place, of in zip(places, values, strict=True) if of is not None]
-        color = COLORS[step % len(COLORS)]
-        at, widths = [place for place, _ in shown], [value for _, value in shown]
-        axes.barh(at, widths, color=color, height=0.9 * height, label=label)
-        for place, value in shown:
-            axes.annotate(
-                number(value), (value, place), (3, 0), textcoords="offset points", va="center",
-                size=7,
-            )  # fmt: skip
+    is_bars, height = len(series) * len(names) <= MOST_BARS, 0.8 / len(series)
+    looks = product("osD", style.PALETTE)
+    for step, (label, (marker, color)) in enumerate(zip(series, looks, strict=False)):
+        shift = height * (step - (len(series) - 1) / 2) if is_bars else 0.0
+        shown = {place + shift: of for place, of in enumerate(series[label]) if of is not None}
+        if not is_bars:
+            axes.plot(list(shown.values()), list(shown), marker, color=color, label=label)
+            continue
+        axes.barh(list(shown), list(shown.values()), color=color, height=0.9 * height, label=label)
+        for place, value in shown.items():
+            look: Any = {"textcoords": "offset points", "va": "center", "size": 7}
+            axes.annotate(number(value), (value, place), (3, 0), **look)
     style.lanes(axes, names)
     every = [of for values in series.values() for of in values if of]
-    is_log &= bool(every) and max(every) > 20 * min(every)
-    if is_log:
+    is_percent = "%" in about or any("%" in label for label in series)
+    if is_bars and not is_percent and every and max(every) > 20 * min(every) > 0:
         axes.set_xscale("log")
         is_narrow = max(every) < 100 * min(every)
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if is_narrow else (1,)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
+        about += " (logarithmic axis)"
     axes.margins(x=0.12)
-    axes.set_xlabel(f"{about} (logarithmic axis)" if is_log else about)
+    axes.set_xlabel(about)
+    if len(series) > 1:
+        axes.legend(**style.UPPER_LEFT_OUTSIDE)
+
+
+def lines(
+    axes: Axes, series: Mapping[str, tuple[Sequence[float], Sequence[float]]], x: str, y: str
+) -> None:
+    """Lines by their meaning, each its places and its values, and what both axes are."""
+    for (label, points), color in zip(series.items(), cycle(style.PALETTE), strict=False):
+        axes.plot(*points, ".-", color=color, label=label)
+    axes.set(xlabel=x, ylabel=y)
     if len(series) > 1:
         axes.legend()

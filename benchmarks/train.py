@@ -13,18 +13,15 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
-from itertools import cycle
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, ClassVar
 
-import numpy as np
 import psutil
-from matplotlib.figure import Figure
 
 from benchmarks.harness import Benchmark, Job, say
-from benchmarks.tables import COLORS, Report, Table, by, limits
+from benchmarks.tables import Table, by, limits
 
 KINDS = ("cold", "warm")
 SAMPLE_S = 0.1
@@ -44,7 +41,11 @@ class Train(Benchmark):
 
     title = "Training"
     about = "python -m tactslip_torch.train, with an empty feature cache and with a full one"
-    quick = "overrides=[+exp=quick] repeats=1"
+    quick = (
+        'overrides=[+exp=quick,recipe=robust,"data.materials=[M1,iron]","split.seen=[M1]",'
+        "num_workers=0] repeats=1"
+    )
+    charts: ClassVar = {"": [("Stages", ("cold, s", "warm, s"))]}
     overrides: tuple[str, ...] = ("+exp=unseen4",)
     repeats: int = 3
 
@@ -57,47 +58,34 @@ class Train(Benchmark):
                 for kind in KINDS:
                     say(f"train: repeat {repeat + 1} of {self.repeats}, {kind}")
                     runs.append({"kind": kind} | _training(overrides, Path(folder), kind))
-        return {"overrides": overrides, "runs": runs}
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Limits, stages and totals."""
-        by_kind = {kind: of for (kind,), of in by(numbers["runs"], "kind").items()}
-        walls = {kind: [run["wall_s"] for run in runs] for kind, runs in by_kind.items()}
+        by_kind = {kind: of for (kind,), of in by(runs, "kind").items()}
+        walls = {kind: [run["wall_s"] for run in of] for kind, of in by_kind.items()}
         rows = []
-        for stage, of_kind in _stages(numbers).items():
+        for stage in dict.fromkeys(stage for run in runs for stage in run["stages"]):
             row = {"stage": stage}
-            for kind, seconds in of_kind.items():
+            for kind, of in by_kind.items():
+                seconds = median(run["stages"].get(stage, 0.0) for run in of)
                 row[f"{kind}, s"] = f"{seconds:.2f}"
                 row[f"{kind}, %"] = f"{100 * seconds / median(walls[kind]):.1f}"
             rows.append(row)
         for name, (key, factor) in _TOTALS.items():
             row = {"stage": name}
-            for kind, runs in by_kind.items():
-                value = factor * median(run[key] for run in runs)
+            for kind, of in by_kind.items():
+                value = factor * median(run[key] for run in of)
                 row |= {f"{kind}, s": f"{value:.2f}", f"{kind}, %": ""}
             rows.append(row)
-        first = numbers["runs"][0]
         note = (
-            f"`train {' '.join(numbers['overrides'])}`, medians of {len(by_kind['cold'])} "
-            f"repeats; {first['num_bins']} bins; start-up: imports, configuration and figures; "
-            f"memory: {first['memory'].upper()}."
+            f"`train {' '.join(overrides)}`, medians of {self.repeats} repeats; "
+            f"{runs[0]['num_bins']} bins; start-up: imports, configuration and figures; "
+            f"memory: {runs[0]['memory'].upper()}."
         )
         found = {"Stages": Table(rows, note)}
-        if numbers["overrides"] != ["+exp=unseen4"]:
-            return found
-        goals = [(f"{kind}, s, worst", max(walls[kind]), LIMITS[kind], "") for kind in KINDS]
-        most = max(run["peak_bytes"] for run in by_kind["cold"]) / 1e9
-        goals.append(("cold, peak memory, GB, worst", most, MOST_GB, ""))
-        return {"Limits": limits(goals), **found}
-
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Stages of both kinds, stacked."""
-        axes, left = drawing.subplots(), np.zeros(len(KINDS))
-        for color, (stage, seconds) in zip(cycle(COLORS), _stages(numbers).items(), strict=False):
-            axes.barh(list(seconds), list(seconds.values()), left=left, color=color, label=stage)
-            left += list(seconds.values())
-        axes.set_xlabel("s")
-        drawing.legend(loc="outside lower center", ncols=4)
+        if overrides == ["+exp=unseen4"]:
+            goals = [(f"{kind}, s, worst", max(walls[kind]), LIMITS[kind], "") for kind in KINDS]
+            most = max(run["peak_bytes"] for run in by_kind["cold"]) / 1e9
+            goals.append(("cold, peak memory, GB, worst", most, MOST_GB, ""))
+            found = {"Limits": limits(goals), **found}
+        return {"tables": found, "runs": runs}
 
 
 _TOTALS = {
@@ -106,15 +94,6 @@ _TOTALS = {
     "workers, s in all": ("worker_s", 1.0),
     "bins a second of its passes": ("bins_a_second", 1.0),
 }
-
-
-def _stages(numbers: Report) -> dict[str, dict[str, float]]:
-    """Median seconds by stage and kind of run."""
-    runs = by(numbers["runs"], "kind").items()
-    return {
-        stage: {kind: median(run["stages"].get(stage, 0.0) for run in of) for (kind,), of in runs}
-        for stage in dict.fromkeys(stage for run in numbers["runs"] for stage in run["stages"])
-    }
 
 
 def _training(overrides: list[str], folder: Path, kind: str) -> dict[str, Any]:
