@@ -105,7 +105,7 @@ class Alarms(Benchmark):
             given = ["+exp=onset", f"seed={seed}", *self.overrides, *job.overrides]
             folder = job.folder / f"seed-{seed}"
             metrics = trained(given, folder, job.folder / "cache")
-            own = {"pulses": []} if found else {}
+            own: dict[str, Any] = {}
             if not found:
                 detector = SlipDetector.load(folder / "detector.pt")
                 of_detail = metrics["alarm"]["methods"][LARGEST_DETAIL]

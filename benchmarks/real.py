@@ -8,7 +8,6 @@ with ridge. All that is fitted or chosen is so inside the fold. Writes docs/real
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -126,7 +125,8 @@ class Real(Benchmark):
             ours = next(iter(found))
             names = [name for name in found if "Rocket" in name]
             times = times_of(windows, found, names[0], self)
-            streams = as_streams(windows, folds, found[ours].detectors, configs[0], job.folder)
+            detectors = [of.detector for of in found[ours].fitted]
+            streams = as_streams(windows, folds, detectors, configs[0], job.folder)
         methods = {
             name: evaluated(of, windows) | {"time": times.get(name)} for name, of in found.items()
         }
@@ -423,16 +423,12 @@ class OnFolds:
     Attributes:
         scores: ``[N]``, of every window by the fold that left its object out.
         fit_s: seconds of each fold's fit, with describing its training windows.
-        chosen: by each fold.
-        score: what the last fold fitted, for the clock.
-        detectors: of ours, by fold.
+        fitted: by each fold.
     """
 
     scores: Array
     fit_s: list[float] = field(default_factory=list)
-    chosen: list[dict[str, Any]] = field(default_factory=list)
-    score: Callable[[Array], Array] | None = None
-    detectors: list[SlipDetector | None] = field(default_factory=list)
+    fitted: list[Fitted] = field(default_factory=list)
 
 
 def on_folds(
@@ -444,19 +440,17 @@ def on_folds(
         ValueError: if a score is not finite.
     """
     found = {name: OnFolds(np.full(len(windows.is_slip), np.nan)) for name in methods}
-    first = next(iter(found.values()))
+    detector: SlipDetector | None = None
     for fold, name in bar(list(product(folds, methods)), "fits, fold by fold", "fit"):
         held, train = windows.of(fold.having("unseen")), windows.of(fold.having("train"))
         (fit, describe_s), of = methods[name], found[name]
-        started = time.perf_counter()
-        fitted = fit(train, first.detectors[-1] if first.detectors else None)
-        of.fit_s.append(time.perf_counter() - started + describe_s * int(train.sum()))
-        of.score = fitted.score
+        seconds, fitted = timed(partial(fit, train, detector))
+        of.fit_s.append(seconds + describe_s * int(train.sum()))
         of.scores[held] = fitted.score(windows.samples[held])
         if not np.isfinite(of.scores[held]).all():
             raise ValueError(f"{name} gave scores that are not finite")
-        of.chosen.append(fitted.chosen)
-        of.detectors.append(fitted.detector)
+        of.fitted.append(fitted)
+        detector = found[next(iter(methods))].fitted[-1].detector
     return found
 
 
@@ -484,7 +478,7 @@ def evaluated(of: OnFolds, windows: Windows) -> dict[str, Any]:
         },
         "curve": {"false_alarms": quiet, "found": detected},
         "fit_s": median(of.fit_s),
-        "chosen": of.chosen,
+        "chosen": [one.chosen for one in of.fitted],
     }
 
 
@@ -543,10 +537,10 @@ def times_of(
         "alone": windows.samples[-1:].copy(),
     }
     names = [name for name in found if "seed" not in name or name.endswith("seed 0")]
-    calls: dict[str, Callable[[], object]] = {}
-    for name, how in product(names, inputs):
-        if (score := found[name].score) is not None:
-            calls[f"{name}, {how}"] = partial(score, inputs[how])
+    calls = {
+        f"{name}, {how}": partial(found[name].fitted[-1].score, inputs[how])
+        for name, how in product(names, inputs)
+    }
     seconds = {name: of["seconds"] for name, of in interleaved(calls, sizes.rounds).items()}
     rows: dict[str, dict[str, Any]] = {name: {"batch": len(inputs["batched"])} for name in names}
     for (name, row), how in product(rows.items(), inputs):

@@ -68,7 +68,7 @@ class SceneWeights(Benchmark):
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Errors of each set of weights, the least mean error first."""
-        found = []
+        found: list[dict[str, float]] = []
         for seed in self.seeds:
             small = [f"seed={seed}", *self.overrides, *job.overrides]
             found += _errors(*_training_bins(job.folder / "cache", small), self)

@@ -24,7 +24,6 @@ from benchmarks.harness import Benchmark, Job, say
 from benchmarks.tables import Table, by, limits
 
 KINDS = ("cold", "warm")
-SAMPLE_S = 0.1
 LIMITS = {"cold": 300.0, "warm": 90.0}
 """Seconds of the whole process, agreed for 2 cores and ``+exp=unseen4``."""
 MOST_GB = 6.0
@@ -37,17 +36,19 @@ class Train(Benchmark):
     Args:
         overrides: of ``tactslip_torch.train``, before those of the command line.
         repeats: of cold and warm.
+        sample_s: between two looks at the memory.
     """
 
     title = "Training"
     about = "python -m tactslip_torch.train, with an empty feature cache and with a full one"
     quick = (
         'overrides=[+exp=quick,recipe=robust,"data.materials=[M1,iron]","split.seen=[M1]",'
-        "num_workers=0] repeats=1"
+        "num_workers=0] repeats=1 sample_s=1.0"
     )
     charts: ClassVar = {"": [("Stages", ("cold, s", "warm, s"))]}
     overrides: tuple[str, ...] = ("+exp=unseen4",)
     repeats: int = 3
+    sample_s: float = 0.1
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Runs in turns, each pair from an empty cache."""
@@ -57,7 +58,8 @@ class Train(Benchmark):
             with TemporaryDirectory(prefix="tactslip-bench-") as folder:
                 for kind in KINDS:
                     say(f"train: repeat {repeat + 1} of {self.repeats}, {kind}")
-                    runs.append({"kind": kind} | _training(overrides, Path(folder), kind))
+                    run = _training(overrides, Path(folder), kind, self.sample_s)
+                    runs.append({"kind": kind} | run)
         by_kind = {kind: of for (kind,), of in by(runs, "kind").items()}
         walls = {kind: [run["wall_s"] for run in of] for kind, of in by_kind.items()}
         rows = []
@@ -96,7 +98,7 @@ _TOTALS = {
 }
 
 
-def _training(overrides: list[str], folder: Path, kind: str) -> dict[str, Any]:
+def _training(overrides: list[str], folder: Path, kind: str, sample_s: float) -> dict[str, Any]:
     """One run in a process of its own, watched from outside.
 
     Raises:
@@ -112,7 +114,7 @@ def _training(overrides: list[str], folder: Path, kind: str) -> dict[str, Any]:
             while process.poll() is None:
                 now_bytes, memory = _memory(process.pid, memory)
                 peak_bytes = max(peak_bytes, now_bytes)
-                time.sleep(SAMPLE_S)
+                time.sleep(sample_s)
         finally:
             process.terminate()
     wall_s = time.perf_counter() - started
