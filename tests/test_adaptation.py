@@ -9,20 +9,10 @@ import torch
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.moments import SufficientStats
-from tactslip_torch.training.adaptation import (
-    FACTORS,
-    AccuracyChange,
-    KnownBins,
-    Machine,
-    RecordingBins,
-    Statistics,
-    add,
-    forget,
-    solve,
-)
+from tactslip_torch.training import adaptation
 
 K, NUM_BINS = 3, 24
-MACHINE = Machine(0.05, 0.5, "weights")
+MACHINE = adaptation.Machine(0.05, 0.5, "weights")
 
 
 def recording(material, seed, num_bins=NUM_BINS, turn=0.0):
@@ -31,7 +21,7 @@ def recording(material, seed, num_bins=NUM_BINS, turn=0.0):
     z = torch.from_numpy(rng.uniform(-1, 1, (num_bins, K)))
     level = (1 - turn) * z[:, 0] + turn * z[:, 1] + 0.4 * z[:, 0] * z[:, 2]
     is_slip = level + 0.2 * torch.from_numpy(rng.standard_normal(num_bins)) > -0.3
-    return RecordingBins(material, z, is_slip, f"{material} {seed}")
+    return adaptation.RecordingBins(material, z, is_slip, f"{material} {seed}")
 
 
 def recordings(material, number, first_seed, turn=0.0):
@@ -52,8 +42,8 @@ def statistics(trained):
     sizes = torch.tensor([len(own.z) for own in trained.values()])
     recording = torch.arange(len(trained)).repeat_interleave(sizes)
     materials = tuple(own.material for own in trained.values())
-    rehearsal = KnownBins(z, is_slip, ones, ones, recording, tuple(trained), materials)
-    return Statistics(sums, MACHINE, {"bin_ms": 50.0}, rehearsal, "digest")
+    rehearsal = adaptation.KnownBins(z, is_slip, ones, ones, recording, tuple(trained), materials)
+    return adaptation.Statistics(sums, MACHINE, {"bin_ms": 50.0}, rehearsal, "digest")
 
 
 TRAINED = recordings("a", 4, 0) | recordings("b", 4, 10) | recordings("c", 4, 20, turn=0.1)
@@ -67,7 +57,7 @@ def old():
 
 @pytest.fixture(scope="module")
 def before(old):
-    return solve(old)
+    return adaptation.solve(old)
 
 
 def assert_same(one, other, folder, weight=1.0):
@@ -86,7 +76,7 @@ def assert_same(one, other, folder, weight=1.0):
 
 def test_machine_and_scores_without_a_recording_are_those_of_refits(old):
     after = old.reweighed(dict.fromkeys(NEW, 2.5), NEW)
-    solved, everyone = solve(after), TRAINED | NEW
+    solved, everyone = adaptation.solve(after), TRAINED | NEW
     scales = after.sums.class_scale(MACHINE.balance)
 
     def refitted_without(name, z):
@@ -108,12 +98,12 @@ def test_machine_and_scores_without_a_recording_are_those_of_refits(old):
 
 def test_a_change_of_accuracy_names_what_falls():
     same = {"a": 0.9, "b": 0.8}
-    assert AccuracyChange(same, same).problem(0.0) is None
-    assert AccuracyChange({}, {}).problem(0.0) is None
-    fall = AccuracyChange(same, {"a": 0.88, "b": 0.8})
+    assert adaptation.AccuracyChange(same, same).problem(0.0) is None
+    assert adaptation.AccuracyChange({}, {}).problem(0.0) is None
+    fall = adaptation.AccuracyChange(same, {"a": 0.88, "b": 0.8})
     assert fall.problem(0.0101) is None
     assert fall.problem(0.005).startswith("old materials fall from 85.00 to 84.00 %")
-    of_one = AccuracyChange(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7})
+    of_one = adaptation.AccuracyChange(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7})
     assert of_one.problem(0.01).startswith("b falls from 80.00 to 75.00 %")  # four times as much
 
 
@@ -135,25 +125,25 @@ def test_bins_go_out_as_they_came_in(old, num_bins, weight, tmp_path):
 def test_forgetting_is_as_if_it_was_never_in(old, before, tmp_path):
     mine = {name: own for name, own in TRAINED.items() if own.material == "c"}
     others = {name: own for name, own in TRAINED.items() if own.material != "c"}
-    found = forget(old, before, mine)
+    found = adaptation.forget(old, before, mine)
     expected = statistics(others).sums
     torch.testing.assert_close(found.statistics.sums.sums, expected.sums, rtol=0, atol=1e-12)
     assert sorted(found.old.after) == ["a", "b"]
     with pytest.raises(ValueError, match="other content"):
-        forget(old, before, {"a/1": replace(TRAINED["a/1"], z=TRAINED["a/2"].z)})
+        adaptation.forget(old, before, {"a/1": replace(TRAINED["a/1"], z=TRAINED["a/2"].z)})
     with pytest.raises(ValueError, match="d/1 is not in"):
-        forget(old, before, {"d/1": TRAINED["a/1"]})
+        adaptation.forget(old, before, {"d/1": TRAINED["a/1"]})
 
 
 def test_a_new_material_is_learned_and_later_recordings_share_its_weight(old, before):
     sums = old.sums.sums.clone()
-    found = add(old, before, NEW, 4.0, margin=1.0)
+    found = adaptation.add(old, before, NEW, 4.0, margin=1.0)
     assert torch.equal(old.sums.sums, sums)  # nothing that is given is changed
     assert not old.bins
     assert found.new["after"] > found.new["before"] + 0.1
     assert sorted(found.old.before) == ["a", "b", "c"]
     more = {"new/7": recording("new", 107, turn=1.0)}
-    later = add(found.statistics, found.solved, more, 2.0, margin=1.0)
+    later = adaptation.add(found.statistics, found.solved, more, 2.0, margin=1.0)
     assert dict(later.statistics.weights) == dict.fromkeys([*NEW, *more], 2.0)
     assert later.new["after"] is None  # nothing else of this recording is known
     assert "new" in later.old.before
@@ -161,23 +151,23 @@ def test_a_new_material_is_learned_and_later_recordings_share_its_weight(old, be
 
 @pytest.mark.parametrize("margin", [0.1, 0.0])
 def test_auto_takes_the_largest_weight_that_old_materials_allow(old, before, margin):
-    found = add(old, before, NEW, None, margin=margin)
+    found = adaptation.add(old, before, NEW, None, margin=margin)
     assert found.tried[found.factor] == found.old.mean_fall
     # a material has 4 recordings, the new one 3
     assert found.weight * 3 == pytest.approx(found.factor * 4)
     if margin == 0:
-        assert min(found.tried) == found.factor == FACTORS[0]
+        assert min(found.tried) == found.factor == adaptation.FACTORS[0]
         return
     assert found.old.problem(0.5 * margin) is None
-    larger = FACTORS[FACTORS.index(found.factor) + 1]
-    by_hand = add(old, before, NEW, found.weight * larger / found.factor, margin=margin)
+    larger = adaptation.FACTORS[adaptation.FACTORS.index(found.factor) + 1]
+    by_hand = adaptation.add(old, before, NEW, found.weight * larger / found.factor, margin=margin)
     assert by_hand.old.problem(0.5 * margin) is not None
 
 
 def test_bins_without_slip_weigh_as_those_of_an_average_material(old, before):
     own = recording("quiet", 50)
     quiet = replace(own, z=own.z[~own.is_slip], is_slip=own.is_slip[~own.is_slip])
-    found = add(old, before, {"quiet/0": quiet}, None, margin=0.0)
+    found = adaptation.add(old, before, {"quiet/0": quiet}, None, margin=0.0)
     num_quiet = sum(int((~own.is_slip).sum()) for own in TRAINED.values()) / 3
     assert found.weight * len(quiet.z) / num_quiet == pytest.approx(found.factor)
 
@@ -186,7 +176,7 @@ def test_small_steps_together_keep_the_margin(old, before):
     at, solved = old, before
     for number in range(6):
         more = recordings(f"new{number}", 2, 200 + 10 * number, turn=1.0)
-        change = add(at, solved, more, 1.0, margin=1.0)
+        change = adaptation.add(at, solved, more, 1.0, margin=1.0)
         entry = {"old": {"before": change.old.before}}
         at = at.with_step(change.statistics, entry, torch.zeros(1, dtype=torch.uint8), f"{number}")
         solved = change.solved
@@ -212,4 +202,4 @@ def test_small_steps_together_keep_the_margin(old, before):
 )
 def test_what_cannot_be_added_is_refused(old, before, bins, weight, message):
     with pytest.raises(ValueError, match=message):
-        add(old, before, bins, weight, margin=0.1)
+        adaptation.add(old, before, bins, weight, margin=0.1)

@@ -28,26 +28,13 @@ from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.report.results import alarm_figure, alarm_table, scene_rows
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.alarm import (
-    FIRST_TRANSITION,
-    JOINT,
-    LEAST,
-    MOST,
-    OURS,
-    CalibratedAlarm,
-    DebouncedAlarm,
-    Stream,
-    Timing,
-    labelled,
-    score_streams,
-    watched,
-)
+from tactslip_torch.training import alarm
 from tactslip_torch.training.onset import OnsetTraining
 
 RULE = {"name": "cusum", "drift": 0.5, "evidence": 0.4}
 LEARNED = OnsetTraining(penalty=1e3)
 TRAINED = [RecordingId(m, 0, s) for m in ("a", "b") for s in ("paper", "held")]
-TIMING = Timing(RATE_HZ, 20, 100, 25)
+TIMING = alarm.Timing(RATE_HZ, 20, 100, 25)
 SCENES = ("paper", "held", "taps")
 BARE = {"held": 1e6}
 
@@ -102,13 +89,13 @@ def loudness_detector() -> SlipDetector:
     return SlipDetector(pool, layer, [place], scaler, head, info)
 
 
-def stage(streams=None, **changes) -> CalibratedAlarm:
+def stage(streams=None, **changes) -> alarm.CalibratedAlarm:
     values = {"streams": streams or Streams(), "classifier": LEARNED, "rule": RULE, "hop_ms": 25.0}
     values |= {"learn_scenes": ["paper", "held"], "learn_cycles": 1, "slip_free": "held"}
     values |= {"budget": {"held": 2000.0, "taps_share": 0.6}}
     values |= {"hours": {"held": 11 / 3600, "taps": 8 / 3600}}
     values |= {"check_hours": 10.0, "check_slip_free_hours": 10.0}
-    return CalibratedAlarm(**(values | changes))
+    return alarm.CalibratedAlarm(**(values | changes))
 
 
 @pytest.fixture(scope="module")
@@ -182,8 +169,8 @@ def test_a_budget_that_cannot_be_shown_is_refused_before_anything_is_read(budget
         (stage, {"budget": BARE | {"tap": 1.0}}, "onset.streams has no scene 'tap'"),
         (stage, {"budget": BARE | {"taps": 0.0}}, "onset.budget of taps must be positive, got 0"),
         (stage, {"budget": {"taps": 1.0}}, "onset.budget must say what held may have, an hour"),
-        (DebouncedAlarm, {"k": 4}, "k must lie between 1 and n"),
-        (DebouncedAlarm, {"k": "a"}, "onset.k must be a positive whole number, got 'a'"),
+        (alarm.DebouncedAlarm, {"k": 4}, "k must lie between 1 and n"),
+        (alarm.DebouncedAlarm, {"k": "a"}, "onset.k must be a positive whole number, got 'a'"),
     ],
 )
 def test_bad_settings_are_refused_in_one_line(made, changes, match):
@@ -204,8 +191,8 @@ def recounted(detector, settings, scene):
         decider = Decider(settings, RATE_HZ, 100, detector.look_ahead)
         bins = decider.decide(scores.score, scores.is_valid)
         made = decider.join(bins, left_out[recording.material].score_recording(samples))
-        stream = Stream(recording, source.timeline(recording), none, none, none, none)
-        found = recording_events(watched(stream, made), EventRules(), latency)
+        stream = alarm.Stream(recording, source.timeline(recording), none, none, none, none)
+        found = recording_events(alarm.watched(stream, made), EventRules(), latency)
         alarms, hours = alarms + len(found.false_alarms_s), hours + found.quiet_s / 3600
     return alarms, hours
 
@@ -238,7 +225,7 @@ def test_thresholds_of_the_curve_give_its_rates(calibrated):
     thresholds, rates = zip(*curve, strict=True)
     assert list(thresholds) == sorted(set(thresholds))
     assert list(rates) == sorted(set(rates), reverse=True)
-    assert LEAST <= rates[-1] <= rates[0] <= MOST
+    assert alarm.LEAST <= rates[-1] <= rates[0] <= alarm.MOST
     for threshold, rate in curve:
         at = replace(settings, onset=replace(settings.onset, threshold=threshold))
         alarms, hours = recounted(detector, at, "held")
@@ -263,14 +250,19 @@ def test_evaluated_streams_set_nothing():
 def test_slips_are_found_in_time_and_all_is_told_in_plain_json(calibrated, tmp_path):
     detector, found = calibrated
     assert json.loads(json.dumps(found, allow_nan=False)) == found
-    assert (found["rule"], found["methods"][JOINT]["onset"]) == (JOINT, True)
-    ours = found["events"]["test stream"][JOINT]
+    assert (found["rule"], found["methods"][alarm.JOINT]["onset"]) == (alarm.JOINT, True)
+    ours = found["events"]["test stream"][alarm.JOINT]
     assert ours["num_onsets"] == ours["num_found"] + ours["num_early"] == 4
     assert 0 < ours["delay_ms"]["median"]["value"] < 60  # a bin with its look-ahead
-    assert set(found["events"]["unseen stream"]) == {JOINT, "cusum", FIRST_TRANSITION, "loud"}
+    assert set(found["events"]["unseen stream"]) == {
+        alarm.JOINT,
+        "cusum",
+        alarm.FIRST_TRANSITION,
+        "loud",
+    }
     taps, streams = found["scenes"]["taps"], found["streams"]
     assert (taps.keys(), taps["trained"]) == ({"trained", "test", "unseen"}, False)
-    assert taps["test"][JOINT]["quiet_hours"] == pytest.approx(27 / 3600)
+    assert taps["test"][alarm.JOINT]["quiet_hours"] == pytest.approx(27 / 3600)
     assert set(streams) == {"learn", "calibrate", "test", "unseen"}
     held = {"recordings": 4, "hours": 12 / 3600, "slips": 0}
     assert streams["calibrate"]["held"] == pytest.approx(held)
@@ -293,11 +285,13 @@ def test_slips_are_found_in_time_and_all_is_told_in_plain_json(calibrated, tmp_p
 
 
 def test_the_papers_rule_is_left_out_where_its_hop_cannot_be():
-    detector, timing = loudness_detector(), Timing(RATE_HZ, 40, 100, 25)
+    detector, timing = loudness_detector(), alarm.Timing(RATE_HZ, 40, 100, 25)
     made, onset = stage(hop_ms=20.0), onset_of()
     calibrate = made.roles(detector)["calibrate"]
-    own = score_streams(made.streams, calibrate, {OURS: detector}, {OURS: 40}, onset, 0)
-    assert set(made.methods(own, {OURS: timing}, onset)) == {JOINT, "cusum"}
+    own = alarm.score_streams(
+        made.streams, calibrate, {alarm.OURS: detector}, {alarm.OURS: 40}, onset, 0
+    )
+    assert set(made.methods(own, {alarm.OURS: timing}, onset)) == {alarm.JOINT, "cusum"}
 
 
 # -------------------------------------------------------------------------- streams and decisions
@@ -311,11 +305,11 @@ def onset_of() -> OnsetClassifier:
 
 def stream_of(
     score, slides=(), number=0, duration_s=2.0, scene="held", onset=(), **times
-) -> Stream:
+) -> alarm.Stream:
     score = torch.as_tensor(score, dtype=torch.float32)
     valid, recording = torch.ones(len(score)) > 0, RecordingId("a", number, scene)
     hops = torch.as_tensor(onset, dtype=torch.float64)
-    return Stream(recording, times_of(slides, duration_s, **times), score, valid, valid, hops)
+    return alarm.Stream(recording, times_of(slides, duration_s, **times), score, valid, valid, hops)
 
 
 def knocked(number: int) -> np.ndarray:
@@ -359,7 +353,7 @@ def test_joint_thresholds_are_the_lowest_that_keep_every_budget(rule):
         for stream in streams:
             decider = Decider(settings, RATE_HZ, 100, 25)
             bins = decider.decide(stream.score, stream.is_valid)
-            seen = watched(stream, decider.join(bins, stream.onset_score))
+            seen = alarm.watched(stream, decider.join(bins, stream.onset_score))
             found = recording_events(seen, EventRules(), latency)
             counts[stream.recording.scene] += len(found.false_alarms_s)
         return counts
@@ -395,7 +389,7 @@ def test_a_threshold_that_is_never_reached_is_refused():
 
 
 def test_bins_over_the_edge_of_a_slide_have_no_label():
-    kept, is_slip = labelled([stream_of(torch.arange(60.0), [(0.2, 0.4)])], TIMING)
+    kept, is_slip = alarm.labelled([stream_of(torch.arange(60.0), [(0.2, 0.4)])], TIMING)
     starts, expected = np.arange(60) * 0.01, {}
     for number, (start, end) in enumerate(zip(starts, starts + 0.05, strict=True)):
         inside = start >= 0.2 - 1e-9 and end <= 0.4 + 1e-9
@@ -408,7 +402,7 @@ def test_bins_over_the_edge_of_a_slide_have_no_label():
 def test_debounced_settings_are_kept_in_the_file_with_no_rate(tmp_path):
     detector = small_detector(3)
     detector.info["calibration"] = Platt(2.0, -0.5).to_dict()
-    DebouncedAlarm(k=1, n=4, probability=0.8, slip_share=0.25)(detector)
+    alarm.DebouncedAlarm(k=1, n=4, probability=0.8, slip_share=0.25)(detector)
     detector.save(tmp_path / "a.pt")
     settings = AlarmSettings.of(SlipDetector.load(tmp_path / "a.pt"))
     assert settings.target_per_hour is None
@@ -420,15 +414,15 @@ def test_debounced_settings_are_kept_in_the_file_with_no_rate(tmp_path):
     assert odds / (1 + odds) == pytest.approx(0.8)
     detector.info = {}
     with pytest.raises(ValueError, match=r"training chose nothing; give several recipe\.penalties"):
-        DebouncedAlarm()(detector)
+        alarm.DebouncedAlarm()(detector)
 
 
 def test_a_debounced_hop_is_half_a_bin_or_so_many_milliseconds():
-    assert DebouncedAlarm().hop_samples(2000.0, 100) == 50
-    assert DebouncedAlarm().hop_samples(2000.0, 1) == 1
-    assert DebouncedAlarm(hop_ms=2.5).hop_samples(2000.0, 100) == 5
+    assert alarm.DebouncedAlarm().hop_samples(2000.0, 100) == 50
+    assert alarm.DebouncedAlarm().hop_samples(2000.0, 1) == 1
+    assert alarm.DebouncedAlarm(hop_ms=2.5).hop_samples(2000.0, 100) == 5
     with pytest.raises(ValueError, match=r"onset\.hop_ms=0\.3 is 0\.6 samples"):
-        DebouncedAlarm(hop_ms=0.3).hop_samples(2000.0, 100)
+        alarm.DebouncedAlarm(hop_ms=0.3).hop_samples(2000.0, 100)
 
 
 # --------------------------------------------------------------------------------- the experiment
@@ -442,7 +436,7 @@ def test_the_experiment_has_ten_hours_to_set_the_alarm_and_all_scenes_to_check_i
         "train_materials": sorted({r.material for r in trained}),
         "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
     }
-    whole: CalibratedAlarm = instantiate(config.onset, _convert_="all")
+    whole: alarm.CalibratedAlarm = instantiate(config.onset, _convert_="all")
     roles = whole.roles(SimpleNamespace(info=info))
     assert not caplog.text  # there are as many hours as were asked for
     assert {r.material for r in roles["unseen"]} == {"iron", "cloth", "copper", "wood"}
@@ -484,6 +478,6 @@ def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
     assert metrics["alarm"]["settings"] == settings.to_dict()
     assert settings.metadata["simulated"] is True
     assert {"test", "unseen", "test stream", "unseen stream"} <= set(metrics["events"])
-    assert metrics["events"]["test stream"][JOINT]["num_onsets"] > 0
+    assert metrics["events"]["test stream"][alarm.JOINT]["num_onsets"] > 0
     assert "budget of false alarms, at 95 % confidence: held 2000 " in capsys.readouterr().out
     assert {"alarm.png", "events.png"} <= {path.name for path in tmp_path.iterdir()}

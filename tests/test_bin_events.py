@@ -10,14 +10,8 @@ import torch
 from tactslip_torch.data.labels import LabelRule, label_bins
 from tactslip_torch.data.recording import RecordingId, Timeline
 from tactslip_torch.onset.events import LatencyParts
+from tactslip_torch.training import learner
 from tactslip_torch.training.datamodule import RecordingFeatures
-from tactslip_torch.training.learner import (
-    BINS_APART,
-    RULES,
-    evaluated_bins,
-    event_numbers,
-    events_by_rule,
-)
 
 RATE_HZ = 2000.0
 LATENCY = LatencyParts(look_ahead_s=0.0125, bin_s=0.05)
@@ -37,8 +31,8 @@ def batch_of(onsets=(2.0, 6.0), ends=(4.0, 8.0), stretches=(), roles=None, slip_
 
 
 def events_of(batch, says_slip):
-    part = evaluated_bins(batch, says_slip, {})["test"]
-    return {name: own[0] for name, own in events_by_rule([part], LATENCY).items()}
+    part = learner.evaluated_bins(batch, says_slip, {})["test"]
+    return {name: own[0] for name, own in learner.events_by_rule([part], LATENCY).items()}
 
 
 def seen(events):
@@ -79,7 +73,7 @@ def test_random_decisions_raise_the_alarms_that_rules_by_hand_do(layout, hop_ms)
     is_apart = batch.stroke == -1
     groups = [batch.stroke == 0, batch.stroke == 1]
     groups += [is_apart & (batch.ends_s < 10.1), is_apart & (batch.ends_s > 10.4)]
-    for share, name in itertools.product((0.2, 0.5, 0.8), RULES):
+    for share, name in itertools.product((0.2, 0.5, 0.8), learner.RULES):
         decisions = torch.rand(len(batch.is_slip), generator=generator) < share
         events, alarms = events_of(batch, decisions)[name], []
         for rows in groups:
@@ -110,16 +104,18 @@ def test_a_split_by_bin_has_no_events_and_says_why():
     num = len(whole.is_slip)
     some = torch.arange(num) % 5 > 0
     apart = batch_of(roles={"train": some, "test": ~some, "unseen": torch.zeros_like(some)})
-    parts = evaluated_bins(apart, apart.is_slip, {})
+    parts = learner.evaluated_bins(apart, apart.is_slip, {})
     assert {role: part.is_whole for role, part in parts.items()} == {"train": False, "test": False}
     assert sum(len(part.says_slip) for part in parts.values()) == num
-    events = {role: events_by_rule([part], LATENCY) for role, part in parts.items()}
-    for by_rule in event_numbers(events).values():
-        assert list(by_rule) == list(RULES)
+    events = {role: learner.events_by_rule([part], LATENCY) for role, part in parts.items()}
+    for by_rule in learner.event_numbers(events).values():
+        assert list(by_rule) == list(learner.RULES)
         for numbers in by_rule.values():
-            assert numbers["reason"] == BINS_APART
+            assert numbers["reason"] == learner.BINS_APART
             assert numbers["found"] is numbers["false_alarms_per_minute"] is None
-    of_whole = evaluated_bins(whole, whole.is_slip, {})["test"]
-    assert events_by_rule([of_whole, parts["test"]], LATENCY) == {name: [] for name in RULES}
-    numbers = event_numbers({"test": events_by_rule([of_whole], LATENCY)})
+    of_whole = learner.evaluated_bins(whole, whole.is_slip, {})["test"]
+    assert learner.events_by_rule([of_whole, parts["test"]], LATENCY) == {
+        name: [] for name in learner.RULES
+    }
+    numbers = learner.event_numbers({"test": learner.events_by_rule([of_whole], LATENCY)})
     assert "reason" not in numbers["test"]["first_transition"]

@@ -10,18 +10,9 @@ from sklearn.isotonic import IsotonicRegression
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import brier_score_loss, log_loss
 
-from tactslip_torch.model.calibration import (
-    LARGEST_LLR,
-    Isotonic,
-    Platt,
-    calibration_from_dict,
-    fit_isotonic,
-    fit_platt,
-    probability,
-    reliability,
-)
+from tactslip_torch.model import calibration
 
-FITS = {"platt": fit_platt, "isotonic": fit_isotonic}
+FITS = {"platt": calibration.fit_platt, "isotonic": calibration.fit_isotonic}
 
 
 def logistic_bins(rng, num, slope, offset, share=0.5, spread=2.0):
@@ -52,7 +43,7 @@ def test_platt_is_sklearns_logistic_regression_towards_platts_targets(scale, shi
     oracle = LogisticRegression(C=1e15, tol=1e-14, solver="newton-cholesky", max_iter=500)
     oracle.fit(np.tile(scores, 2)[:, None], np.repeat([1, 0], 400), sample_weight=parts)
     balance = logit((weights * target).sum() / weights.sum())
-    fitted = fit_platt(*tensors(scale * scores + shift, is_slip, weights))
+    fitted = calibration.fit_platt(*tensors(scale * scores + shift, is_slip, weights))
     llr = fitted.llr(torch.from_numpy(scale * scores + shift)).numpy()
     expected = oracle.coef_[0, 0] * scores + oracle.intercept_[0] - balance
     np.testing.assert_allclose(llr, expected, atol=1e-6, rtol=1e-6)
@@ -61,10 +52,10 @@ def test_platt_is_sklearns_logistic_regression_towards_platts_targets(scale, shi
 def test_backward_scores_are_refused_by_the_line_and_flat_by_steps(rng):
     scores, is_slip = tensors(*logistic_bins(rng, 300, -1.5, 0.0))
     with pytest.raises(ValueError, match="slip has the lower scores; change their sign"):
-        fit_platt(scores, is_slip)
-    assert fit_platt(-scores, is_slip).slope > 1
+        calibration.fit_platt(scores, is_slip)
+    assert calibration.fit_platt(-scores, is_slip).slope > 1
     falling = torch.arange(50.0)
-    assert fit_isotonic(falling, falling < 20).llrs == (0.0,)
+    assert calibration.fit_isotonic(falling, falling < 20).llrs == (0.0,)
 
 
 # ---------------------------------------------------------------------------------- isotonic
@@ -83,7 +74,7 @@ def test_steps_are_sklearns_isotonic_regression(levels, weighted, rng):
     steps = IsotonicRegression().fit(x, y, sample_weight=w).predict(scores)
     expected = logit(steps) - logit(share)
 
-    fitted = fit_isotonic(*tensors(scores, is_slip, weights))
+    fitted = calibration.fit_isotonic(*tensors(scores, is_slip, weights))
     np.testing.assert_allclose(fitted.llrs, np.unique(np.round(expected, 10)), atol=1e-9)
     for knot, llr in zip(fitted.scores, fitted.llrs, strict=True):
         own = np.isclose(expected, llr, atol=1e-9, rtol=0)
@@ -95,10 +86,10 @@ def test_steps_are_sklearns_isotonic_regression(levels, weighted, rng):
 
 # ----------------------------------------------------------------------------- what all share
 CALIBRATIONS = {
-    "platt": Platt(1.7, -0.4),
-    "flat": Platt(0.0, 0.0),
-    "isotonic": Isotonic((-1.5, 0.25, 2.0), (-4.0, 0.5, 3.0)),
-    "one knot": Isotonic((1.0,), (0.0,)),
+    "platt": calibration.Platt(1.7, -0.4),
+    "flat": calibration.Platt(0.0, 0.0),
+    "isotonic": calibration.Isotonic((-1.5, 0.25, 2.0), (-4.0, 0.5, 3.0)),
+    "one knot": calibration.Isotonic((1.0,), (0.0,)),
 }
 
 
@@ -108,14 +99,14 @@ def test_huge_scores_give_finite_ratios_and_nan_stays(name, dtype):
     most = torch.finfo(dtype).max
     x = torch.tensor([-torch.inf, -most, -1e30, 1e30, most, torch.inf], dtype=dtype)
     x.requires_grad_()
-    for calibration in (CALIBRATIONS[name], Platt(1e20, 3.0)):
-        llr = calibration.llr(x)
+    for each in (CALIBRATIONS[name], calibration.Platt(1e20, 3.0)):
+        llr = each.llr(x)
         assert llr.dtype == dtype
-        assert llr.abs().max() <= torch.tensor(LARGEST_LLR, dtype=dtype)
+        assert llr.abs().max() <= torch.tensor(calibration.LARGEST_LLR, dtype=dtype)
         assert (llr.diff() >= 0).all()
         (gradient,) = torch.autograd.grad(llr.sum(), x)
         assert gradient.isfinite().all()
-        assert calibration.llr(torch.tensor([torch.nan, 0.0])).isnan().tolist() == [True, False]
+        assert each.llr(torch.tensor([torch.nan, 0.0])).isnan().tolist() == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -131,7 +122,7 @@ def test_huge_scores_give_finite_ratios_and_nan_stays(name, dtype):
 )
 def test_what_is_no_calibration_is_refused_in_a_line(plain):
     with pytest.raises(ValueError, match="no calibration of this version"):
-        calibration_from_dict(plain)
+        calibration.calibration_from_dict(plain)
 
 
 @pytest.mark.parametrize("name", FITS)
@@ -159,7 +150,7 @@ def test_probability_is_bayes_at_another_balance(share):
     slip, rest = np.exp(-np.array([0.1, 1.0, 5.0])), np.exp(-np.array([4.0, 1.0, 0.3]))
     posterior = share * slip / (share * slip + (1 - share) * rest)
     llr = torch.from_numpy(np.log(slip / rest))
-    np.testing.assert_allclose(probability(llr, share), posterior, rtol=1e-12)
+    np.testing.assert_allclose(calibration.probability(llr, share), posterior, rtol=1e-12)
 
 
 # -------------------------------------------------------------------------------- reliability
@@ -184,7 +175,7 @@ def test_cells_and_errors_are_the_definitions(weighted, levels, rng):
         p = np.round(p * levels) / levels
     y = rng.uniform(size=800) < p**1.5
     w = rng.uniform(0.2, 3, 800) if weighted else np.ones(800)
-    found = reliability(*tensors(p, y), num_cells=10, weights=torch.from_numpy(w))
+    found = calibration.reliability(*tensors(p, y), num_cells=10, weights=torch.from_numpy(w))
     stated, happened, count = plain_reliability(p, y, w, 10)
     np.testing.assert_allclose(found["probabilities"], stated, rtol=1e-12)
     np.testing.assert_allclose(found["slip_shares"], happened, atol=1e-12)
@@ -194,7 +185,7 @@ def test_cells_and_errors_are_the_definitions(weighted, levels, rng):
     errors["brier"] = brier_score_loss(y, p, sample_weight=w)
     assert {name: found[name] for name in errors} == pytest.approx(errors, rel=1e-12)
     inside = np.clip(p, 1e-9, 1 - 1e-9)
-    found = reliability(*tensors(inside, y), weights=torch.from_numpy(w))
+    found = calibration.reliability(*tensors(inside, y), weights=torch.from_numpy(w))
     assert found["log_loss"] == pytest.approx(log_loss(y, inside, sample_weight=w), rel=1e-9)
 
 
@@ -208,4 +199,4 @@ def test_cells_and_errors_are_the_definitions(weighted, levels, rng):
 )
 def test_reliability_of_no_probabilities_is_refused(p, message):
     with pytest.raises(ValueError, match=message):
-        reliability(torch.tensor(p), torch.tensor([True, False]))
+        calibration.reliability(torch.tensor(p), torch.tensor([True, False]))

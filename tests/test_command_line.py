@@ -16,20 +16,15 @@ import pytest
 from omegaconf import OmegaConf
 
 from tactslip_torch.__main__ import COMMANDS, main
-from tactslip_torch.commands.configuration import (
-    Checked,
-    Composed,
-    checked,
-    conf_dir,
-    help_text,
-    with_lists,
-)
+from tactslip_torch.commands import configuration
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "troubleshooting.md"
 MARKERS = "<!-- mistakes: written by tests/test_command_line.py -->", "<!-- end of mistakes -->"
 FILES = {name: name.replace("-", "_") for name in COMMANDS}
-CONFIGURED = [name for name in COMMANDS if (conf_dir() / f"{FILES[name]}.yaml").is_file()]
+CONFIGURED = [
+    name for name in COMMANDS if (configuration.conf_dir() / f"{FILES[name]}.yaml").is_file()
+]
 
 MISTAKES = {
     # what is typed: words of the answer
@@ -120,10 +115,10 @@ def answer(line: str) -> tuple[int, str]:
     return 0, said.getvalue()
 
 
-def checked_line(line: str) -> Checked:
+def checked_line(line: str) -> configuration.Checked:
     """The keys and values of a line, if something takes them all."""
     command, *rest = shlex.split(line)
-    return checked(command, rest)
+    return configuration.checked(command, rest)
 
 
 @contextlib.contextmanager
@@ -173,7 +168,7 @@ def test_a_mistake_is_answered_in_one_line(line):
 )
 def test_a_text_is_a_list_of_one_where_a_list_is_wanted(line, key, value):
     composed = checked_line(line).composed
-    with_lists(composed.config, composed)
+    configuration.with_lists(composed.config, composed)
     assert OmegaConf.select(composed.config, key) == value
 
 
@@ -201,19 +196,19 @@ def test_keys_that_something_takes_pass(line):
 
 @pytest.mark.parametrize("command", CONFIGURED)
 def test_every_key_and_group_is_described(command):
-    composed = Composed(command)
+    composed = configuration.Composed(command)
     assert composed.head
     assert len(composed.examples) == 3
     assert [group.name for group in composed.groups if not group.description] == []
     assert [key.name for key in composed.keys if not key.description] == []
-    text = help_text(command, COMMANDS[command], composed)
+    text = configuration.help_text(command, COMMANDS[command], composed)
     assert all(f"  {key.name}=" in text for key in composed.keys)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", CONFIGURED)
 def test_examples_pass_and_keys_of_every_option_are_described(command):
-    composed = Composed(command)
+    composed = configuration.Composed(command)
     for example in composed.examples:
         assert example.split()[:2] == ["tactslip", command]
         checked_line(example.removeprefix("tactslip "))
@@ -222,7 +217,7 @@ def test_examples_pass_and_keys_of_every_option_are_described(command):
         options = {k: own for k, own in options.items() if k == "search"}
     for n in range(max(map(len, options.values()), default=1)):
         chosen = [f"{group}={own[n % len(own)]}" for group, own in options.items()]
-        keys = Composed(command, chosen).keys
+        keys = configuration.Composed(command, chosen).keys
         assert [key.name for key in keys if not key.description] == [], chosen
 
 

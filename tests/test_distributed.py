@@ -11,14 +11,7 @@ import warnings
 from pathlib import Path
 
 import pytest
-from test_commands import (
-    TINY,
-    TINY_DATA,
-    TINY_FIT,
-    TINY_FOLDS,
-    assert_same_detector,
-    run_train,
-)
+from test_commands import TINY, TINY_BY_FOLD, assert_same_detector, run_train
 
 from tactslip_torch import SlipDetector
 from tactslip_torch.__main__ import main
@@ -81,9 +74,8 @@ def test_processes_that_lightning_starts_learn_what_one_does(cache, tmp_path):
 
 def test_folds_are_learned_in_uneven_shares(cache, tmp_path):
     alone, ddp = tmp_path / "alone", tmp_path / "ddp"
-    told = *TINY_DATA, *TINY_FOLDS, *TINY_FIT, cache
-    run_train(alone, *told)
-    for process in together(3, *told, f"hydra.run.dir={ddp}"):  # of 4 recordings
+    run_train(alone, *TINY_BY_FOLD, cache)
+    for process in together(3, *TINY_BY_FOLD, cache, f"hydra.run.dir={ddp}"):  # of 4 recordings
         process.join(300)
         assert process.exitcode == 0
     assert_same_detector(alone / "without_A", ddp / "without_A")
