@@ -113,15 +113,6 @@ def test_every_column_of_the_pool_answers_as_the_table_says(change):
         assert holds != (answer == "neither"), str(name)
 
 
-def test_a_gain_of_a_power_of_two_changes_no_digit():
-    pool = FeaturePool(HandLayout.paper24())
-    answers = [answer_of(name, "gain") for name in pool.names]
-    bins = torch.from_numpy(np.random.default_rng(0).standard_normal((4, 24, 100)))
-    for exponent in (-40, 1, 33):
-        wanted = torch.ldexp(pool(bins), exponent * torch.tensor(answers))
-        assert torch.equal(pool(torch.ldexp(bins, torch.tensor(exponent))), wanted)
-
-
 def test_the_table_has_every_descriptor_once():
     of_spectra = [*SPECTRUM_DESCRIPTORS, "band_energy_ratio"]
     wanted = [("time", name) for name in TIME_DESCRIPTORS] + [("freq", n) for n in of_spectra]

@@ -156,7 +156,6 @@ def test_other_columns_are_said_not_to_be_read_and_likely_twins_are_named(root):
         ({"onsets_s": "2; 9", "released_s": "1.9-2.1"}, "1 released_s for 2 onsets"),
         ({"onsets_s": "2", "released_s": "2.1-2.2"}, "2 s is not within its released_s, 2.1-2.2"),
         ({"onsets_s": "8", "sliding_s": "2-7"}, "the onset at 8 s is not before the end"),
-        ({"label": "slip", "onsets_s": "2"}, "label slip says all of it"),
         ({"label": ["slip", "slip"]}, "must be slip, non-slip or empty"),
     ],
 )
@@ -184,7 +183,7 @@ def test_a_truth_that_cannot_be_is_named(cells, line):
         ("- file: [a.csv]\n  material: wood\n", "manifest.yaml:1: file must be one value"),
         ("a: &x [1]\nb: *x\n", "manifest.yaml:2: aliases, as *name, are not read"),
         ("&x [*x]\n", "manifest.yaml:1: aliases, as *name, are not read"),
-        ("[" * 500 + "]" * 500, "manifest.yaml: is nested too deeply"),
+        ("{a: " * 50_000, "manifest.yaml: is nested too deeply"),
         ("\x01", "cannot be read as YAML"),
     ],
 )
