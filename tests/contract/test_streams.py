@@ -9,7 +9,6 @@ import torch
 from .names import StreamingDetector
 from .recordings import RATE_HZ, samples_of
 
-FLAGS = ("is_valid", "is_alarm", "is_on")
 SAMPLES = samples_of("D", 1)[1500:4500].astype(np.float64)
 
 
@@ -23,11 +22,7 @@ def pushed(stream, samples, cuts=()):
 
 
 def assert_same(found, expected):
-    for name, values in expected.items():
-        if name in FLAGS or values.dtype == torch.int64:
-            assert torch.equal(found[name], values), name
-        else:
-            torch.testing.assert_close(found[name], values, rtol=1e-9, atol=1e-9, msg=name)
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
 
 
 def in_double(trained):
@@ -83,7 +78,7 @@ def test_missing_samples_are_flagged_while_they_matter(trained, whole):
     is_far = (whole["available_s"] < 1000 / RATE_HZ) | (start_s > 1000 / RATE_HZ + reach_s)
     assert found["is_valid"][is_far].all()
     assert not found["is_valid"].all()
-    torch.testing.assert_close(found["score"][is_far], whole["score"][is_far], rtol=1e-9, atol=1e-9)
+    assert_same(found["score"][is_far], whole["score"][is_far])
 
 
 def test_a_masked_channel_counts_as_missing(trained):
@@ -92,7 +87,7 @@ def test_a_masked_channel_counts_as_missing(trained):
     without = SAMPLES.copy()
     without[:, trained.detector.pool.hand.names.index(used)] = np.nan
     found, expected = pushed(masked, SAMPLES), pushed(in_double(trained), without)
-    torch.testing.assert_close(found["score"], expected["score"], rtol=1e-9, atol=1e-9)
+    assert_same(found["score"], expected["score"])
     assert not found["is_valid"].any()
 
 
@@ -114,7 +109,7 @@ def test_gaps_in_time_are_filled_or_begin_another_stream(trained, whole):
     assert stream.num_gaps == 1
     scores = torch.cat([behind.score[behind.number.argmin().item() :], stream.flush().score])
     assert len(scores) >= len(whole["score"])
-    torch.testing.assert_close(scores[-len(whole["score"]) :], whole["score"], rtol=1e-9, atol=1e-9)
+    assert_same(scores[-len(whole["score"]) :], whole["score"])
 
 
 @pytest.mark.parametrize(
@@ -135,4 +130,4 @@ def test_what_cannot_be_pushed_is_refused_and_changes_nothing(
         stream.push(samples, time_s)
     rest = [stream.push(SAMPLES[700:]), stream.flush()]
     scores = torch.cat([part.score for part in (first, *rest)])
-    torch.testing.assert_close(scores, whole["score"], rtol=1e-9, atol=1e-9)
+    assert_same(scores, whole["score"])
