@@ -20,8 +20,9 @@ from hydra.utils import instantiate
 from torch import Tensor
 
 from benchmarks.harness import Benchmark, Job, say
-from benchmarks.subjects import SEEN_ROLE, FittedMachine, composed, small_recipe, statistics_from
+from benchmarks.subjects import SEEN_ROLE, FittedMachine, small_crossval
 from benchmarks.tables import Report, Table, by, percent
+from tactslip_torch.commands.crossval import read_materials
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.model.calibration import ABSTAIN, NON_SLIP, SLIP, Abstention, fit_platt
 from tactslip_torch.model.fit import HeldOut
@@ -56,8 +57,9 @@ class Abstaining(Benchmark):
         "thresholds of abstention were set"
     )
     quick = (
-        'overrides=[data.cycles=3,"data.materials=[M1,M4,iron]"] num_held_out=1 splits=1 '
-        "train_bins=30 scored_bins=40 num_features=20 penalties=[0.001] coverages=[0.5,0.8]"
+        'overrides=[num_workers=0,data.cycles=3,"data.materials=[M1,M4,iron]"] num_held_out=1 '
+        "splits=1 train_bins=30 scored_bins=40 num_features=20 penalties=[0.001] "
+        "coverages=[0.5,0.8]"
     )
     charts: ClassVar = {"": [(f"{role}: {of}", "coverage") for role, of in SEEN_ROLE.items()]}
     overrides: tuple[str, ...] = ()
@@ -71,11 +73,13 @@ class Abstaining(Benchmark):
 
     def measure(self, job: Job) -> dict[str, Any]:
         """A row for each split, way, coverage and role."""
-        config = composed("crossval", [*self.overrides, *job.overrides])
+        given = [f"scored_bins={self.scored_bins}", f"cache={job.folder / 'cache'}"]
+        given += [f"recipes.robust.penalties={list(self.penalties)}"]
+        given += [*self.overrides, *job.overrides]
+        config, recipe = small_crossval(given, self.train_bins, self.num_features)
         source = instantiate(config.data, _convert_="all")
         names = sorted({recording.material for recording in source.ids})
-        materials = statistics_from(source, config, names, self.train_bins, self.scored_bins)
-        recipe = small_recipe(config, self.train_bins, self.num_features, self.penalties)
+        materials = read_materials(config, source, names, [recipe])
         rows = []
         for held_out in _choices(names, self):
             say(f"abstaining: without {', '.join(held_out)}")

@@ -23,13 +23,11 @@ import torch
 from benchmarks import ROOT
 from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import (
-    FLOAT32,
-    FLOAT64,
     RATE_HZ,
     WINDOW_LENGTHS,
     Array,
     MainJobDetector,
-    endless,
+    pushing,
     raw_bins,
     stream_samples,
 )
@@ -40,8 +38,8 @@ from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.signals.filtering import ChannelFilter
 
 DTYPES: dict[Literal["float32", "float64"], torch.dtype] = {
-    "float32": FLOAT32,
-    "float64": FLOAT64,
+    "float32": torch.float32,
+    "float64": torch.float64,
 }
 REFERENCE = "reference, float64"
 
@@ -135,7 +133,7 @@ def _bins(main: MainJobDetector, folder: Path, sizes: Deployment) -> list[dict[s
     for precision, dtype in DTYPES.items():
         ways[f"onnxruntime, {precision}"] = bin_scores(folder / precision / "model.onnx")
         ways[f"tactslip_torch, {precision}"] = partial(_score, main.detector(dtype), dtype)
-    ways[REFERENCE] = partial(_score, main.detector(FLOAT64, "torch"), FLOAT64)
+    ways[REFERENCE] = partial(_score, main.detector(torch.float64, "torch"), torch.float64)
     rows: dict[str, dict[str, Any]] = {name: {"way": name} for name in ways}
     for size in (1, *sizes.bulk):
         say(f"deployment: {size} bins at once")
@@ -173,7 +171,7 @@ def _streams(main: MainJobDetector, folder: Path, sizes: Deployment) -> list[dic
             scores[name] = np.concatenate(each)
             pushes[name] = make().push
     say("deployment: streams")
-    calls = {n: partial(_next_push, of, endless(samples, sizes.push)) for n, of in pushes.items()}
+    calls = {n: pushing(of, samples, sizes.push) for n, of in pushes.items()}
     timings = interleaved(calls, sizes.rounds, block_s=0.02)
     exact = scores["tactslip_torch, float64"]
     push = f"us a push of {sizes.push} samples"
@@ -190,10 +188,6 @@ def _streams(main: MainJobDetector, folder: Path, sizes: Deployment) -> list[dic
 def _scores_of(pushed: Any) -> Array:
     score = [row["score"] for row in pushed] if isinstance(pushed, list) else pushed.score
     return np.asarray(score, np.float64).ravel()
-
-
-def _next_push(push: Callable[[Array], Any], samples: Any) -> None:
-    push(next(samples))
 
 
 def _starts(folder: Path, num: int) -> list[dict[str, Any]]:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from benchmarks.harness import Benchmark, Job
 from benchmarks.peers import arrays, loop, others
-from benchmarks.subjects import FLOAT32, FLOAT64, labelled_bins
+from benchmarks.subjects import labelled_bins
 from benchmarks.tables import Table, times
 from benchmarks.timing import interleaved, on_threads
 from tactslip_torch import FeaturePool, HandLayout
@@ -57,8 +57,8 @@ class Features(Benchmark):
         names = [(n.channel, n.component, n.domain, n.descriptor) for n in FeaturePool(HAND).names]
         windows = bins.float().numpy()
         ways: dict[str, tuple[int, Callable[[], Any]]] = {
-            "tactslip_torch, float64": (len(bins), partial(_pool(FLOAT64), bins)),
-            "tactslip_torch, float32": (len(bins), partial(_pool(FLOAT32), bins.float())),
+            "tactslip_torch, float64": (len(bins), partial(_pool(torch.float64), bins)),
+            "tactslip_torch, float32": (len(bins), partial(_pool(torch.float32), bins.float())),
             "reference, float64": (len(few), partial(FeaturePool(HAND, backend="torch"), few)),
             "NumPy and PyWavelets, batched": (len(few), partial(arrays.features, few.numpy(), 14)),
             "SciPy and PyWavelets, a loop": (1, partial(_looped, few[0].numpy(), names)),
@@ -97,7 +97,7 @@ def _error(found: Tensor, reference: Tensor) -> float:
 
 
 def _pool(dtype: torch.dtype) -> FeaturePool:
-    return FeaturePool(HAND, arithmetic="native" if dtype == FLOAT32 else "double")
+    return FeaturePool(HAND, arithmetic="native" if dtype == torch.float32 else "double")
 
 
 def _looped(bin_: Any, names: Any) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -32,28 +32,13 @@ FORWARD, OURS, PEER = "forward alone", "differentiable", "autograd"
 NUM_GROUPS, NUM_SCORED, PENALTY, OFFSET = 6, 1000, 1.0, 0.5
 
 
-class Problem(NamedTuple):
-    """A fit to go back through.
-
-    Attributes:
-        kind: the machine of all bins, or the scores of groups left out.
-        num_bins: to fit.
-        num_features: of them.
-        has_peer: whether autograd goes through the same.
-    """
-
-    kind: Literal["fit", "left_out"]
-    num_bins: int
-    num_features: int
-    has_peer: bool
-
-
 @dataclass(frozen=True)
 class Gradients(Benchmark):
     """Every way of every problem, in turns.
 
     Args:
-        problems: to go back through.
+        problems: to go back through: the machine of all bins (``fit``) or the scores of groups left
+            out, numbers of bins and of features, and whether autograd goes through the same.
         rounds: of every way.
         threads: of every process.
     """
@@ -61,13 +46,13 @@ class Gradients(Benchmark):
     title = "Gradients through the fit"
     about = "a loss and its gradient in features, C, c and weights, on synthetic bins"
     charts: ClassVar = {"": (("Forward and back", ("forward, s", "backward, s")),)}
-    quick = "problems=[[fit,200,12,true],[left_out,200,12,true]] rounds=1"
+    quick = "problems=[[left_out,200,12,true]] rounds=1"
     is_simulated = False
-    problems: tuple[Problem, ...] = (
-        Problem("fit", 8000, 120, has_peer=True),
-        Problem("fit", 2000, 120, has_peer=True),
-        Problem("left_out", 4800, 120, has_peer=False),
-        Problem("left_out", 2000, 60, has_peer=True),
+    problems: tuple[tuple[str, int, int, bool], ...] = (
+        ("fit", 8000, 120, True),
+        ("fit", 2000, 120, True),
+        ("left_out", 4800, 120, False),
+        ("left_out", 2000, 60, True),
     )
     rounds: int = 3
     threads: int = 2
@@ -76,13 +61,13 @@ class Gradients(Benchmark):
         """Seconds and bytes of every round, each in a process of its own."""
         rounds: dict[tuple[str, str], list[Any]] = {}
         for _ in range(self.rounds):
-            for problem in (Problem(*of) for of in self.problems):
-                about = f"{problem.kind.replace('_', ' ')}, {problem.num_bins:,} x "
-                about += str(problem.num_features)
-                for way in (FORWARD, OURS, *([PEER] if problem.has_peer else [])):
+            for kind, num_bins, num_features, has_peer in self.problems:
+                about = f"{kind.replace('_', ' ')}, {num_bins:,} x {num_features}"
+                for way in (FORWARD, OURS, *([PEER] if has_peer else [])):
                     say(f"gradients: {about}, {way}")
-                    given = {"problem": problem, "way": way, "threads": self.threads}
-                    answer = in_fresh_process("benchmarks.gradients:one_way", **given)
+                    sizes = {"num_bins": num_bins, "num_features": num_features}
+                    given: dict[str, Any] = {"kind": kind, "way": way, "threads": self.threads}
+                    answer = in_fresh_process("benchmarks.gradients:one_way", **sizes, **given)
                     rounds.setdefault((about, way), []).append(answer)
         cells = []
         for (about, way), own in rounds.items():
@@ -103,7 +88,7 @@ class Gradients(Benchmark):
         return {"tables": {"Forward and back": Table(cells, note)}}
 
 
-def one_way(problem: tuple[Any, ...], way: str, threads: int) -> dict[str, Any]:
+def one_way(kind: str, num_bins: int, num_features: int, way: str, threads: int) -> dict[str, Any]:
     """One loss and its gradient, after a small one that loads and starts what there is.
 
     Returns:
@@ -111,11 +96,10 @@ def one_way(problem: tuple[Any, ...], way: str, threads: int) -> dict[str, Any]:
         beyond what was held before, ``loss``, and ``gradient``, its size along drawn directions.
     """
     torch.set_num_threads(threads)
-    given = Problem(*problem)
-    _loss(given, way, *_learned(min(300, given.num_bins), given.num_features))
-    tensors = _learned(given.num_bins, given.num_features)
+    _loss(kind, way, *_learned(min(300, num_bins), num_features))
+    tensors = _learned(num_bins, num_features)
     before, backward_s, gradient = peak_bytes(), None, None
-    forward_s, loss = timed(lambda: _loss(given, way, *tensors))
+    forward_s, loss = timed(lambda: _loss(kind, way, *tensors))
     if way != FORWARD:
         backward_s, slopes = timed(lambda: torch.autograd.grad(loss, tensors))
         generator = torch.Generator().manual_seed(0)
@@ -141,12 +125,12 @@ def _learned(num_bins: int, num_features: int) -> tuple[Tensor, Tensor, Tensor, 
 
 
 def _loss(
-    problem: Problem, way: str, z: Tensor, penalty: Tensor, offset: Tensor, weights: Tensor
+    kind: str, way: str, z: Tensor, penalty: Tensor, offset: Tensor, weights: Tensor
 ) -> Tensor:
     """Mean logistic loss on other bins, or of groups left out."""
-    _, is_slip = synthetic_bins(len(z), problem.num_features)
+    _, is_slip = synthetic_bins(*z.shape)
     groups = torch.arange(len(z)) % NUM_GROUPS
-    new, new_is_slip = synthetic_bins(NUM_SCORED, problem.num_features, seed=1)
+    new, new_is_slip = synthetic_bins(NUM_SCORED, z.shape[1], seed=1)
     targets = torch.where(is_slip, 1.0, -1.0).double()
     fixed = TrainingBins(z.detach(), is_slip, weights.detach())
     kernel = Polynomial(2, offset.item())
@@ -157,7 +141,7 @@ def _loss(
         beta = torch.cholesky_solve(targets[of, None], torch.linalg.cholesky(system))[:, 0]
         return (rows @ z[of].mT + offset) ** 2 @ beta
 
-    if problem.kind == "fit":
+    if kind == "fit":
         every = torch.ones_like(is_slip)
         if way == FORWARD:
             scores = fit_machine(fixed, penalty.item(), kernel)(new)

@@ -22,14 +22,7 @@ from sklearn.svm import SVC
 from benchmarks.deployment import bin_scores
 from benchmarks.harness import Benchmark, Job, say
 from benchmarks.peers import loop, others
-from benchmarks.subjects import (
-    FLOAT32,
-    FLOAT64,
-    WINDOW_LENGTHS,
-    MainJobDetector,
-    labelled_bins,
-    raw_bins,
-)
+from benchmarks.subjects import WINDOW_LENGTHS, MainJobDetector, labelled_bins, raw_bins
 from benchmarks.tables import Table, limits, number
 from benchmarks.timing import interleaved, on_threads
 from tactslip_torch import FeaturePool, HandLayout
@@ -104,8 +97,8 @@ class Latency(Benchmark):
     def _ways(self) -> dict[str, Score]:
         """From one raw bin ``[1, C, n + 2 * context]``, float32, to its score."""
         main = MainJobDetector.fitted(self.recordings)
-        fast, exact = main.detector(FLOAT32), main.detector(FLOAT64)
-        slow = main.detector(FLOAT64, "torch")
+        fast, exact = main.detector(torch.float32), main.detector(torch.float64)
+        slow = main.detector(torch.float64, "torch")
         support, targets = main.z.numpy(), main.training.targets.numpy()
         svc = SVC(kernel="poly", degree=2, gamma=1.0, coef0=main.kernel.offset)
         svc.fit(support, targets)

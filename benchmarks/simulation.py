@@ -15,9 +15,10 @@ from typing import Any, ClassVar
 import torch
 
 from benchmarks.harness import Benchmark, Job, say
-from benchmarks.subjects import FittedMachine, composed, small_recipe, statistics_from
+from benchmarks.subjects import FittedMachine, small_crossval
 from benchmarks.tables import Table, percent, times
 from benchmarks.timing import interleaved, on_threads
+from tactslip_torch.commands.crossval import read_materials
 from tactslip_torch.simulation import SEEN_MATERIALS, Dynamics, Scene, simulate, timeline
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.recipe import balanced_accuracy
@@ -131,15 +132,15 @@ def _difference(scenes: list[Scene], finest: list[Scene]) -> tuple[float, float]
 @torch.no_grad()
 def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> list[dict[str, str]]:
     """Balanced accuracy on held-out cycles by the level trained on and the one evaluated on."""
-    config = composed("crossval", overrides)
-    recipe = small_recipe(config, sizes.train_bins, sizes.num_features)
+    off = ["cache=off", *overrides]
+    config, recipe = small_crossval(off, sizes.train_bins, sizes.num_features)
     kept = {}
     for level, (fidelity, given) in LEVELS.items():
         say(f"simulation: features of {level}")
         source = SimulatedRecordings(
             cycles=sizes.cycles, materials=list(sizes.materials), fidelity=fidelity, scene=given
         )
-        kept[level] = statistics_from(source, config, sizes.materials, sizes.train_bins, 2000)
+        kept[level] = read_materials(config, source, sizes.materials, [recipe])
     bins = {
         level: materials.bins_of(sizes.materials, ("test",)) for level, materials in kept.items()
     }

@@ -13,11 +13,10 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from functools import partial
-from itertools import cycle, islice
+from itertools import cycle
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -34,8 +33,8 @@ from benchmarks.subjects import (
     Array,
     MainJobDetector,
     alarm_settings,
-    endless,
     onset_settings,
+    pushing,
     stream_samples,
 )
 from benchmarks.tables import Report, Table, chart, limits, lines, listed
@@ -95,7 +94,7 @@ class Streaming(Benchmark):
                     call = _naive(detector, samples, hop)
                 else:
                     stream = StreamingDetector(detector, alarm_settings(hop), dtype=torch.float32)
-                    call = partial(_next_push, stream, endless(samples, push))
+                    call = pushing(stream.push, samples, push)
                     for _ in range(round(RATE_HZ / push)):
                         call()  # until every push makes its decisions
                 calls[f"{kind} {hop} {push}"] = call
@@ -168,10 +167,11 @@ def _hops(detector: SlipDetector, samples: Array, num: int) -> list[dict[str, An
             hosts["C"] = push
         seconds: dict[tuple[str, str], list[float]] = {}
         for host, push in hosts.items():  # one after the other: they would share the caches
-            for place, piece in enumerate(islice(endless(samples, hop), num)):
+            call = pushing(push, samples, hop)
+            for place in range(num):
                 bins = [(x * hop - first) // settings.hop_samples for x in (place, place + 1)]
                 started = time.thread_time()
-                push(piece)
+                call()
                 spent = time.thread_time() - started
                 if place >= _FIRST_TIMED:
                     kind = "hop" if bins[0] == bins[1] else "hop and bin"
@@ -216,13 +216,13 @@ def watch(seconds: float) -> dict[str, Any]:
     torch.set_num_threads(1)
     detector = MainJobDetector.fitted(1).detector()
     stream = StreamingDetector(detector, alarm_settings(HOP), dtype=torch.float32)
-    samples = endless(stream_samples(1), PUSH)
+    push = pushing(stream.push, stream_samples(1), PUSH)
     at_s: list[float] = []
     resident: list[int] = []
     state_bytes, each_s = 0, max(1.0, seconds / 400)
     gc.collect()
     for number_of_push in range(round(seconds * RATE_HZ / PUSH) + 1):
-        stream.push(next(samples))
+        push()
         now_s = number_of_push * PUSH / RATE_HZ
         if now_s >= len(at_s) * each_s:
             at_s.append(now_s)
@@ -237,10 +237,6 @@ def _naive(detector: SlipDetector, samples: Array, hop: int) -> Callable[[], Any
     length = detector.context_before + detector.pool.bin_samples + detector.context_after
     each = cycle(range(0, whole.shape[-1] - length, hop))
     return lambda: detector.predict_raw(whole[None, :, (at := next(each)) : at + length])
-
-
-def _next_push(stream: StreamingDetector, samples: Iterator[Array]) -> None:
-    stream.push(next(samples))
 
 
 def _ms(samples: int) -> str:

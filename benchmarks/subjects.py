@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,13 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 from torch import Tensor
 
-from benchmarks.harness import say, trained
+from benchmarks.harness import trained
 from benchmarks.selection import kept_selection
 from tactslip_torch import AlarmSettings, FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.commands.configuration import checked
-from tactslip_torch.commands.crossval import Materials
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource
-from tactslip_torch.data.splits import Split, seen6
+from tactslip_torch.data.splits import Split
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.calibration import Platt
@@ -45,7 +45,6 @@ from tactslip_torch.training.recipe import Recipe
 Array = NDArray[Any]
 WINDOW_LENGTHS = (51,) * 14 + (11,) * 10
 RATE_HZ = 2000.0
-FLOAT32, FLOAT64 = torch.float32, torch.float64
 SEEN_ROLE = {"test": "held-out cycles of seen materials", "unseen": "held-out materials"}
 
 
@@ -84,11 +83,10 @@ def raw_bins(num: int, num_recordings: int = 1) -> Tensor:
     return torch.stack([samples[:, start : start + length] for start in starts]).contiguous()
 
 
-def endless(samples: Array, num: int) -> Iterator[Array]:
-    """Pieces of ``num`` samples, over and over; what does not fill a piece is passed over."""
-    while True:
-        for start in range(0, len(samples) - num + 1, num):
-            yield samples[start : start + num]
+def pushing(push: Callable[[Array], object], samples: Array, num: int) -> Callable[[], object]:
+    """A call that pushes the next ``num`` samples, over and over; a rest is passed over."""
+    starts = cycle(range(0, len(samples) - num + 1, num))
+    return lambda: push(samples[(start := next(starts)) : start + num])
 
 
 # ------------------------------------------------------------ a detector of the main job's size
@@ -128,11 +126,11 @@ class MainJobDetector:
         return TrainingBins(self.z, self.is_slip)
 
     def detector(
-        self, dtype: torch.dtype = FLOAT64, backend: BackendName = "auto", hop: int = 20
+        self, dtype: torch.dtype = torch.float64, backend: BackendName = "auto", hop: int = 20
     ) -> SlipDetector:
         """A detector of its own, which computes in this dtype, with settings for streams."""
         pool = FeaturePool(
-            HandLayout.paper24(), arithmetic="native" if dtype == FLOAT32 else "double"
+            HandLayout.paper24(), arithmetic="native" if dtype == torch.float32 else "double"
         )
         head = fit_machine(self.training, self.penalty, self.kernel)
         scaler = copy.deepcopy(self.scaler)
@@ -245,26 +243,6 @@ class Trained:
         return sorted({one.material for one in self.recordings(role)})
 
 
-def statistics_from(
-    source: RecordingSource,
-    config: DictConfig,
-    seen: Sequence[str],
-    train_bins: int,
-    scored_bins: int,
-) -> Materials:
-    """What one pass over all recordings keeps of each material, split by cycle."""
-    rule = instantiate(config.labels)
-    by = {"train_fraction": config.train_fraction, "seed": config.seed}
-    by_cycle = seen6(source.ids, seen=list(seen), **by)[0]
-    maker = feature_maker(source, rule, **config.features)
-    materials = Materials(maker.pool, train_bins, scored_bins)
-    for place, recording in enumerate(source.ids):
-        if place % 20 == 0:
-            say(f"features of recording {place} of {len(source.ids)}")
-        materials.update(maker(recording, by_cycle), by_cycle.roles[recording])
-    return materials
-
-
 @dataclass(frozen=True, eq=False)
 class FittedMachine:
     """A machine of sampled training bins, as a recipe makes it."""
@@ -290,10 +268,11 @@ class FittedMachine:
         return scores
 
 
-def small_recipe(
-    config: DictConfig, train_bins: int, num_features: int, penalties: Sequence[float] = ()
-) -> Recipe:
-    """The default recipe on a sample of bins."""
-    whole: Recipe = instantiate(config.recipes.robust, _convert_="all")
-    choices = tuple(penalties) or whole.penalties
-    return replace(whole, sample_bins=train_bins, num_features=num_features, penalties=choices)
+def small_crossval(
+    overrides: Sequence[str], train_bins: int, num_features: int
+) -> tuple[DictConfig, Recipe]:
+    """The configuration of ``crossval``, and its default recipe on a sample of bins."""
+    sized = [f"train_bins={train_bins}", f"recipes.robust.num_features={num_features}"]
+    config = composed("crossval", [*sized, *overrides])
+    recipe: Recipe = instantiate(config.recipes.robust, _convert_="all")
+    return config, replace(recipe, sample_bins=train_bins)

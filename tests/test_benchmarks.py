@@ -34,8 +34,8 @@ def _subject(name: str) -> type[Benchmark]:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", SUBJECTS)
-def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path, monkeypatch) -> None:
-    """In this process: commands that a subject runs have theirs."""
+def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path, monkeypatch, drawn) -> None:
+    """In this process, as most commands that a subject runs; figures are small."""
     monkeypatch.chdir(ROOT)
     arguments = ["--quick", "--out", str(tmp_path)]
     if name in ("real", "realism"):
@@ -44,7 +44,7 @@ def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path, monkeypa
     assert subject.run(arguments) == 0
     assert json.loads((tmp_path / f"{name}.json").read_text())["quick"]
     assert (tmp_path / f"{name}.md").read_text().count("|") > 10
-    assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+    assert (tmp_path / f"{name}.png").stat().st_size > 2_000
     assert subject.run(["--render", *arguments]) == 0
 
 

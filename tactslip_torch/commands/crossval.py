@@ -142,7 +142,7 @@ def crossval(config: DictConfig, folder: Path) -> dict[str, Any]:
         for name, recipe in instantiate(config.recipes, _convert_="all").items()
     }
     save_config(config, folder)
-    materials = _read(config, source, names, recipes.values())
+    materials = read_materials(config, source, names, recipes.values())
     choices = list(itertools.combinations(names, num_unseen))
 
     def work(job: tuple[str, Sequence[str]]) -> dict[str, Any]:
@@ -166,10 +166,20 @@ def crossval(config: DictConfig, folder: Path) -> dict[str, Any]:
     return content
 
 
-def _read(
+def read_materials(
     config: DictConfig, source: RecordingSource, names: Sequence[str], recipes: Iterable[Recipe]
 ) -> Materials:
-    """One pass over all recordings."""
+    """One pass over all recordings, split by cycle.
+
+    Args:
+        config: composed from ``conf/crossval.yaml``.
+        source: of the recordings.
+        names: of the materials.
+        recipes: that will be fitted.
+
+    Raises:
+        ValueError: if a recipe allows no feature of the pool.
+    """
     rule = instantiate(config.labels)
     fraction = config.train_fraction
     by_cycle = seen6(source.ids, seen=names, train_fraction=fraction, seed=config.seed)[0]
