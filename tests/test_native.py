@@ -155,14 +155,14 @@ def test_leading_axes_strides_copies_and_modes(backend):
 # Built and found ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"selected": []}, "empty selection"),
-        ({"selected": [len(NAMES)]}, rf"must lie in 0..{len(NAMES) - 1}, the pool's {len(NAMES)}"),
-        ({"backend": "fast"}, "backend must be one of auto, native, torch, got 'fast'"),
-    ],
-)
+REFUSED = [
+    ({"selected": []}, "empty selection"),
+    ({"selected": [len(NAMES)]}, rf"must lie in 0..{len(NAMES) - 1}, the pool's {len(NAMES)}"),
+    ({"backend": "fast"}, "backend must be one of auto, native, torch, got 'fast'"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), REFUSED)
 def test_what_is_refused_is_one_line(arguments, message):
     with pytest.raises(ValueError, match=message) as caught:
         made(POOL, **arguments)

@@ -104,16 +104,15 @@ def off(detector, precision, samples):
     return dict(zip(map(str, detector.pool.names), error, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("precision", "case"),
-    [
-        ("float32", {}),
-        ("float64", {"align": "causal"}),
-        ("float64", {"bin_samples": 75, "level": 3, "spectrum": "clean"}),
-        ("float64", {"bin_samples": 101, "align": "trailing"}),
-    ],
-    ids=str,
-)
+CASES = [
+    ("float32", {}),
+    ("float64", {"align": "causal"}),
+    ("float64", {"bin_samples": 75, "level": 3, "spectrum": "clean"}),
+    ("float64", {"bin_samples": 101, "align": "trailing"}),
+]
+
+
+@pytest.mark.parametrize(("precision", "case"), CASES, ids=str)
 def test_every_feature_of_the_pool_is_that_of_torch(precision, case):
     detector = whole_pool(**case)
     extra = torch.from_numpy(np.random.default_rng(1).standard_normal((20, 4, 1)))

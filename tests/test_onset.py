@@ -246,16 +246,16 @@ def kept(change, hand=HAND):
     return AlarmSettings.from_dict(plain, hand, RATE)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: evidence_of("GG"), "needs fast channels, and this hand has none; take onset=deb"),
-        (lambda: evidence_of(hop=0), "a hop of 0 samples at 2000 Hz is no hop of at most 5 ms"),
-        (lambda: evidence_of(fast_knee=(1.0,) * 3), "expected 10 positive and finite knees"),
-        (lambda: kept(dict, some_hand("F")), "expected 12 columns of evidence, got 72"),
-        (lambda: kept(lambda plain: plain.pop("mains_hz")), "of this version: 'mains_hz'"),
-    ],
-)
+BAD_SETTINGS = [
+    (lambda: evidence_of("GG"), "needs fast channels, and this hand has none; take onset=deb"),
+    (lambda: evidence_of(hop=0), "a hop of 0 samples at 2000 Hz is no hop of at most 5 ms"),
+    (lambda: evidence_of(fast_knee=(1.0,) * 3), "expected 10 positive and finite knees"),
+    (lambda: kept(dict, some_hand("F")), "expected 12 columns of evidence, got 72"),
+    (lambda: kept(lambda plain: plain.pop("mains_hz")), "of this version: 'mains_hz'"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), BAD_SETTINGS)
 def test_bad_settings_are_refused_in_one_line(make, message):
     with pytest.raises(ValueError, match=message) as caught:
         make()
@@ -342,19 +342,19 @@ def test_a_missing_film_is_flagged_and_counts_as_silent(name):
     torch.testing.assert_close(found.score[[0, 2]], whole.score[[0, 2]])
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda x: film_band_power(x, []), "needs a film"),
-        (lambda x: largest_detail(x, torch.zeros(3, dtype=torch.bool)), "needs a film"),
-        (lambda x: film_band_power(x, [0], 8.0), "no line of 100 samples"),
-        (lambda x: largest_detail(x[..., :20], [0]), "level must lie in"),
-        (lambda x: largest_detail(x, [0], wavelet="none"), "unknown wavelet"),
-        (lambda x: baseline("loudest"), r"baseline must be one of film.*got 'loudest'"),
-        (lambda x: baseline("largest_detail", HandLayout(HAND.channels[:2])), "needs a film"),
-        (lambda x: baseline("largest_detail").predict_raw(x), "expected samples"),
-    ],
-)
+NO_BASELINE = [
+    (lambda x: film_band_power(x, []), "needs a film"),
+    (lambda x: largest_detail(x, torch.zeros(3, dtype=torch.bool)), "needs a film"),
+    (lambda x: film_band_power(x, [0], 8.0), "no line of 100 samples"),
+    (lambda x: largest_detail(x[..., :20], [0]), "level must lie in"),
+    (lambda x: largest_detail(x, [0], wavelet="none"), "unknown wavelet"),
+    (lambda x: baseline("loudest"), r"baseline must be one of film.*got 'loudest'"),
+    (lambda x: baseline("largest_detail", HandLayout(HAND.channels[:2])), "needs a film"),
+    (lambda x: baseline("largest_detail").predict_raw(x), "expected samples"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), NO_BASELINE)
 def test_what_is_no_baseline_is_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call(torch.randn(2, 3, 100))
@@ -489,14 +489,14 @@ def test_knees_are_a_tenth_of_the_usual_power_and_the_usual_step():
     assert evidence.slow_knee[0] == pytest.approx(np.median(steps), rel=0.02)
 
 
-@pytest.mark.parametrize(
-    ("scene", "numbers", "match"),
-    [
-        ("taps", {}, "no slip begins in the recordings that onsets are learned from"),
-        ("none", {}, "no recording is left to learn onsets from; give onset.streams"),
-        ("paper", {"hop_ms": 5.6}, "a hop of 6 samples at 1000 Hz is no hop of at most"),
-    ],
-)
+NOTHING_TO_LEARN = [
+    ("taps", {}, "no slip begins in the recordings that onsets are learned from"),
+    ("none", {}, "no recording is left to learn onsets from; give onset.streams"),
+    ("paper", {"hop_ms": 5.6}, "a hop of 6 samples at 1000 Hz is no hop of at most"),
+]
+
+
+@pytest.mark.parametrize(("scene", "numbers", "match"), NOTHING_TO_LEARN)
 def test_what_nothing_can_be_learned_from_is_refused_in_one_line(scene, numbers, match):
     source = Bursts()
     with pytest.raises(ValueError, match=match) as caught:

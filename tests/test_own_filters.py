@@ -32,33 +32,28 @@ def split_of(source):
 
 def test_other_filters_are_another_entry_of_the_cache(tmp_path):
     source, cache = SmallSet(), FeatureCache(tmp_path)
-    choices = [
-        {},
-        {"wavelet": WAVELET},
-        {"kernels": KERNELS},
-        {"kernels": own_kernels(ChannelFilter([51, 11]), seed=4)},
-    ]
+    others = own_kernels(ChannelFilter([51, 11]), seed=4)
+    choices = [{}, {"wavelet": WAVELET}, {"kernels": KERNELS}, {"kernels": others}]
     for _ in range(2):
         for choice in choices:
             maker_of(source, cache=cache, **choice)(RECORDING, split_of(source))
     assert source.loads == len(choices)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda facts: facts["kernels"].update({"11": [0.1] * 11}),
-        lambda facts: facts["kernels"].update({"nine": [1.0]}),
-        lambda facts: facts["pool"]["wavelet"].update({"dec_lo": [1.0] * 6}),
-        lambda facts: facts["pool"]["wavelet"].pop("name"),
-    ],
-    ids=["kernel sum", "kernel length", "no wavelet", "no name"],
-)
+DAMAGES = {
+    "kernel sum": lambda facts: facts["kernels"].update({"11": [0.1] * 11}),
+    "kernel length": lambda facts: facts["kernels"].update({"nine": [1.0]}),
+    "no wavelet": lambda facts: facts["pool"]["wavelet"].update({"dec_lo": [1.0] * 6}),
+    "no name": lambda facts: facts["pool"]["wavelet"].pop("name"),
+}
+
+
+@pytest.mark.parametrize("change", DAMAGES)
 def test_damaged_filters_are_named_in_one_line(tmp_path, change):
     path = tmp_path / "detector.pt"
     detector_of("own filters").save(path)
     facts, tensors = load_table(path, FORMAT)
-    change(facts)
+    DAMAGES[change](facts)
     save_table(path, FORMAT, facts, tensors)
     with pytest.raises(ValueError, match="is damaged: ") as error:
         SlipDetector.load(path)

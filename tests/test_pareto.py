@@ -135,22 +135,22 @@ def test_groups_hold_what_their_names_say():
             names_of(channels, components)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"channels": ["toes"]}, r"search.channels: unknown 'toes', expected some of all, films"),
-        ({"sizes": []}, r"search.sizes is empty, expected at least one value"),
-        ({"sizes": 8}, r"search.sizes must be a list in brackets, got 8"),
-        ({"sizes": [8.5]}, r"search.sizes must be a positive whole number, got 8.5"),
-        ({"pooled_sizes": [None, 0]}, r"search.pooled_sizes must be a positive whole number"),
-        ({"penalties": [float("inf")]}, r"search.penalties must be a .* finite number, got inf"),
-        ({"calls": True}, r"search.calls must be a positive whole number, got True"),
-        ({"cost_power": -1}, r"search.cost_power must be a finite number of at least 0, got -1"),
-        ({"alpha": 1.5}, r"search.alpha must be at most 1, got 1.5"),
-        ({"degrees": [True]}, r"search.degrees: unknown True, expected some of 1, 2"),
-        ({"statistics": ["mean"]}, r"each of search.statistics must be a list in brackets, got 'm"),
-    ],
-)
+REFUSED = [
+    ({"channels": ["toes"]}, r"search.channels: unknown 'toes', expected some of all, films"),
+    ({"sizes": []}, r"search.sizes is empty, expected at least one value"),
+    ({"sizes": 8}, r"search.sizes must be a list in brackets, got 8"),
+    ({"sizes": [8.5]}, r"search.sizes must be a positive whole number, got 8.5"),
+    ({"pooled_sizes": [None, 0]}, r"search.pooled_sizes must be a positive whole number"),
+    ({"penalties": [float("inf")]}, r"search.penalties must be a .* finite number, got inf"),
+    ({"calls": True}, r"search.calls must be a positive whole number, got True"),
+    ({"cost_power": -1}, r"search.cost_power must be a finite number of at least 0, got -1"),
+    ({"alpha": 1.5}, r"search.alpha must be at most 1, got 1.5"),
+    ({"degrees": [True]}, r"search.degrees: unknown True, expected some of 1, 2"),
+    ({"statistics": ["mean"]}, r"each of search.statistics must be a list in brackets, got 'm"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), REFUSED)
 def test_what_cannot_be_searched_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         pareto.Search(**(SMALL | changes))
@@ -364,16 +364,16 @@ def test_unseen_materials_are_never_read_and_test_cycles_by_the_chosen_one_alone
     assert found["chosen"]["test"]["num_bins"] > 0
 
 
-@pytest.mark.parametrize(
-    ("argument", "message"),
-    [
-        ("deadline_ms=57.5", "look-ahead 2.5 ms are 57.5 ms before any compute; give more, or a"),
-        ("tries=0", "tries must be a positive whole number, got 0"),
-        ("search.hops_ms=[5.3]", "search.hops_ms: 5.3 ms are 10.6 samples at 2000 Hz"),
-        ("headroom=0.5", "headroom must be a finite number of at least 1, got 0.5"),
-        ("search.sizes=[5000]", "an empty selection: no group of this hand"),
-    ],
-)
+BAD_ARGUMENTS = [
+    ("deadline_ms=57.5", "look-ahead 2.5 ms are 57.5 ms before any compute; give more, or a"),
+    ("tries=0", "tries must be a positive whole number, got 0"),
+    ("search.hops_ms=[5.3]", "search.hops_ms: 5.3 ms are 10.6 samples at 2000 Hz"),
+    ("headroom=0.5", "headroom must be a finite number of at least 1, got 0.5"),
+    ("search.sizes=[5000]", "an empty selection: no group of this hand"),
+]
+
+
+@pytest.mark.parametrize(("argument", "message"), BAD_ARGUMENTS)
 def test_bad_input_is_one_line(monkeypatch, tmp_path, argument, message):
     monkeypatch.setattr(pareto.ParetoSearch, "read", None)  # it refuses before it works
     with pytest.raises(BAD_INPUT) as caught:

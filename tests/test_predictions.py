@@ -136,16 +136,16 @@ def test_a_head_that_overflows_is_not_valid():
     assert not found.is_valid[~found.score.isfinite()].any()
 
 
-@pytest.mark.parametrize(
-    ("samples", "message"),
-    [
-        (torch.zeros(2, 24, 150, dtype=torch.int32), "got torch.int32; convert with .float"),
-        (torch.zeros(2, 24, 150, dtype=torch.bfloat16), r"bfloat16; convert .* or .double\(\)"),
-        (np.zeros((2, 24, 150)), "got numpy.ndarray; use torch.as_tensor"),
-        (torch.full((2, 25, 150), torch.nan), r"24, .*got \(2, 25, 150\)"),
-        (torch.full((150,), torch.nan), r"24, .*got \(150,\)"),
-    ],
-)
+NO_SAMPLES = [
+    (torch.zeros(2, 24, 150, dtype=torch.int32), "got torch.int32; convert with .float"),
+    (torch.zeros(2, 24, 150, dtype=torch.bfloat16), r"bfloat16; convert .* or .double\(\)"),
+    (np.zeros((2, 24, 150)), "got numpy.ndarray; use torch.as_tensor"),
+    (torch.full((2, 25, 150), torch.nan), r"24, .*got \(2, 25, 150\)"),
+    (torch.full((150,), torch.nan), r"24, .*got \(150,\)"),
+]
+
+
+@pytest.mark.parametrize(("samples", "message"), NO_SAMPLES)
 def test_what_are_no_samples_of_this_hand_is_refused_in_words(samples, message, detector):
     for take in (detector.predict_raw, detector.score_raw):
         with pytest.raises((TypeError, ValueError), match=message):
@@ -206,14 +206,14 @@ def test_the_file_holds_what_stands_in_for_a_channel(kind, small, tmp_path):
         assert float((near.score - expected.score).abs().max()) < 1e-4 * expected.score.std()
 
 
-@pytest.mark.parametrize(
-    ("masked", "said"),
-    [
-        (["SG9"], r"^masked_channels names the channel 'SG9', .* take some of SG1, SG2, PVDF1, PV"),
-        (3, r"^masked_channels must be a list of names of channels, got 3"),
-        (torch.zeros(3).bool(), r"bool mask \[4\], got torch.bool \(3,\)"),
-    ],
-)
+NO_CHANNELS = [
+    (["SG9"], r"^masked_channels names the channel 'SG9', .* take some of SG1, SG2, PVDF1, PV"),
+    (3, r"^masked_channels must be a list of names of channels, got 3"),
+    (torch.zeros(3).bool(), r"bool mask \[4\], got torch.bool \(3,\)"),
+]
+
+
+@pytest.mark.parametrize(("masked", "said"), NO_CHANNELS)
 def test_what_is_no_channel_of_the_hand_is_refused_in_one_line(masked, said, small):
     with pytest.raises(ValueError, match=said):
         small.predict_raw(raw_bins(1), masked_channels=masked)

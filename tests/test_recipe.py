@@ -27,7 +27,6 @@ from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.missing_channels import RESOLUTION
 from tactslip_torch.training import plan as planning
 from tactslip_torch.training.learner import SlipLearner
-from tactslip_torch.training.plan import TrainingPass, choose_model, plan_detector
 from tactslip_torch.training.recipe import (
     FREE_CONSTANT,
     Recipe,
@@ -74,11 +73,11 @@ def selected(recipe, parts):
 
 
 def planned(recipe, parts):
-    return plan_detector(recipe, statistics_from(recipe, parts))
+    return planning.plan_detector(recipe, statistics_from(recipe, parts))
 
 
 def passed(plan, parts):
-    gathered = TrainingPass(plan)
+    gathered = planning.TrainingPass(plan)
     for recording, features, is_slip in parts:
         gathered.update(str(recording), features, is_slip)
     return gathered
@@ -122,35 +121,34 @@ def test_a_sample_stands_for_all_bins_with_both_classes_of_one_weight(balance, r
     assert class_fractions(recipe, sample)[0] == 1.0  # non-slip is the smaller class
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"balance": "none"}, r"recipe.balance must be one of undersample, weights, got 'none'"),
-        ({"kernel": "rbf"}, r"recipe.kernel=rbf needs recipe.gamma"),
-        ({"penalties": ()}, r"recipe.penalties must be positive, got \[\]"),
-        ({"penalties": (0.1, float("inf"))}, r"validation needs finite values"),
-        ({"num_features": 1.5}, r"num_features must be whole numbers of at least 1, got \[1.5\]"),
-        ({"offsets": -1.0}, r"recipe.offsets must not be negative"),
-        ({"tail": "0.1"}, r"recipe.tail must lie in \[0, 0.5\), got '0.1'"),  # text is no number
-        ({"most_correlation": 0.0}, r"recipe.most_correlation must lie in \(0, 1\]"),
-        ({"sample_bins": 1}, r"recipe.sample_bins must be at least 2"),
-        ({"degree": 0}, r"degree of the kernel must be a whole number"),
-        ({"use": "pooled", "pooling": None}, "needs statistics over channels"),
-        ({"num_features": None}, "num_features=null needs recipe.validation=nested"),
-        ({"validation": "nested", "kernel": "rbf", "gamma": 1}, "needs recipe.kernel=polynomial"),
-        ({"validation": "nested", "degree": 3}, "of degree 1 or 2"),
-        ({"tolerance": 1.0}, r"recipe.tolerance must lie in \[0, 1\), got 1.0"),
-        ({"scene_weights": {"taps": 0.0}}, "scene_weights must be positive, got {'taps': 0.0}"),
-        ({"feature_filter": {"kinds": "SG"}}, r"recipe.feature_filter: unknown 'kinds', expected"),
-        ({"feature_filter": {"kind": 3}}, r"feature_filter.kind must be a name or several, got 3"),
-        ({"feature_filter": "SG"}, r"recipe.feature_filter must be like .*, got 'SG'"),
-        ({"degree": 3}, "^tuning needs recipe.kernel=polynomial recipe.degree=2, got Polynomial"),
-        ({"kernel": "rbf", "gamma": 0.1}, "needs recipe.kernel=polynomial recipe.degree=2"),
-        ({"validation": "nested"}, "needs a machine of degree 2 .* recipe=paper does not always"),
-        ({"penalties": float("inf")}, "needs finite recipe.penalties, got inf"),
-    ],
-    ids=str,
-)
+BAD_RECIPES = [
+    ({"balance": "none"}, r"recipe.balance must be one of undersample, weights, got 'none'"),
+    ({"kernel": "rbf"}, r"recipe.kernel=rbf needs recipe.gamma"),
+    ({"penalties": ()}, r"recipe.penalties must be positive, got \[\]"),
+    ({"penalties": (0.1, float("inf"))}, r"validation needs finite values"),
+    ({"num_features": 1.5}, r"num_features must be whole numbers of at least 1, got \[1.5\]"),
+    ({"offsets": -1.0}, r"recipe.offsets must not be negative"),
+    ({"tail": "0.1"}, r"recipe.tail must lie in \[0, 0.5\), got '0.1'"),  # text is no number
+    ({"most_correlation": 0.0}, r"recipe.most_correlation must lie in \(0, 1\]"),
+    ({"sample_bins": 1}, r"recipe.sample_bins must be at least 2"),
+    ({"degree": 0}, r"degree of the kernel must be a whole number"),
+    ({"use": "pooled", "pooling": None}, "needs statistics over channels"),
+    ({"num_features": None}, "num_features=null needs recipe.validation=nested"),
+    ({"validation": "nested", "kernel": "rbf", "gamma": 1}, "needs recipe.kernel=polynomial"),
+    ({"validation": "nested", "degree": 3}, "of degree 1 or 2"),
+    ({"tolerance": 1.0}, r"recipe.tolerance must lie in \[0, 1\), got 1.0"),
+    ({"scene_weights": {"taps": 0.0}}, "scene_weights must be positive, got {'taps': 0.0}"),
+    ({"feature_filter": {"kinds": "SG"}}, r"recipe.feature_filter: unknown 'kinds', expected"),
+    ({"feature_filter": {"kind": 3}}, r"feature_filter.kind must be a name or several, got 3"),
+    ({"feature_filter": "SG"}, r"recipe.feature_filter must be like .*, got 'SG'"),
+    ({"degree": 3}, "^tuning needs recipe.kernel=polynomial recipe.degree=2, got Polynomial"),
+    ({"kernel": "rbf", "gamma": 0.1}, "needs recipe.kernel=polynomial recipe.degree=2"),
+    ({"validation": "nested"}, "needs a machine of degree 2 .* recipe=paper does not always"),
+    ({"penalties": float("inf")}, "needs finite recipe.penalties, got inf"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_RECIPES, ids=str)
 def test_bad_recipes_are_refused(change, message):
     Recipe().check_quadratic("tuning")
     with pytest.raises(ValueError, match=message):
@@ -275,17 +273,16 @@ def told_apart(rng, pool):
     return statistics
 
 
-@pytest.mark.parametrize(
-    ("wanted", "does", "num"),
-    [
-        ({"kind": "SG"}, lambda n: n.channel.startswith("SG"), 14 * 13),
-        ({"kind": "SG", "descriptor": "mean"}, lambda n: str(n).endswith("raw time mean"), 14),
-        ({"finger": "thumb"}, lambda n: n.channel in ("SG13", "SG14", "PVDF9", "PVDF10"), 26 + 480),
-        ({"channel": ["SG2", "PVDF3"]}, lambda n: n.channel in ("SG2", "PVDF3"), 13 + 240),
-        ({"component": "D1", "domain": "time"}, lambda n: " D1 time " in str(n), 10 * 14),
-    ],
-    ids=lambda value: "rule" if callable(value) else str(value),  # no address: as in any process
-)
+FILTERS = [
+    ({"kind": "SG"}, lambda n: n.channel.startswith("SG"), 14 * 13),
+    ({"kind": "SG", "descriptor": "mean"}, lambda n: str(n).endswith("raw time mean"), 14),
+    ({"finger": "thumb"}, lambda n: n.channel in ("SG13", "SG14", "PVDF9", "PVDF10"), 26 + 480),
+    ({"channel": ["SG2", "PVDF3"]}, lambda n: n.channel in ("SG2", "PVDF3"), 13 + 240),
+    ({"component": "D1", "domain": "time"}, lambda n: " D1 time " in str(n), 10 * 14),
+]
+
+
+@pytest.mark.parametrize(("wanted", "does", "num"), FILTERS, ids=[str(row[0]) for row in FILTERS])
 def test_what_matches_has_every_attribute_that_is_asked_for(wanted, does, num):
     mask = matching(POOL.hand, POOL.names, wanted)
     assert int(mask.sum()) == num
@@ -297,7 +294,7 @@ def test_what_matches_has_every_attribute_that_is_asked_for(wanted, does, num):
 def test_only_what_matches_is_ranked_and_in_the_order_of_the_whole_ranking(most_correlation, rng):
     statistics, wanted = told_apart(rng, SMALL_POOL), {"domain": "freq"}
     options = {"num_features": 9, "most_correlation": most_correlation, "penalties": 0.1}
-    plan = plan_detector(Recipe(feature_filter=wanted, **options), statistics, SMALL_POOL)
+    plan = planning.plan_detector(Recipe(feature_filter=wanted, **options), statistics, SMALL_POOL)
     every = select_features(Recipe(num_features=len(SMALL_POOL.names)), statistics).selected
     of_spectra = [index for index in every if SMALL_POOL.names[index].domain == "freq"]
     assert list(plan.selection.selected) == of_spectra[:9]
@@ -308,7 +305,7 @@ def test_only_what_matches_is_ranked_and_in_the_order_of_the_whole_ranking(most_
 def test_more_features_than_match_are_cut_and_that_is_said(rng, caplog):
     options = {"feature_filter": {"kind": "SG"}, "penalties": (0.1, 1.0)}
     recipe, statistics = Recipe(num_features=[2, 60, 120], **options), told_apart(rng, SMALL_POOL)
-    plan = plan_detector(recipe, statistics, SMALL_POOL)
+    plan = planning.plan_detector(recipe, statistics, SMALL_POOL)
     numbers = {"matching": 13, "num_features": [2, 13]}
     assert plan.feature_filter == {"wanted": {"kind": ["SG"]}, **numbers}
     assert [row["num_features"] for row in plan.validation] == [2, 2, 13, 13]
@@ -319,7 +316,7 @@ def test_more_features_than_match_are_cut_and_that_is_said(rng, caplog):
 def test_a_filter_is_never_silently_ignored(rng):
     recipe = Recipe(num_features=3, feature_filter={"kind": "SG"})
     with pytest.raises(ValueError, match=r"needs the names of features; hand over the pool"):
-        plan_detector(recipe, told_apart(rng, SMALL_POOL))
+        planning.plan_detector(recipe, told_apart(rng, SMALL_POOL))
     with pytest.raises(ValueError, match=r"recipe.feature_filter is not for a search"):
         ParetoSearch({}, None, None, recipe)
     maker = small_maker(SmallSet())
@@ -375,7 +372,7 @@ def sample_of(rng, groups=GROUPS, per=30):
 
 
 def chosen(sample, **changes):
-    return choose_model(Recipe(**NESTED | changes), FILM_POOL, sample)
+    return planning.choose_model(Recipe(**NESTED | changes), FILM_POOL, sample)
 
 
 @pytest.fixture(scope="module")
@@ -466,7 +463,7 @@ def small():
     for recording in split.having("train"):
         made = maker(recording, split)
         statistics.update(str(recording), recording.material, made.features, made.is_slip)
-    return maker, statistics.sample.bins(), plan_detector(RECIPE, statistics), split
+    return maker, statistics.sample.bins(), planning.plan_detector(RECIPE, statistics), split
 
 
 def tuned_by(small, sample, tuning):
@@ -543,19 +540,18 @@ def test_a_held_out_group_does_not_change_its_descent(small):
     assert first[0]["held_loss"] != second[0]["held_loss"]
 
 
-@pytest.mark.parametrize(
-    ("values", "changes", "message"),
-    [
-        ({"learn": ["bias"]}, {}, "tuning.learn must be a list of some of penalty, offset"),
-        ({"steps": 0}, {}, "tuning.steps must be a positive whole number, got 0"),
-        ({"bins": "abc"}, {}, "tuning.bins must be a positive whole number, got 'abc'"),
-        ({"rate": float("nan")}, {}, "tuning.rate must be a positive finite number, got nan"),
-        ({}, {"degree": 3}, "needs recipe.kernel=polynomial recipe.degree=2"),
-        ({}, {"offsets": 0.0}, r"needs recipe\.offsets above 0"),
-        ({}, {}, "needs three groups to hold some out, got a, b"),
-    ],
-    ids=str,
-)
+NO_TUNING = [
+    ({"learn": ["bias"]}, {}, "tuning.learn must be a list of some of penalty, offset"),
+    ({"steps": 0}, {}, "tuning.steps must be a positive whole number, got 0"),
+    ({"bins": "abc"}, {}, "tuning.bins must be a positive whole number, got 'abc'"),
+    ({"rate": float("nan")}, {}, "tuning.rate must be a positive finite number, got nan"),
+    ({}, {"degree": 3}, "needs recipe.kernel=polynomial recipe.degree=2"),
+    ({}, {"offsets": 0.0}, r"needs recipe\.offsets above 0"),
+    ({}, {}, "needs three groups to hold some out, got a, b"),
+]
+
+
+@pytest.mark.parametrize(("values", "changes", "message"), NO_TUNING, ids=str)
 def test_what_could_not_be_tuned_is_refused_beforehand(small, values, changes, message):
     split = small[3]
     Tuning().check(replace(RECIPE, group_by="cycle"), split)

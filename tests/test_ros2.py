@@ -148,15 +148,15 @@ def test_messages_that_cannot_be_read_are_told_and_passed_over(model):  # noqa: 
     assert late.time_s[0] == pytest.approx((START_NS + 2 * 10**7) / 1e9, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("kind", "content", "words"),
-    [
-        (WRENCH, wrench(range(6), START_NS), "numbers called wrench.force.x"),
-        (ARRAY, array([1.0, 2.0]), "/ft has 2 channels, and none is"),
-        (ARRAY, array(np.ones(5)), "/ft has 5 channels, the detector 4; say which"),
-        ("my_msgs/msg/Skin", b"", "no definition of my_msgs/msg/Skin"),
-    ],
-)
+WRONG = [
+    (WRENCH, wrench(range(6), START_NS), "numbers called wrench.force.x"),
+    (ARRAY, array([1.0, 2.0]), "/ft has 2 channels, and none is"),
+    (ARRAY, array(np.ones(5)), "/ft has 5 channels, the detector 4; say which"),
+    ("my_msgs/msg/Skin", b"", "no definition of my_msgs/msg/Skin"),
+]
+
+
+@pytest.mark.parametrize(("kind", "content", "words"), WRONG)
 def test_a_topic_that_does_not_fit_is_one_line(kind, content, words, model):  # noqa: F811
     messages = TopicMessages(Topic("/ft", kind), SlipDetector.load(model))
     with pytest.raises(ValueError, match=words) as caught:

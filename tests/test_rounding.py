@@ -52,23 +52,17 @@ def exact_score(head, z):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("num", [1, 120])
-def test_the_bound_is_above_the_worst_seen_and_not_far(kind, num, rng):
-    head = head_of(kind, num, rng)
-    bound, seen = rounding_bound(head), worst_error(head, seed=num)
-    assert 0 <= seen <= bound + rounding_bound(head, torch.float64) < math.inf
-    if num == 120 and kind not in ("huge", "tiny", "mixed"):
-        assert bound <= 1e4 * seen
-    assert worst_error(head, seed=num) == seen
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("num", [1, 12])
-def test_the_bound_holds_against_exact_arithmetic(kind, num, rng):
+@pytest.mark.parametrize("num", [1, 12, 120])
+def test_the_bound_is_above_the_worst_seen_and_exact_arithmetic_and_not_far(kind, num, rng):
     head = head_of(kind, num, rng)
     bounds = {dtype: rounding_bound(head, dtype) for dtype in (torch.float32, torch.float64)}
-    points = rng.choice([-1.0, 1.0, *rng.uniform(-1, 1, 20)], (30, num)).astype(np.float32)
-    for z in torch.from_numpy(points):
+    seen = worst_error(head, seed=num)
+    assert 0 <= seen <= sum(bounds.values()) < math.inf
+    assert worst_error(head, seed=num) == seen
+    if num == 120 and kind not in ("huge", "tiny", "mixed"):
+        assert bounds[torch.float32] <= 1e4 * seen
+    points = rng.choice([-1.0, 1.0, *rng.uniform(-1, 1, 20)], (30 if num < 120 else 0, num))
+    for z in torch.from_numpy(points.astype(np.float32)):
         exact = exact_score(head, z.tolist())
         for dtype, bound in bounds.items():
             error = abs(Fraction(float(stored(head, dtype)(z.to(dtype)))) - exact)
@@ -76,9 +70,8 @@ def test_the_bound_holds_against_exact_arithmetic(kind, num, rng):
 
 
 def test_what_overflows_and_what_is_nan():
-    huge = QuadraticForm(
-        torch.full((2, 2), 3e38).double(), torch.zeros(2).double(), torch.tensor(0.0).double()
-    )
+    zero = torch.zeros(2).double()
+    huge = QuadraticForm(torch.full((2, 2), 3e38).double(), zero, zero[0])
     assert rounding_bound(huge) == math.inf
     assert worst_error(huge) == math.inf
     assert rounding_bound(huge, torch.float64) < math.inf

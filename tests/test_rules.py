@@ -118,17 +118,17 @@ def test_survives_json(rule: Rule) -> None:
     assert type(rule_from_dict(plain)) is RULES[rule.name]
 
 
-@pytest.mark.parametrize(
-    ("plain", "said"),
-    [
-        ({"name": "viterbi"}, "no sequential rule is called 'viterbi'; there are k_of_n, "),
-        ({"name": "k_of_n", "k": 2}, "do not fit.*'n'"),
-        ({"name": "k_of_n", "k": 4, "n": 3}, "between 1 and n, got k=4 and n=3"),
-        ({"name": "cusum", "evidence": 1.1}, r"evidence must lie in \(0, 1\], got 1.1"),
-        ({"name": "cusum", "drift": math.inf}, "drift must be finite"),
-        ({"name": "cusum", "ceiling": 0.0}, "ceiling must be positive"),
-    ],
-)
+NO_RULES = [
+    ({"name": "viterbi"}, "no sequential rule is called 'viterbi'; there are k_of_n, "),
+    ({"name": "k_of_n", "k": 2}, "do not fit.*'n'"),
+    ({"name": "k_of_n", "k": 4, "n": 3}, "between 1 and n, got k=4 and n=3"),
+    ({"name": "cusum", "evidence": 1.1}, r"evidence must lie in \(0, 1\], got 1.1"),
+    ({"name": "cusum", "drift": math.inf}, "drift must be finite"),
+    ({"name": "cusum", "ceiling": 0.0}, "ceiling must be positive"),
+]
+
+
+@pytest.mark.parametrize(("plain", "said"), NO_RULES)
 def test_no_such_rule(plain: dict, said: str) -> None:
     with pytest.raises(ValueError, match=said) as error:
         rule_from_dict(plain)
@@ -206,14 +206,14 @@ def test_bounds_are_those_of_garwood_and_of_clopper_and_pearson(confidence: floa
     assert share.bound(200, 200) == share.bound(300, 200) == 1  # several alarms a knock
 
 
-@pytest.mark.parametrize(
-    ("budget", "amount", "match"),
-    [
-        (Budget("machine", 10.0), 0.29, r"0\.29 h of machine cannot show .* most 10 .* 0\.3 h"),
-        (Budget("held", 1.0, confidence=0.9), 0.0, r"0 h of held .* at least 2\.303 h, or a la"),
-        (Budget("taps", 0.01, True), 298, r"298 knocks of taps cannot show a share .* 299 knocks"),
-    ],
-)
+TOO_LITTLE = [
+    (Budget("machine", 10.0), 0.29, r"0\.29 h of machine cannot show .* most 10 .* 0\.3 h"),
+    (Budget("held", 1.0, confidence=0.9), 0.0, r"0 h of held .* at least 2\.303 h, or a la"),
+    (Budget("taps", 0.01, True), 298, r"298 knocks of taps cannot show a share .* 299 knocks"),
+]
+
+
+@pytest.mark.parametrize(("budget", "amount", "match"), TOO_LITTLE)
 def test_too_little_to_show_a_budget_is_refused_with_what_would_do(budget, amount, match) -> None:
     with pytest.raises(ValueError, match=match) as error:
         budget.allowed(amount)
@@ -222,14 +222,14 @@ def test_too_little_to_show_a_budget_is_refused_with_what_would_do(budget, amoun
     assert budget.allowed(least) == 0
 
 
-@pytest.mark.parametrize(
-    ("numbers", "match"),
-    [
-        ({"limit": 0.0}, "onset.budget of held must be positive, got 0"),
-        ({"limit": 1.0, "is_share": True}, "onset.budget of held must be between 0 and 1, got 1"),
-        ({"limit": 1.0, "confidence": 1.0}, "onset.confidence must lie between 0 and 1, got 1"),
-    ],
-)
+NO_BUDGETS = [
+    ({"limit": 0.0}, "onset.budget of held must be positive, got 0"),
+    ({"limit": 1.0, "is_share": True}, "onset.budget of held must be between 0 and 1, got 1"),
+    ({"limit": 1.0, "confidence": 1.0}, "onset.confidence must lie between 0 and 1, got 1"),
+]
+
+
+@pytest.mark.parametrize(("numbers", "match"), NO_BUDGETS)
 def test_what_is_no_budget(numbers, match: str) -> None:
     with pytest.raises(ValueError, match=match):
         Budget("held", **numbers)

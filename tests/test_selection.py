@@ -228,36 +228,36 @@ NEEDS, PRICES = torch.ones(3, 2, dtype=torch.bool), torch.tensor([1, 2])
 BROKEN = torch.zeros(5, 3).index_put((torch.tensor(4), torch.tensor(2)), torch.tensor(math.nan))
 
 
-@pytest.mark.parametrize(
-    ("call", "arguments", "message"),
-    [
-        (t_scores, [labelled(1, 1, 1)], "no non-slip bin"),
-        (t_scores, [labelled(0, 0, 0)], "no slip bin"),
-        (t_scores, [labelled(0, 1), "student"], "'pooled' or 'welch', got 'student'"),
-        (updated, [torch.zeros(5, 4)], r"\[N, 3\] and .*\(5, 4\) and \(5,\)"),
-        (updated, [BINS, 4], r"\[N, 3\] and .*\(5, 3\) and \(4,\)"),
-        (updated, [BINS, (5, 1)], r"\(5, 3\) and \(5, 1\)"),
-        (updated, [BINS, ()], r"\(5, 3\) and \(\)"),
-        (updated, [BINS.double()], r"float64; hand float32, as the data module does"),
-        (updated, [BROKEN], "got nan in row 4, column 2"),
-        *((rank_features, [ONES, num], rf"1\.\.3, got {num}") for num in (4, 0, -1)),
-        (rank_distinct, [ONES, BINS, torch.zeros(5), 0, 0.9], r"1\.\.3, got 0"),
-        *(
-            (rank_distinct, [ONES, BINS, torch.zeros(5), 2, most], rf"lie in 0\.\.1, got {most}")
-            for most in (-0.1, 1.1, math.nan)
-        ),
-        (rank_distinct, [ONES, BINS, torch.zeros(6), 2, 0.9], r"\[6, 3\], got \(5, 3\)"),
-        (rank_weighted, [ONES, BINS, 2, 1.5], r"alpha must lie in 0\.\.1, got 1\.5"),
-        (rank_weighted, [ONES, torch.ones(5, 4), 2], r"features \[n, 3\], got \(5, 4\)"),
-        (rank_weighted, [ONES, BINS, 4], r"num must lie in 1\.\.3, got 4"),
-        (rank_per_cost, [ONES, NEEDS, PRICES, 0], r"num must lie in 1\.\.3, got 0"),
-        (rank_per_cost, [ONES, NEEDS.float(), PRICES, 2], r"needs \[3, 2\] of bool, got \(3, 2\)"),
-        (rank_per_cost, [ONES, NEEDS, -PRICES, 2], "prices must be whole numbers"),
-        (rank_per_cost, [ONES, NEEDS, PRICES.double(), 2], "prices must be whole numbers"),
-        (rank_per_cost, [ONES, NEEDS, PRICES * 2**50, 2], r"more than 2\^50"),
-        (rank_per_cost, [ONES, NEEDS, PRICES, 2, -1], "power must not be negative, got -1"),
-    ],
-)
+REFUSED = [
+    (t_scores, [labelled(1, 1, 1)], "no non-slip bin"),
+    (t_scores, [labelled(0, 0, 0)], "no slip bin"),
+    (t_scores, [labelled(0, 1), "student"], "'pooled' or 'welch', got 'student'"),
+    (updated, [torch.zeros(5, 4)], r"\[N, 3\] and .*\(5, 4\) and \(5,\)"),
+    (updated, [BINS, 4], r"\[N, 3\] and .*\(5, 3\) and \(4,\)"),
+    (updated, [BINS, (5, 1)], r"\(5, 3\) and \(5, 1\)"),
+    (updated, [BINS, ()], r"\(5, 3\) and \(\)"),
+    (updated, [BINS.double()], r"float64; hand float32, as the data module does"),
+    (updated, [BROKEN], "got nan in row 4, column 2"),
+    *((rank_features, [ONES, num], rf"1\.\.3, got {num}") for num in (4, 0, -1)),
+    (rank_distinct, [ONES, BINS, torch.zeros(5), 0, 0.9], r"1\.\.3, got 0"),
+    *(
+        (rank_distinct, [ONES, BINS, torch.zeros(5), 2, most], rf"lie in 0\.\.1, got {most}")
+        for most in (-0.1, 1.1, math.nan)
+    ),
+    (rank_distinct, [ONES, BINS, torch.zeros(6), 2, 0.9], r"\[6, 3\], got \(5, 3\)"),
+    (rank_weighted, [ONES, BINS, 2, 1.5], r"alpha must lie in 0\.\.1, got 1\.5"),
+    (rank_weighted, [ONES, torch.ones(5, 4), 2], r"features \[n, 3\], got \(5, 4\)"),
+    (rank_weighted, [ONES, BINS, 4], r"num must lie in 1\.\.3, got 4"),
+    (rank_per_cost, [ONES, NEEDS, PRICES, 0], r"num must lie in 1\.\.3, got 0"),
+    (rank_per_cost, [ONES, NEEDS.float(), PRICES, 2], r"needs \[3, 2\] of bool, got \(3, 2\)"),
+    (rank_per_cost, [ONES, NEEDS, -PRICES, 2], "prices must be whole numbers"),
+    (rank_per_cost, [ONES, NEEDS, PRICES.double(), 2], "prices must be whole numbers"),
+    (rank_per_cost, [ONES, NEEDS, PRICES * 2**50, 2], r"more than 2\^50"),
+    (rank_per_cost, [ONES, NEEDS, PRICES, 2, -1], "power must not be negative, got -1"),
+]
+
+
+@pytest.mark.parametrize(("call", "arguments", "message"), REFUSED)
 def test_what_cannot_be_ranked_is_named(call, arguments, message):
     with pytest.raises(ValueError, match=message):
         call(*arguments)

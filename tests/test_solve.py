@@ -166,22 +166,19 @@ APART = np.array([[1e-300, 1e300], [1e300, 1e-300]])
 SMALL = 1e-312 * np.eye(2)
 
 
-@pytest.mark.parametrize(
-    ("matrix", "penalty", "options", "message"),
-    [
-        *(
-            (NEGATIVE, c, {}, r"not positive semi-definite: .* -0.5 beside 1;")
-            for c in (1e3, np.inf)
-        ),
-        (np.eye(2), -1.0, {}, "positive, and so large .*, got -1"),
-        (np.eye(2), np.nan, {}, "positive, and so large .*, got nan"),
-        (np.eye(2), 1e-320, {}, "positive, and so large .*, got 1e-320"),
-        (STEEP, np.inf, {}, r"rank \d+ of 40 and a condition of \d\.\de\+1[345]"),
-        (KNOWN, 1e9, {"most_condition": 1e4}, r"^gram \+ I/C at penalty=1e\+09 .*to 1e\+04; lower"),
-        (APART, np.inf, {}, "overflows float64; scale the features"),
-        (SMALL, np.inf, {}, r"solution for gram leaves float64: an entry is (inf|nan);"),
-    ],
-)
+UNSOLVABLE = [
+    *((NEGATIVE, c, {}, r"not positive semi-definite: .* -0.5 beside 1;") for c in (1e3, np.inf)),
+    (np.eye(2), -1.0, {}, "positive, and so large .*, got -1"),
+    (np.eye(2), np.nan, {}, "positive, and so large .*, got nan"),
+    (np.eye(2), 1e-320, {}, "positive, and so large .*, got 1e-320"),
+    (STEEP, np.inf, {}, r"rank \d+ of 40 and a condition of \d\.\de\+1[345]"),
+    (KNOWN, 1e9, {"most_condition": 1e4}, r"^gram \+ I/C at penalty=1e\+09 .*to 1e\+04; lower"),
+    (APART, np.inf, {}, "overflows float64; scale the features"),
+    (SMALL, np.inf, {}, r"solution for gram leaves float64: an entry is (inf|nan);"),
+]
+
+
+@pytest.mark.parametrize(("matrix", "penalty", "options", "message"), UNSOLVABLE)
 def test_what_cannot_be_solved_is_refused_in_one_line(matrix, penalty, options, message):
     right = np.ones(len(matrix)) - 2.0 * (np.arange(len(matrix)) % 2)
     with pytest.raises(ValueError, match=message) as caught:
@@ -325,26 +322,26 @@ def twice(bins):
     return TrainingBins(bins.features.repeat(2, 1), bins.is_slip.repeat(2))
 
 
-@pytest.mark.parametrize(
-    ("fit", "message"),
-    [
-        *(
-            (lambda b, g, f=f, c=c: f(b, g, c), r"positive and finite penalty .*, got")
-            for f in (held_out, lambda b, g, c: HeldOut(b, g).at(c))
-            for c in (0.0, -1.0, float("inf"), float("nan"))
-        ),
-        (lambda b, g: held_out(b, g[:19], 1.0), r"each of 20 bins, got \(19,\)"),
-        (lambda b, g: HeldOut(b, g[:19]), r"each of 20 bins, got \(19,\)"),
-        (lambda b, g: HeldOut(b, g.float()), r"whole number .*, got \(20,\) torch.float32"),
-        (lambda b, g: HeldOut(b, 0 * g + 7), r"at least two groups, all 20 bins are in \[7\]"),
-        (lambda b, g: HeldOut(b, with_all_of(True, b)), "without group 9 no slip bin is left"),
-        (lambda b, g: HeldOut(b, with_all_of(False, b)), "without group 9 no non-slip bin is left"),
-        (lambda b, g: HeldOut(b, g, RADIAL, "primal"), r"RadialBasis.* has no primal"),
-        (lambda b, g: held_out(b, g, 1.0, -0.5), r"offset .* at least 0, got -0.5"),
-        (lambda b, g: held_out(b, g, 1.0, weights=torch.zeros(20)), "weights must be positive"),
-        (lambda b, g: held_out(twice(b), g.repeat(2), 1e12), r"condition .*, wanted up to 1e\+10"),
-    ],
-)
+NOT_HELD_OUT = [
+    *(
+        (lambda b, g, f=f, c=c: f(b, g, c), r"positive and finite penalty .*, got")
+        for f in (held_out, lambda b, g, c: HeldOut(b, g).at(c))
+        for c in (0.0, -1.0, float("inf"), float("nan"))
+    ),
+    (lambda b, g: held_out(b, g[:19], 1.0), r"each of 20 bins, got \(19,\)"),
+    (lambda b, g: HeldOut(b, g[:19]), r"each of 20 bins, got \(19,\)"),
+    (lambda b, g: HeldOut(b, g.float()), r"whole number .*, got \(20,\) torch.float32"),
+    (lambda b, g: HeldOut(b, 0 * g + 7), r"at least two groups, all 20 bins are in \[7\]"),
+    (lambda b, g: HeldOut(b, with_all_of(True, b)), "without group 9 no slip bin is left"),
+    (lambda b, g: HeldOut(b, with_all_of(False, b)), "without group 9 no non-slip bin is left"),
+    (lambda b, g: HeldOut(b, g, RADIAL, "primal"), r"RadialBasis.* has no primal"),
+    (lambda b, g: held_out(b, g, 1.0, -0.5), r"offset .* at least 0, got -0.5"),
+    (lambda b, g: held_out(b, g, 1.0, weights=torch.zeros(20)), "weights must be positive"),
+    (lambda b, g: held_out(twice(b), g.repeat(2), 1e12), r"condition .*, wanted up to 1e\+10"),
+]
+
+
+@pytest.mark.parametrize(("fit", "message"), NOT_HELD_OUT)
 def test_what_has_no_held_out_scores_is_refused(fit, message, rng):
     with pytest.raises(ValueError, match=message):
         fit(draw(rng, 20), torch.arange(20) % 4)

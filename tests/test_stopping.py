@@ -39,17 +39,17 @@ def test_a_signal_is_a_line_and_a_status(number, capsys):
     assert signal.getsignal(number) is before
 
 
+STOPPED = [
+    (signal.SIGTERM, TRAIN, "last.ckpt", "last.ckpt"),
+    (signal.SIGINT, TRAIN, "last.ckpt", "last.ckpt"),
+    (signal.SIGTERM, TRAIN, "config.yaml", "no pass is finished"),
+    (signal.SIGINT, "generate materials=M1 cycles=20", "M1_paper_00.npz", "are whole"),
+    (signal.SIGTERM, "crossval data.cycles=2", "crossval.log", "start it again"),
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("number", "command", "seen", "saved"),
-    [
-        (signal.SIGTERM, TRAIN, "last.ckpt", "last.ckpt"),
-        (signal.SIGINT, TRAIN, "last.ckpt", "last.ckpt"),
-        (signal.SIGTERM, TRAIN, "config.yaml", "no pass is finished"),
-        (signal.SIGINT, "generate materials=M1 cycles=20", "M1_paper_00.npz", "are whole"),
-        (signal.SIGTERM, "crossval data.cycles=2", "crossval.log", "start it again"),
-    ],
-)
+@pytest.mark.parametrize(("number", "command", "seen", "saved"), STOPPED)
 def test_a_command_that_is_stopped_says_how_to_go_on(number, command, seen, saved, tmp_path):
     """The command that it names is carried out, and ends well."""
     told = [*command.split(), "hydra.run.dir=run", "cache=cache", "num_workers=1"]

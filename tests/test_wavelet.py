@@ -65,17 +65,17 @@ def test_the_highest_level_is_pywavelets(wavelet):
         highest_level(shortest - 1, wavelet)
 
 
-@pytest.mark.parametrize(
-    ("function", "num_samples", "options", "message"),
-    [
-        (wavelet_branches, 100, {"level": 5}, r"1\.\.4.*100 samples.*got 5"),
-        (wavelet_branches, 50, {}, r"1\.\.3.*50 samples.*got 4"),
-        (wavelet_branches, 100, {"wavelet": "rbio9.9"}, r"rbio9\.9"),
-        (wavelet_branches, 9, {"level": 1}, r"9 samples .* rbio2\.2, which needs 10; use longer"),
-        (amplitude_spectrum, 1, {}, "at least two samples, got 1"),
-        (amplitude_spectrum, 100, {"method": "welch"}, "'reference' or 'clean', got 'welch'"),
-    ],
-)
+REFUSED = [
+    (wavelet_branches, 100, {"level": 5}, r"1\.\.4.*100 samples.*got 5"),
+    (wavelet_branches, 50, {}, r"1\.\.3.*50 samples.*got 4"),
+    (wavelet_branches, 100, {"wavelet": "rbio9.9"}, r"rbio9\.9"),
+    (wavelet_branches, 9, {"level": 1}, r"9 samples .* rbio2\.2, which needs 10; use longer"),
+    (amplitude_spectrum, 1, {}, "at least two samples, got 1"),
+    (amplitude_spectrum, 100, {"method": "welch"}, "'reference' or 'clean', got 'welch'"),
+]
+
+
+@pytest.mark.parametrize(("function", "num_samples", "options", "message"), REFUSED)
 def test_errors_name_the_value(function, num_samples, options, message):
     with pytest.raises(ValueError, match=message):
         function(torch.zeros(num_samples), **options)
@@ -116,19 +116,19 @@ def haar_but(**taps):
     return {key: value for key, value in values.items() if value is not None}
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        (haar_but(rec_lo=None), "have the keys name, dec_lo, .* got name, dec_lo, dec_hi"),
-        (haar_but(name=""), "need a name, got ''"),
-        (haar_but(dec_lo=[0.7]), "one even length, got 1, 2, 2, 2"),
-        ({"name": "odd"} | {name: [1.0, 2.0, 1.0] for name in FILTERS}, "got 3, 3, 3, 3"),
-        (haar_but(dec_lo=[0.7, float("nan")]), "dec_lo must be finite"),
-        (haar_but(dec_hi="ab"), "dec_hi must hold numbers, got 'ab'"),
-        (haar_but(dec_lo=[0.7, 0.7]), r"do not reconstruct: off by 1\.0e-02"),
-        (3, "a wavelet is a name or its filters, got int"),
-    ],
-)
+NO_WAVELETS = [
+    (haar_but(rec_lo=None), "have the keys name, dec_lo, .* got name, dec_lo, dec_hi"),
+    (haar_but(name=""), "need a name, got ''"),
+    (haar_but(dec_lo=[0.7]), "one even length, got 1, 2, 2, 2"),
+    ({"name": "odd"} | {name: [1.0, 2.0, 1.0] for name in FILTERS}, "got 3, 3, 3, 3"),
+    (haar_but(dec_lo=[0.7, float("nan")]), "dec_lo must be finite"),
+    (haar_but(dec_hi="ab"), "dec_hi must hold numbers, got 'ab'"),
+    (haar_but(dec_lo=[0.7, 0.7]), r"do not reconstruct: off by 1\.0e-02"),
+    (3, "a wavelet is a name or its filters, got int"),
+]
+
+
+@pytest.mark.parametrize(("values", "message"), NO_WAVELETS)
 def test_what_is_no_wavelet_is_refused_in_one_line(values, message):
     for take in (as_wavelet, lambda wavelet: FeaturePool(HAND, wavelet=wavelet)):
         with pytest.raises(ValueError, match=message) as error:
@@ -240,15 +240,15 @@ def test_what_is_not_finite_spoils_what_reaches_it_and_nothing_else(from_hz, to_
     assert resample(torch.full((1, 30), torch.nan), 100.0, 150.0).isnan().all()
 
 
-@pytest.mark.parametrize(
-    ("samples", "from_hz", "to_hz", "message"),
-    [
-        (torch.ones(5), 1.0, 2.0, r"samples \[C, T\] to resample, got torch.float32 \(5,\)"),
-        (torch.ones(1, 5), 0.0, 2.0, "rate must be positive to resample, got 0 Hz"),
-        (torch.ones(1, 5), 2000.0, 2000.008, "from 2000 to 2000.008 Hz is no ratio of whole"),
-        (torch.ones(1, 5), 1e6, 1.0, "from 1000000 to 1 Hz is no ratio"),
-    ],
-)
+NOT_RESAMPLED = [
+    (torch.ones(5), 1.0, 2.0, r"samples \[C, T\] to resample, got torch.float32 \(5,\)"),
+    (torch.ones(1, 5), 0.0, 2.0, "rate must be positive to resample, got 0 Hz"),
+    (torch.ones(1, 5), 2000.0, 2000.008, "from 2000 to 2000.008 Hz is no ratio of whole"),
+    (torch.ones(1, 5), 1e6, 1.0, "from 1000000 to 1 Hz is no ratio"),
+]
+
+
+@pytest.mark.parametrize(("samples", "from_hz", "to_hz", "message"), NOT_RESAMPLED)
 def test_what_cannot_be_resampled_is_refused_in_one_line(samples, from_hz, to_hz, message):
     with pytest.raises(ValueError, match=message) as refused:
         resample(samples, from_hz, to_hz)
