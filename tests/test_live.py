@@ -502,14 +502,13 @@ def test_lines_go_to_all_who_connect_and_one_that_does_not_read_is_cut_off():
     server = LineServer("127.0.0.1", 0)
     reader, idle = (socket.create_connection((server.host, server.port)) for _ in range(2))
     text = "x" * 99_999 + "\n"
-    got = []
-    thread = threading.Thread(target=lambda: got.extend(reader.makefile("rb")))
-    thread.start()
-    for _ in range(100):
-        server.write(text)
-        time.sleep(0.002)
-    server.close()
-    thread.join(20)
+    with ThreadPoolExecutor(1) as pool:
+        reading = pool.submit(reader.makefile("rb").readlines)
+        for _ in range(100):
+            server.write(text)
+            time.sleep(0.002)
+        server.close()
+        got = reading.result(20)
     assert got[0] == text.encode()
     assert len(got) > 50
     other = LineServer("127.0.0.1", 0)

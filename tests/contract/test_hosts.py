@@ -21,7 +21,6 @@ from .recordings import samples_of
 
 pytestmark = pytest.mark.onnx
 
-NEEDS = {"python": [], "c": ["gcc", "make"], "node": ["node"]}
 SAMPLES = samples_of("D", 1)[1500:5500]
 BROKEN = SAMPLES.copy()
 BROKEN[2500:2510, 1:3] = np.nan
@@ -40,6 +39,9 @@ def places(tmp_path_factory):
 def build(places):
     """Runs ``make`` for the C host with more words of a command line; what it prints."""
 
+    if not (shutil.which("gcc") and shutil.which("make")):
+        pytest.skip("no gcc and make here")
+
     def run(*words):
         command = [*names.BUILD_C_HOST.format(**places).split(), *words]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -49,24 +51,16 @@ def build(places):
     return run
 
 
-def words_of(name, places, build):
-    """The words of a host's command; built or installed before."""
-    missing = [program for program in NEEDS[name] if shutil.which(program) is None]
-    if missing:
-        pytest.skip(f"not installed: {', '.join(missing)}")
-    if name == "c":
-        build()
-    if name == "node":
-        hosts.installed(EXPORT / name)
-    return names.HOSTS[name].format(**places).split()
-
-
 @pytest.fixture(
     scope="module", params=["python", "c", pytest.param("node", marks=pytest.mark.slow)]
 )
-def host(request, places, build):
-    """Each host of a command line."""
-    return words_of(request.param, places, build)
+def host(request, places):
+    """The words of each host's command; built or installed before."""
+    if request.param == "c":
+        request.getfixturevalue("build")()
+    if request.param == "node":
+        hosts.installed(EXPORT / "node")
+    return names.HOSTS[request.param].format(**places).split()
 
 
 @pytest.fixture(scope="module")
@@ -274,14 +268,13 @@ def test_lines_that_cannot_be_written_are_an_error(host, stream, recording, opti
 # C ---------------------------------------------------------------------------------------------
 
 
-def test_parts_hold_chunks_agree_and_a_push_takes_no_memory(places, build, stream, fast_stream):
-    words_of("c", places, build)
+def test_parts_hold_chunks_agree_and_a_push_takes_no_memory(build, stream, fast_stream):
     for each in (stream, fast_stream):
         assert "parts and pushes hold" in build("test", f"MODEL={each}")
 
 
 def test_the_example_of_the_page_compiles_and_feels_the_slips(places, build, fast_stream, tmp_path):
-    words_of("c", places, build)
+    build()
     source, folder = EXPORT / "c", places["build"]
     page = (source / "README.md").read_text(encoding="utf-8")
     example = page.split("<!-- example -->\n```c\n")[1].split("```")[0]
