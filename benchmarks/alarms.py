@@ -20,7 +20,7 @@ from statistics import fmean
 from typing import Any, ClassVar
 
 from benchmarks.harness import Benchmark, Job, resumed, trained
-from benchmarks.tables import Report, Table, by, percent
+from benchmarks.tables import Table, by, percent
 from tactslip_torch import AlarmSettings, SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector
 from tactslip_torch.onset.decisions import Scorer
@@ -99,26 +99,20 @@ class Alarms(Benchmark):
     cycles: int = 4
 
     def measure(self, job: Job) -> dict[str, Any]:
-        """Of every seed what the training tells; of the first also pulses."""
-        found: dict[str, Any] = {}
+        """Goals, budgets and slips of every seed; of the first also weak pulses."""
+        seeds, pulses = [], list[dict[str, Any]]()
         for seed in self.seeds:
             given = ["+exp=onset", f"seed={seed}", *self.overrides, *job.overrides]
             folder = job.folder / f"seed-{seed}"
             metrics = trained(given, folder, job.folder / "cache")
-            own: dict[str, Any] = {}
-            if not found:
+            if not seeds:
                 detector = SlipDetector.load(folder / "detector.pt")
                 of_detail = metrics["alarm"]["methods"][LARGEST_DETAIL]
                 held_out = sorted(metrics["splits"]["unseen"]["per_material"])
                 run = partial(_pulses, detector, of_detail, held_out, self)
-                own["pulses"] = resumed(folder / "pulses.json", [*given, repr(self)], run)
-            found[str(seed)] = _told(metrics) | own
-        return {"seeds": found}
-
-    def tables(self, numbers: Report) -> dict[str, Table]:
-        """Goals, budgets, slips, weak pulses."""
-        seeds = numbers["seeds"]
-        first = next(iter(seeds.values()))
+                pulses = resumed(folder / "pulses.json", [*given, repr(self)], run)
+            seeds.append(metrics)
+        first = seeds[0]["alarm"]
         allowed = ", ".join(
             f"{row['scene']} {row['alarms']} of {row['allowed']} in {row['amount']:.4g}"
             for row in first["settings"]["metadata"]["budget"]
@@ -128,18 +122,15 @@ class Alarms(Benchmark):
             f"{allowed}. In brackets 95 % intervals of all seeds together; *within* counts seeds "
             "whose own rate lies within the budget."
         )
-        by_role = [
-            {role: of["events"].get(f"{role} stream", {}) for role in ROLES}
-            for of in seeds.values()
-        ]
+        by_role = [{role: of["events"].get(f"{role} stream", {}) for role in ROLES} for of in seeds]
         among = [
             {"scene": scene.replace("_", " "), **row}
             for scene in first["scenes"]
-            for row in _slip_rows(of["scenes"][scene] for of in seeds.values())
+            for row in _slip_rows(of["alarm"]["scenes"][scene] for of in seeds)
             if row["materials"] == "held out" and row["method"] in (JOINT, LARGEST_DETAIL)
         ]
-        return {
-            "False alarms": Table(_budget_rows(seeds), note),
+        tables = {
+            "False alarms": Table(_budget_rows(of["alarm"]["budget"] for of in seeds), note),
             "Slips of the protocol": Table(
                 _slip_rows(by_role),
                 "Means over seeds, in brackets the worst. Delays are from the release of half of "
@@ -147,42 +138,18 @@ class Alarms(Benchmark):
             ),
             "Slips among confounders, held out": Table(among),
             "Weak pulses and strong knocks": Table(
-                _pulse_rows(first["pulses"]),
+                _pulse_rows(pulses),
                 "Slips found in %, seed 0, held-out materials, at the thresholds of the default "
                 "budget; false alarms an hour in the rests of the same recordings.",
             ),
         }
+        return {"tables": tables}
 
 
-def _told(metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """Of what a training tells, what is told here."""
-    names = ("num_onsets", "found", "early", "missed", "delay_ms", "delay_first_ms")
-    alarm = metrics["alarm"]
-
-    def of_methods(by_method: Mapping[str, Any]) -> dict[str, Any]:
-        told = {}
-        for method, events in by_method.items():
-            slid_mm = events.get("per_speed", {}).get("40", {}).get("slid_mm")
-            told[method] = {name: events.get(name) for name in names}
-            told[method]["per_speed"] = {"40": {"slid_mm": slid_mm}}
-        return told
-
-    streams = [f"{role} stream" for role in ROLES if f"{role} stream" in metrics["events"]]
-    return {
-        "settings": {"metadata": {"budget": alarm["settings"]["metadata"]["budget"]}},
-        "budget": alarm["budget"],
-        "events": {name: of_methods(metrics["events"][name]) for name in streams},
-        "scenes": {
-            scene: {"unseen": of_methods(by_role.get("unseen", {}))}
-            for scene, by_role in alarm["scenes"].items()
-        },
-    }
-
-
-def _budget_rows(seeds: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _budget_rows(by_seed: Iterable[Sequence[Any]]) -> list[dict[str, Any]]:
     """A row for each scene and kind of materials: rates of each method, all seeds together."""
     rows = []
-    every = [row for of in seeds.values() for row in of["budget"] if row["role"] in ROLES]
+    every = [row for budget in by_seed for row in budget if row["role"] in ROLES]
     for (scene, role), own in by(every, "scene", "role").items():
         budget = Budget(scene, own[0]["limit"], own[0]["is_share"])
         factor, unit, counted = (
@@ -227,8 +194,8 @@ def _slip_rows(by_seed: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
             ("p95 ms", "delay_ms", "p95"),
             ("from first release ms", "delay_first_ms", "median"),
         ):
-            row[title] = _mean_and_worst([of[key] for of in own], quantile, 1)
-        slid = [of["per_speed"]["40"]["slid_mm"] for of in own]
+            row[title] = _mean_and_worst([of.get(key) for of in own], quantile, 1)
+        slid = [of.get("per_speed", {}).get("40", {}).get("slid_mm") for of in own]
         rows.append(row | {"mm slid at 40 mm/s": _mean_and_worst(slid, "median", 2)})
     return sorted(rows, key=lambda row: row["materials"] != "seen")
 

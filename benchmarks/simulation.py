@@ -49,7 +49,7 @@ class Simulation(Benchmark):
     about = "fidelity levels and time steps: cost, difference to the smallest step, and accuracy"
     charts: ClassVar = {"": (("Levels and steps", "s a minute"),)}
     quick = (
-        "steps_us=[250.0,500.0] recordings=1 rounds=1 materials=[M1,M2] cycles=4 train_bins=20 "
+        "steps_us=[250.0,500.0] recordings=1 rounds=1 materials=[M1,M2] cycles=3 train_bins=20 "
         "num_features=10"
     )
     steps_us: tuple[float, ...] = (31.25, 62.5, 125.0, 250.0, 500.0)

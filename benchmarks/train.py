@@ -43,7 +43,7 @@ class Train(Benchmark):
     about = "python -m tactslip_torch.train, with an empty feature cache and with a full one"
     quick = (
         'overrides=[+exp=quick,recipe=robust,"data.materials=[M1,iron]","split.seen=[M1]",'
-        "num_workers=0] repeats=1 sample_s=1.0"
+        "num_workers=0,baselines=false,export=false] repeats=1 sample_s=1.0"
     )
     charts: ClassVar = {"": [("Stages", ("cold, s", "warm, s"))]}
     overrides: tuple[str, ...] = ("+exp=unseen4",)
