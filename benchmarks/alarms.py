@@ -100,7 +100,7 @@ class Alarms(Benchmark):
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Goals, budgets and slips of every seed; of the first also weak pulses."""
-        seeds, pulses = [], list[dict[str, Any]]()
+        seeds, pulses = list[dict[str, Any]](), list[dict[str, Any]]()
         for seed in self.seeds:
             given = ["+exp=onset", f"seed={seed}", *self.overrides, *job.overrides]
             folder = job.folder / f"seed-{seed}"
