@@ -70,18 +70,17 @@ class Train(Benchmark):
                 row[f"{kind}, s"] = f"{seconds:.2f}"
                 row[f"{kind}, %"] = f"{100 * seconds / median(walls[kind]):.1f}"
             rows.append(row)
-        for name, (key, factor) in _TOTALS.items():
-            row = {"stage": name}
-            for kind, of in by_kind.items():
-                value = factor * median(run[key] for run in of)
-                row |= {f"{kind}, s": f"{value:.2f}", f"{kind}, %": ""}
-            rows.append(row)
+        totals = [
+            {"whole runs": name}
+            | {kind: factor * median(run[key] for run in of) for kind, of in by_kind.items()}
+            for name, (key, factor) in _TOTALS.items()
+        ]
         note = (
             f"`train {' '.join(overrides)}`, medians of {self.repeats} repeats; "
             f"{runs[0]['num_bins']} bins; start-up: imports, configuration and figures; "
             f"memory: {runs[0]['memory'].upper()}."
         )
-        found = {"Stages": Table(rows, note)}
+        found = {"Stages": Table(rows, note), "Whole runs": Table(totals)}
         if overrides == ["+exp=unseen4"]:
             goals = [(f"{kind}, s, worst", max(walls[kind]), LIMITS[kind], "") for kind in KINDS]
             most = max(run["peak_bytes"] for run in by_kind["cold"]) / 1e9
