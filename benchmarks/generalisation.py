@@ -238,19 +238,20 @@ def _measured(name: str, given: Sequence[str], job: Job, sizes: Generalisation) 
     seen = list(whole.split.seen)
 
     def on(keep: Any, *over: str, half: bool = False) -> list[_Scored]:
-        config = composed("train", ["+exp=unseen4", *given, *over])
+        config = composed("train", ["+exp=unseen4", *given, *over]) if over else whole
         made = features_of_some(config, cache, keep, f"{given[0]} {' '.join(over)}")
         return [_scored(detector, each, half=half) for each in made]
 
-    def having(num: int, *roles: str) -> Callable[[RecordingSource], list[RecordingId]]:
-        """The first recordings of each material with a role in ``unseen4``."""
+    def having(**most: int) -> Callable[[RecordingSource], list[RecordingId]]:
+        """The first recordings of each material with a role in ``unseen4``, by role how many."""
 
         def keep(source: RecordingSource) -> list[RecordingId]:
             (split,) = instantiate(whole.split, _convert_="all")(source.ids)
             by_material: dict[str, list[RecordingId]] = {}
-            for recording in split.having(*roles):
-                by_material.setdefault(recording.material, []).append(recording)
-            return [one for own in by_material.values() for one in own[:num]]
+            for role in most:  # a material has training and test recordings, or held-out ones
+                for recording in split.having(role):
+                    by_material.setdefault(recording.material, []).append(recording)
+            return [one for own in by_material.values() for one in own[: most[split.roles[own[0]]]]]
 
         return keep
 
@@ -266,7 +267,7 @@ def _measured(name: str, given: Sequence[str], job: Job, sizes: Generalisation) 
         ("test", "test", "test"),
         ("unseen", "held out", "held-out materials"),
     ):
-        every, without = on(having(99, role)), on(having(99, role), half=True)
+        every, without = on(having(**{role: 99})), on(having(**{role: 99}), half=True)
         found[name] = _balanced(every)
         found[f"calibration error, {label}"] = _calibration_error(every)
         found[f"half of the channels missing, {label}"] = _balanced(without)
@@ -287,7 +288,7 @@ def _measured(name: str, given: Sequence[str], job: Job, sizes: Generalisation) 
     by_side(pulled, "pulled object found, {}", truth=True)
     for mv in sizes.levels_mv:
         loud = f"+scene.motor_vibration_mv={mv}"
-        slips = on(having(few, "test"), loud) + on(having(few + 1, "unseen"), loud)
+        slips = on(having(test=few, unseen=few + 1), loud)
         by_side(slips, LOUD.format(mv, "{}"), truth=True)
         arm = on(later(6), "scene=arm_motion", f"data.cycles={6 + few}", loud)
         by_side(arm, LOUD_ARM.format(mv, "{}"), truth=False)
