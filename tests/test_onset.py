@@ -480,7 +480,7 @@ def test_knees_are_a_tenth_of_the_usual_power_and_the_usual_step():
     source = Bursts(cycles=2)
     evidence = fitted(source, comb_periods=2)[0].evidence
     assert evidence.comb_periods == 2
-    plain = type(evidence)(source.hand, TRAINING_HZ, 5)
+    plain = type(evidence)(source.hand, TRAINING_HZ, 5, comb_periods=2)
     blocks = [plain.blocks_of_recording(source.load(r).samples) for r in source.ids]
     fast = np.median([np.median(own.power[0].sqrt(), -1) for own in blocks], 0)
     assert evidence.fast_knee == pytest.approx(0.1 * fast, rel=0.02)
