@@ -131,31 +131,30 @@ def test_steps_in_and_out_are_listed_and_taken_back_to_the_bit(
     run, files, trained, capsys, monkeypatch
 ):
     """Graphs beside it are told to be of another detector while they are."""
+    source, kept = run / "detector.pt", trained / "detector.pt"
     act(run, "action=list")
     assert "no step since training" in capsys.readouterr().out
     monkeypatch.setattr("tactslip_torch.deploy.export.check_model", lambda *_: {"worst_sd": 0.0})
-    source = run / "detector.pt"
     export_detector(SlipDetector.load(source), run, ["bin"], source=source)
     add_c(run, files, "weight=2")
     stale = "model.onnx beside it: of another detector; python -m tactslip_torch export model="
     assert stale in capsys.readouterr().out
-    added = (run / "detector.pt").read_bytes()
+    added = source.read_bytes()
     assert len(act(run, "action=list")["steps"]) == 1
     act(run, "action=forget", "material=C")
-    old, new = (SlipDetector.load(f / "detector.pt") for f in (trained, run))
+    old, new = SlipDetector.load(kept), SlipDetector.load(source)
     z = Statistics.load(run / "statistics.pt").rehearsal.z
     torch.testing.assert_close(new.head(z), old.head(z), rtol=1e-9, atol=1e-12)
     assert new.info["train_materials"] == ["A", "B"]
     act(run, "action=undo")
-    assert (run / "detector.pt").read_bytes() == added
-    # as where writing was cut off between the two files
-    (run / "detector.pt").write_bytes((trained / "detector.pt").read_bytes())
+    assert source.read_bytes() == added
+    source.write_bytes(kept.read_bytes())  # as where writing was cut off between the two files
     with pytest.raises(ValueError, match=r"one step ahead of .* action=undo"):
         act(run, "action=list")
     capsys.readouterr()
     act(run, "action=undo")
     assert stale not in capsys.readouterr().out
-    assert content(run)[0] == content(trained)[0]
+    assert source.read_bytes() == kept.read_bytes()
     sums, before = (Statistics.load(each / "statistics.pt").sums for each in (run, trained))
     torch.testing.assert_close(sums.sums, before.sums, rtol=0, atol=1e-11)
     assert sums.seen_batches == before.seen_batches

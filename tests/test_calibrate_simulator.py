@@ -128,14 +128,9 @@ def put_in(monkeypatch, tmp_path):
 
     def put(holds=True):
         def point(config, difficulty):
-            return {
-                "difficulty": difficulty,
-                "parameters": parameters_at(difficulty),
-                "accuracy": 0.97,
-                "accuracy_by_seed": [0.97] * len(config.seeds),
-                "holds": holds,
-                "signal_checks": [{**CHECK, "holds": holds}],
-            }
+            found = {"difficulty": difficulty, "parameters": parameters_at(difficulty)}
+            found |= {"accuracy": 0.97, "accuracy_by_seed": [0.97] * len(config.seeds)}
+            return found | {"holds": holds, "signal_checks": [{**CHECK, "holds": holds}]}
 
         monkeypatch.setattr(command, "evaluate_point", point)
 

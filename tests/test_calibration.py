@@ -12,8 +12,6 @@ from sklearn.metrics import brier_score_loss, log_loss
 
 from tactslip_torch.model import calibration
 
-FITS = {"platt": calibration.fit_platt, "isotonic": calibration.fit_isotonic}
-
 
 def logistic_bins(rng, num, slope, offset, share=0.5, spread=2.0):
     """Scores and truth whose log likelihood ratio is ``slope * score + offset`` but for a constant.
@@ -125,7 +123,7 @@ def test_what_is_no_calibration_is_refused_in_a_line(plain):
         calibration.calibration_from_dict(plain)
 
 
-@pytest.mark.parametrize("name", FITS)
+@pytest.mark.parametrize("fit", [calibration.fit_platt, calibration.fit_isotonic])
 @pytest.mark.parametrize(
     ("scores", "is_slip", "weights", "message"),
     [
@@ -137,10 +135,10 @@ def test_what_is_no_calibration_is_refused_in_a_line(plain):
         ([], [], None, "weights must be finite"),
     ],
 )
-def test_what_cannot_be_fitted_is_refused_in_a_line(name, scores, is_slip, weights, message):
-    arguments = [torch.tensor(scores), torch.tensor(is_slip, dtype=torch.bool)]
+def test_what_cannot_be_fitted_is_refused_in_a_line(fit, scores, is_slip, weights, message):
+    given = torch.tensor(scores), torch.tensor(is_slip, dtype=torch.bool)
     with pytest.raises(ValueError, match=message):
-        FITS[name](*arguments, None if weights is None else torch.tensor(weights))
+        fit(*given, None if weights is None else torch.tensor(weights))
 
 
 # -------------------------------------------------------------------------------- probability

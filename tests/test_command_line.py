@@ -15,16 +15,13 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from tactslip_torch.__main__ import COMMANDS, main
+from tactslip_torch.__main__ import COMMANDS, OF_THEIR_OWN, main
 from tactslip_torch.commands import configuration
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "troubleshooting.md"
 MARKERS = "<!-- mistakes: written by tests/test_command_line.py -->", "<!-- end of mistakes -->"
-FILES = {name: name.replace("-", "_") for name in COMMANDS}
-CONFIGURED = [
-    name for name in COMMANDS if (configuration.conf_dir() / f"{FILES[name]}.yaml").is_file()
-]
+CONFIGURED = [name for name in COMMANDS if name not in OF_THEIR_OWN]
 
 MISTAKES = {
     # what is typed: words of the answer
