@@ -75,26 +75,26 @@ def of_file(**changes):
     return Abstention.from_dict(Abstention(0.9, -0.5, 0.25).to_dict() | changes)
 
 
-@pytest.mark.parametrize(
-    ("attempt", "message"),
-    [
-        (lambda: fit_drawn(lambda s, t, u: (s, t, u, 1.0)), "coverage must lie between 0 and 1"),
-        (lambda: fit_drawn(lambda s, t, u: (s, t, u, True)), "coverage must lie between 0 and 1"),
-        (lambda: fit_drawn(lambda s, t, u: (s[:-1], t, u, 0.9)), "of one N"),
-        (lambda: fit_drawn(lambda s, t, u: (s / 0, t, u, 0.9)), "must be finite"),
-        (
-            lambda: fit_drawn(lambda s, t, u: (s, t | True, u, 0.5)),
-            "5 with slip and 0 .*; lower it",
-        ),
-        (lambda: fit_drawn(lambda s, t, u: (s, t, u, 0.9)), "takes 9 training recordings"),
-        (lambda: Abstaining("much", "recording"), "coverage must .* such as 0.95, got 'much'"),
-        (lambda: Abstaining(0.9, "finger"), "coverage_by must be .* got 'finger'"),
-        (lambda: of_file(low=0.1), "expected finite low <= 0 <= high"),
-        (lambda: of_file(high=math.inf), "expected finite low <= 0 <= high"),
-        (lambda: of_file(low=None), "no thresholds of abstention of this version"),
-        (lambda: of_file(coverage=0), "coverage must lie between"),
-    ],
-)
+REFUSED = [
+    (lambda: fit_drawn(lambda s, t, u: (s, t, u, 1.0)), "coverage must lie between 0 and 1"),
+    (lambda: fit_drawn(lambda s, t, u: (s, t, u, True)), "coverage must lie between 0 and 1"),
+    (lambda: fit_drawn(lambda s, t, u: (s[:-1], t, u, 0.9)), "of one N"),
+    (lambda: fit_drawn(lambda s, t, u: (s / 0, t, u, 0.9)), "must be finite"),
+    (
+        lambda: fit_drawn(lambda s, t, u: (s, t | True, u, 0.5)),
+        "5 with slip and 0 .*; lower it",
+    ),
+    (lambda: fit_drawn(lambda s, t, u: (s, t, u, 0.9)), "takes 9 training recordings"),
+    (lambda: Abstaining("much", "recording"), "coverage must .* such as 0.95, got 'much'"),
+    (lambda: Abstaining(0.9, "finger"), "coverage_by must be .* got 'finger'"),
+    (lambda: of_file(low=0.1), "expected finite low <= 0 <= high"),
+    (lambda: of_file(high=math.inf), "expected finite low <= 0 <= high"),
+    (lambda: of_file(low=None), "no thresholds of abstention of this version"),
+    (lambda: of_file(coverage=0), "coverage must lie between"),
+]
+
+
+@pytest.mark.parametrize(("attempt", "message"), REFUSED)
 def test_what_cannot_be_is_refused(attempt, message):
     with pytest.raises(ValueError, match=message):
         attempt()

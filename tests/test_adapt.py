@@ -215,15 +215,15 @@ def test_two_programs_do_not_change_a_detector_at_once(run, files):
     act(run, "action=list")
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["recordings=nowhere"], "no folder at nowhere"),
-        (["weight=heavy"], "weight must be auto or a positive number below 8000, got 'heavy'"),
-        (["action=forget", "material=D"], "action=forget needs material= one that was added"),
-        (["action=forget"], "action=forget needs material= one that was added (none was), or rec"),
-    ],
-)
+REFUSED = [
+    (["recordings=nowhere"], "no folder at nowhere"),
+    (["weight=heavy"], "weight must be auto or a positive number below 8000, got 'heavy'"),
+    (["action=forget", "material=D"], "action=forget needs material= one that was added"),
+    (["action=forget"], "action=forget needs material= one that was added (none was), or rec"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "message"), REFUSED)
 def test_bad_input_is_one_line(run, overrides, message):
     state = content(run)
     with pytest.raises((ValueError, FileNotFoundError, InstantiationException)) as caught:
@@ -243,13 +243,13 @@ def test_a_detector_without_its_statistics_says_how_to_get_them(run, trained):
         act(run, "action=list")
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["recipe.kernel=rbf", "recipe.gamma=0.1"], "statistics=true needs recipe.kernel="),
-        (["ckpt_path=elsewhere"], "statistics=true needs the first pass"),
-    ],
-)
+NO_STATISTICS = [
+    (["recipe.kernel=rbf", "recipe.gamma=0.1"], "statistics=true needs recipe.kernel="),
+    (["ckpt_path=elsewhere"], "statistics=true needs the first pass"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "message"), NO_STATISTICS)
 def test_training_refuses_statistics_that_it_cannot_leave(tmp_path, overrides, message):
     with pytest.raises(ValueError, match=message):
         train(composed(*TRAINING, *overrides), tmp_path)

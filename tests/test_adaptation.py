@@ -189,17 +189,17 @@ def test_small_steps_together_keep_the_margin(old, before):
     assert change.problem(margin).startswith("since before the first step, ")
 
 
-@pytest.mark.parametrize(
-    ("bins", "weight", "message"),
-    [
-        (recordings("d", 1, 0) | recordings("e", 1, 0), 1.0, "one material at a time, got d, e"),
-        (recordings("a", 1, 0), 1.0, "a/0 is in already"),
-        ({"d/0": recording("d", 0, num_bins=0)}, 1.0, "no labelled bin"),
-        ({}, 1.0, "no labelled bin"),
-        (recordings("d", 1, 0), -1.0, "weight must be auto or a positive number"),
-        (recordings("d", 1, 0), float("nan"), "weight must be auto or a positive number"),
-    ],
-)
+REFUSED = [
+    (recordings("d", 1, 0) | recordings("e", 1, 0), 1.0, "one material at a time, got d, e"),
+    (recordings("a", 1, 0), 1.0, "a/0 is in already"),
+    ({"d/0": recording("d", 0, num_bins=0)}, 1.0, "no labelled bin"),
+    ({}, 1.0, "no labelled bin"),
+    (recordings("d", 1, 0), -1.0, "weight must be auto or a positive number"),
+    (recordings("d", 1, 0), float("nan"), "weight must be auto or a positive number"),
+]
+
+
+@pytest.mark.parametrize(("bins", "weight", "message"), REFUSED)
 def test_what_cannot_be_added_is_refused(old, before, bins, weight, message):
     with pytest.raises(ValueError, match=message):
         adaptation.add(old, before, bins, weight, margin=0.1)

@@ -54,15 +54,15 @@ def test_what_is_stored_comes_back_bit_by_bit(cache, values):
     assert [path.suffix for path in files(cache)] == [".npz"]
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        *(lambda content, n=n: content[:n] for n in (0, 40, -4)),
-        *(lambda content, n=n: content[:n] + b"?" + content[n + 1 :] for n in (0, 300)),
-        lambda content: b"not features at all" * 20,
-        lambda content: bytes(len(content)),
-    ],
-)
+DAMAGES = [
+    *(lambda content, n=n: content[:n] for n in (0, 40, -4)),
+    *(lambda content, n=n: content[:n] + b"?" + content[n + 1 :] for n in (0, 300)),
+    lambda content: b"not features at all" * 20,
+    lambda content: bytes(len(content)),
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_file_is_absent_with_a_warning_and_is_written_again(cache, caplog, damage):
     cache.store(KEY, features())
     (path,) = files(cache)
@@ -75,16 +75,16 @@ def test_a_damaged_file_is_absent_with_a_warning_and_is_written_again(cache, cap
     assert torch.equal(cache.load(KEY), features())
 
 
-@pytest.mark.parametrize(
-    ("most_files", "spare_bytes", "read", "left"),
-    [
-        (3, 0, None, [2, 3, 4]),
-        (2, 0, 0, [0, 4]),  # reading counts as use
-        (5, 0, None, [0, 1, 2, 3, 4]),
-        (5, -1, None, [1, 2, 3, 4]),
-        (0, 0, None, []),
-    ],
-)
+PRUNED = [
+    (3, 0, None, [2, 3, 4]),
+    (2, 0, 0, [0, 4]),  # reading counts as use
+    (5, 0, None, [0, 1, 2, 3, 4]),
+    (5, -1, None, [1, 2, 3, 4]),
+    (0, 0, None, []),
+]
+
+
+@pytest.mark.parametrize(("most_files", "spare_bytes", "read", "left"), PRUNED)
 def test_prune_drops_what_was_used_longest_ago_and_nothing_else(
     cache, most_files, spare_bytes, read, left
 ):

@@ -107,34 +107,34 @@ def test_huge_scores_give_finite_ratios_and_nan_stays(name, dtype):
         assert each.llr(torch.tensor([torch.nan, 0.0])).isnan().tolist() == [True, False]
 
 
-@pytest.mark.parametrize(
-    "plain",
-    [
-        {"kind": "platt", "slope": -1.0, "offset": 0.0},
-        {"kind": "platt", "slope": 1.0, "offset": 0.0, "more": 1.0},
-        {"kind": "isotonic", "scores": [1.0, 0.0], "llrs": [0.0, 1.0]},
-        {"kind": "isotonic", "scores": [0.0, 1.0], "llrs": [1.0, 0.0]},
-        {"kind": "isotonic", "scores": [0.0], "llrs": [math.nan]},
-        {},
-    ],
-)
+NO_CALIBRATIONS = [
+    {"kind": "platt", "slope": -1.0, "offset": 0.0},
+    {"kind": "platt", "slope": 1.0, "offset": 0.0, "more": 1.0},
+    {"kind": "isotonic", "scores": [1.0, 0.0], "llrs": [0.0, 1.0]},
+    {"kind": "isotonic", "scores": [0.0, 1.0], "llrs": [1.0, 0.0]},
+    {"kind": "isotonic", "scores": [0.0], "llrs": [math.nan]},
+    {},
+]
+
+
+@pytest.mark.parametrize("plain", NO_CALIBRATIONS)
 def test_what_is_no_calibration_is_refused_in_a_line(plain):
     with pytest.raises(ValueError, match="no calibration of this version"):
         calibration.calibration_from_dict(plain)
 
 
+NOT_TO_BE_FITTED = [
+    ([1.0, 2.0], [True, True], None, "needs slip and non-slip"),
+    ([1.0, 2.0, 3.0], [True, False, True], [0.0, 1.0, 0.0], "needs slip and non-slip"),
+    ([1.0, math.nan], [True, False], None, "scores must lie in"),
+    ([1.0, 2.0], [True], None, "of one N"),
+    ([1.0, 2.0], [True, False], [1.0, -1.0], "weights must be finite"),
+    ([], [], None, "weights must be finite"),
+]
+
+
 @pytest.mark.parametrize("fit", [calibration.fit_platt, calibration.fit_isotonic])
-@pytest.mark.parametrize(
-    ("scores", "is_slip", "weights", "message"),
-    [
-        ([1.0, 2.0], [True, True], None, "needs slip and non-slip"),
-        ([1.0, 2.0, 3.0], [True, False, True], [0.0, 1.0, 0.0], "needs slip and non-slip"),
-        ([1.0, math.nan], [True, False], None, "scores must lie in"),
-        ([1.0, 2.0], [True], None, "of one N"),
-        ([1.0, 2.0], [True, False], [1.0, -1.0], "weights must be finite"),
-        ([], [], None, "weights must be finite"),
-    ],
-)
+@pytest.mark.parametrize(("scores", "is_slip", "weights", "message"), NOT_TO_BE_FITTED)
 def test_what_cannot_be_fitted_is_refused_in_a_line(fit, scores, is_slip, weights, message):
     given = torch.tensor(scores), torch.tensor(is_slip, dtype=torch.bool)
     with pytest.raises(ValueError, match=message):

@@ -106,18 +106,18 @@ def test_the_exit_status_is_0_if_it_holds_and_1_if_not(typed, tmp_path, monkeypa
     assert (content["holds"], list(content["sets"])) == (False, ["calibration", "unseen"])
 
 
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("calibrate=all", "calibrate and evaluate must be different roles of train, test, unseen"),
-        ("fold=other", "fold must be one of unseen4, got other"),
-        ("+data.broken=A/0", "repair or leave out A/0"),
-        ("out=taken", "taken is a file, out= must be a folder; give another"),
-        ("out=foreign", "certificate.json is no certificate of ours; move it, or give another"),
-        ("data.channels=3", "the features expect 4 channels SG1..PVDF2, the recordings have 3"),
-        ("scored_bins=1.5", "scored_bins must be a positive whole number, got 1.5"),
-    ],
-)
+REFUSED = [
+    ("calibrate=all", "calibrate and evaluate must be different roles of train, test, unseen"),
+    ("fold=other", "fold must be one of unseen4, got other"),
+    ("+data.broken=A/0", "repair or leave out A/0"),
+    ("out=taken", "taken is a file, out= must be a folder; give another"),
+    ("out=foreign", "certificate.json is no certificate of ours; move it, or give another"),
+    ("data.channels=3", "the features expect 4 channels SG1..PVDF2, the recordings have 3"),
+    ("scored_bins=1.5", "scored_bins must be a positive whole number, got 1.5"),
+]
+
+
+@pytest.mark.parametrize(("override", "words"), REFUSED)
 def test_bad_input_is_one_line_and_nothing_is_written(override, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").write_text("mine")

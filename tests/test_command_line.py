@@ -157,36 +157,36 @@ def test_a_mistake_is_answered_in_one_line(line):
     assert not missing, said
 
 
-@pytest.mark.parametrize(
-    ("line", "key", "value"),
-    [
-        ("train split.seen=M1", "split.seen", ["M1"]),
-        ("train data=files data.root=x data.materials=cup", "data.materials", ["cup"]),
-        ("train recipe.use=pooled", "recipe.use", "pooled"),  # a text, or a list to choose from
-        ("train features.pooling=sorted", "features.pooling", "sorted"),
-    ],
-)
+TEXTS = [
+    ("train split.seen=M1", "split.seen", ["M1"]),
+    ("train data=files data.root=x data.materials=cup", "data.materials", ["cup"]),
+    ("train recipe.use=pooled", "recipe.use", "pooled"),  # a text, or a list to choose from
+    ("train features.pooling=sorted", "features.pooling", "sorted"),
+]
+
+
+@pytest.mark.parametrize(("line", "key", "value"), TEXTS)
 def test_a_text_is_a_list_of_one_where_a_list_is_wanted(line, key, value):
     composed = checked_line(line).composed
     configuration.with_lists(composed.config, composed)
     assert OmegaConf.select(composed.config, key) == value
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "train +scene.friction_noise_mv=4 +features.frames.film=11 +trainer.limit_train_batches=2",
-        "train extra_scenes=confound +extra_scenes.taps.machine_mv=3 extra_scenes.taps.cycles=1",
-        "train '+extra_scenes.mine={cycles: 3, taps_per_s: 1.0}'",
-        "train 'recipe.scene_weights={arm_motion: 1}' '~features.frames.PVDF'",
-        "train onset=alarms 'onset.budget={held: 2}' +onset.streams.extra_scenes.held.machine_mv=9",
-        "train data=files data.root=x 'data.streams={a: {kind: SG}}'",
-        "train data=mine --config-dir own",
-        "train -m +exp=quick,unseen4 'seed=range(0,3)' 'data.materials=[M1],[M2]'",
-        "data action=label_template root=a=b 'pattern={material}_{trial}'",
-        "crossval -m recipe@recipes.paper=robust,paper",
-    ],
-)
+TAKEN = [
+    "train +scene.friction_noise_mv=4 +features.frames.film=11 +trainer.limit_train_batches=2",
+    "train extra_scenes=confound +extra_scenes.taps.machine_mv=3 extra_scenes.taps.cycles=1",
+    "train '+extra_scenes.mine={cycles: 3, taps_per_s: 1.0}'",
+    "train 'recipe.scene_weights={arm_motion: 1}' '~features.frames.PVDF'",
+    "train onset=alarms 'onset.budget={held: 2}' +onset.streams.extra_scenes.held.machine_mv=9",
+    "train data=files data.root=x 'data.streams={a: {kind: SG}}'",
+    "train data=mine --config-dir own",
+    "train -m +exp=quick,unseen4 'seed=range(0,3)' 'data.materials=[M1],[M2]'",
+    "data action=label_template root=a=b 'pattern={material}_{trial}'",
+    "crossval -m recipe@recipes.paper=robust,paper",
+]
+
+
+@pytest.mark.parametrize("line", TAKEN)
 def test_keys_that_something_takes_pass(line):
     checked_line(line)
 

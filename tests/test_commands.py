@@ -176,17 +176,17 @@ def test_a_checkpoint_of_other_bins_is_refused(tiny, tmp_path, change):
         train(config, tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (b"", "is damaged or no file of ours"),
-        (pickle.dumps({"plan": 3}), "is damaged or no file of ours"),
-        (0.5, "is damaged or no file of ours"),  # of a whole one
-        ("folder", "no last.ckpt in .*/ckpt: a run writes it after its first pass"),
-        ("pipe", "is a device or pipe, expected a file"),
-        (None, "no file at .*/ckpt"),
-    ],
-)
+NO_CHECKPOINTS = [
+    (b"", "is damaged or no file of ours"),
+    (pickle.dumps({"plan": 3}), "is damaged or no file of ours"),
+    (0.5, "is damaged or no file of ours"),  # of a whole one
+    ("folder", "no last.ckpt in .*/ckpt: a run writes it after its first pass"),
+    ("pipe", "is a device or pipe, expected a file"),
+    (None, "no file at .*/ckpt"),
+]
+
+
+@pytest.mark.parametrize(("content", "said"), NO_CHECKPOINTS)
 def test_what_is_no_checkpoint_is_refused_in_one_line(tiny, tmp_path, content, said):
     path = tmp_path / "ckpt"
     if content == "folder":
@@ -221,15 +221,15 @@ def evaluated(tiny, folder, *overrides):
     return evaluate(composed(*told, model, *overrides, name="evaluate"), folder)
 
 
-@pytest.mark.parametrize(
-    ("override", "line"),
-    [
-        ("data.channels=3", "the features expect 4 channels SG1..PVDF2, the recordings have 3 SG2"),
-        ("+scene.rate=1000.0", "the features expect 2000 Hz, the recordings have 1000 Hz"),
-        ("labels.bin_ms=100", "the features expect bins of 100 samples, labels.bin_ms=100 makes"),
-        ("split.seen=[A,Foo]", "no recording of material 'Foo'; the set has A, B, C"),
-    ],
-)
+UNFIT = [
+    ("data.channels=3", "the features expect 4 channels SG1..PVDF2, the recordings have 3 SG2"),
+    ("+scene.rate=1000.0", "the features expect 2000 Hz, the recordings have 1000 Hz"),
+    ("labels.bin_ms=100", "the features expect bins of 100 samples, labels.bin_ms=100 makes"),
+    ("split.seen=[A,Foo]", "no recording of material 'Foo'; the set has A, B, C"),
+]
+
+
+@pytest.mark.parametrize(("override", "line"), UNFIT)
 def test_evaluate_refuses_what_does_not_fit_the_detector(tiny, tmp_path, override, line):
     with pytest.raises(BAD_INPUT) as caught:
         evaluated(tiny, tmp_path, override)
@@ -245,20 +245,21 @@ def assert_one_line(error, expected):
     assert "\n" not in line
 
 
+REFUSED = [
+    (["data.cycles=1"], "no recording has the role 'test'"),
+    (["split.unseen=[]"], "no recording has the role 'unseen'"),
+    (["features.frames={SG: 51}", "~features.frames.PVDF"], "no frame for PVDF channels"),
+    (["+features.misspelt=1"], "misspelt"),
+    (["recipe.num_features=0"], "recipe.num_features must be whole numbers of at least 1"),
+    (["onset=debounced", "onset.hop_ms=0.3"], "onset.hop_ms=0.3 is 0.6 samples at 2000 Hz"),
+    (["+scene.misspelt=1"], "unknown override misspelt"),
+    (["data.channels=[{name: film, kind: FSR, finger: index, segment: distal}]"], "FSR"),
+    ([*TINY, "+scene.slide_s=0.03"], "no slip"),  # slides hold no bin of 50 ms
+]
+
+
 @pytest.mark.parametrize(
-    ("overrides", "line"),
-    [
-        (["data.cycles=1"], "no recording has the role 'test'"),
-        (["split.unseen=[]"], "no recording has the role 'unseen'"),
-        (["features.frames={SG: 51}", "~features.frames.PVDF"], "no frame for PVDF channels"),
-        (["+features.misspelt=1"], "misspelt"),
-        (["recipe.num_features=0"], "recipe.num_features must be whole numbers of at least 1"),
-        (["onset=debounced", "onset.hop_ms=0.3"], "onset.hop_ms=0.3 is 0.6 samples at 2000 Hz"),
-        (["+scene.misspelt=1"], "unknown override misspelt"),
-        (["data.channels=[{name: film, kind: FSR, finger: index, segment: distal}]"], "FSR"),
-        ([*TINY, "+scene.slide_s=0.03"], "no slip"),  # slides hold no bin of 50 ms
-    ],
-    ids=lambda value: value[0] if isinstance(value, list) else "",
+    ("overrides", "line"), REFUSED, ids=lambda value: value[0] if isinstance(value, list) else ""
 )
 def test_bad_input_is_refused_before_anything_is_simulated(overrides, line, tmp_path, monkeypatch):
     module = importlib.import_module("tactslip_torch.simulation.simulate")  # the name is a function

@@ -36,29 +36,29 @@ class Picky:
 SIMULATED = "tactslip_torch.simulation.SimulatedRecordings"
 
 
-@pytest.mark.parametrize(
-    ("section", "line"),
-    [
-        ({"_target_": "test_config.Picky", "cycles": 0}, "data: cycles must be at least 1, got 0"),
-        ({"_target_": "test_config.Picky", "cycels": 3}, "cycels"),
-        ({"_target_": "tactslip_torch.data.splits.nope"}, "nope"),
-        ({"_target_": SIMULATED, "cycles": "abc"}, "data: "),
-    ],
-)
+WRAPPED = [
+    ({"_target_": "test_config.Picky", "cycles": 0}, "data: cycles must be at least 1, got 0"),
+    ({"_target_": "test_config.Picky", "cycels": 3}, "cycels"),
+    ({"_target_": "tactslip_torch.data.splits.nope"}, "nope"),
+    ({"_target_": SIMULATED, "cycles": "abc"}, "data: "),
+]
+
+
+@pytest.mark.parametrize(("section", "line"), WRAPPED)
 def test_hydras_wrapping_is_taken_off_and_the_section_named(section, line):
     with pytest.raises(InstantiationException) as caught:
         instantiate(OmegaConf.create({"data": section}).data)
     assert line in one_line(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("error", "line"),
-    [
-        (KeyError("no channel 'SG99' in this hand"), "no channel 'SG99' in this hand"),
-        (OSError(28, "No space left on device"), "[Errno 28] No space left on device"),
-        (ValueError(), "ValueError"),
-    ],
-)
+ERRORS = [
+    (KeyError("no channel 'SG99' in this hand"), "no channel 'SG99' in this hand"),
+    (OSError(28, "No space left on device"), "[Errno 28] No space left on device"),
+    (ValueError(), "ValueError"),
+]
+
+
+@pytest.mark.parametrize(("error", "line"), ERRORS)
 def test_errors_speak_for_themselves(error, line):
     assert one_line(error) == line
 

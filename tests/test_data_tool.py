@@ -152,19 +152,19 @@ def files_in(path):
         return [line["file"] for line in csv.DictReader(file)]
 
 
-@pytest.mark.parametrize(
-    ("overrides", "line"),
-    [
-        (["to=npz"], "no value for output; give to=FORMAT and output=FOLDER"),
-        (["to=doc", "output=out"], "format must be one of .* got 'doc'"),
-        (["to=npz", "output={root}/../set"], "output must be another folder than root"),
-        (["to=npz", "output={there}"], r"a\.npz .*; move it away, or give another output"),
-        (
-            ["data=simulated", "to=npz", "output=out"],
-            "data must be a set of files, such as",
-        ),
-    ],
-)
+NO_CONVERSIONS = [
+    (["to=npz"], "no value for output; give to=FORMAT and output=FOLDER"),
+    (["to=doc", "output=out"], "format must be one of .* got 'doc'"),
+    (["to=npz", "output={root}/../set"], "output must be another folder than root"),
+    (["to=npz", "output={there}"], r"a\.npz .*; move it away, or give another output"),
+    (
+        ["data=simulated", "to=npz", "output=out"],
+        "data must be a set of files, such as",
+    ),
+]
+
+
+@pytest.mark.parametrize(("overrides", "line"), NO_CONVERSIONS)
 def test_a_conversion_that_cannot_be_is_refused_before_any_work(root, tmp_path, overrides, line):
     there = tmp_path / "there"
     there.mkdir()
@@ -211,32 +211,32 @@ def test_a_template_lists_every_recording_with_what_names_tell(tmp_path, capsys)
     assert [filled.timeline(r).onsets_s for r in filled.ids] == [(1.5, 2.0), (), ()]
 
 
-@pytest.mark.parametrize(
-    ("pattern", "file", "found"),
-    [
-        ("{material}{trial}", "sub/wood - 12.csv", "material=wood, trial=12"),
-        ("{scene}/{material}{trial}", "taps/iron_4.h5", "scene=taps, material=iron, trial=4"),
-        ("{label}/{material}_*", "slip/iron_x.h5", "label=slip, material=iron"),
-        ("*_{material}.v1", "run7_oil paper.v1.csv", "material=oil paper"),
-        ("{material:cup|big cup}{trial}*", "big cup12b.csv", "material=big cup, trial=12"),
-    ],
-)
+PATTERNS = [
+    ("{material}{trial}", "sub/wood - 12.csv", "material=wood, trial=12"),
+    ("{scene}/{material}{trial}", "taps/iron_4.h5", "scene=taps, material=iron, trial=4"),
+    ("{label}/{material}_*", "slip/iron_x.h5", "label=slip, material=iron"),
+    ("*_{material}.v1", "run7_oil paper.v1.csv", "material=oil paper"),
+    ("{material:cup|big cup}{trial}*", "big cup12b.csv", "material=big cup, trial=12"),
+]
+
+
+@pytest.mark.parametrize(("pattern", "file", "found"), PATTERNS)
 def test_a_pattern_tells_what_names_mean(pattern, file, found):
     assert guessed(file, pattern) == dict(part.split("=") for part in found.split(", "))
 
 
-@pytest.mark.parametrize(
-    ("pattern", "file", "readings"),
-    [
-        (
-            "{material}_{scene}_*",
-            "plastic_cup_C_1.csv",
-            "material='plastic', scene='cup' or material='plastic_cup', scene='C'; list the texts "
-            "that can stand there, as {material:plastic|plastic_cup}, or rename the file",
-        ),
-        ("{material}_*", "day 2/oil_paper_1.csv", "material='oil' or material='oil_paper';"),
-    ],
-)
+AMBIGUOUS = [
+    (
+        "{material}_{scene}_*",
+        "plastic_cup_C_1.csv",
+        "material='plastic', scene='cup' or material='plastic_cup', scene='C'; list the texts "
+        "that can stand there, as {material:plastic|plastic_cup}, or rename the file",
+    ),
+    ("{material}_*", "day 2/oil_paper_1.csv", "material='oil' or material='oil_paper';"),
+]
+
+
+@pytest.mark.parametrize(("pattern", "file", "readings"), AMBIGUOUS)
 def test_a_name_that_can_be_read_in_two_ways_is_refused(pattern, file, readings, tmp_path):
     table(tmp_path / file, samples(1))
     with pytest.raises(ValueError, match=re.escape(f"{pattern!r} can mean {readings}")) as raised:

@@ -533,30 +533,30 @@ def test_a_rate_that_nobody_says_is_asked_for(tmp_path):
     refused(r"its times are 200 Hz, but 250 Hz is stated", tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        ({"materials": ["steel", "iron"]}, r"data\.materials steel; the set has wood, iron"),
-        ({"cycles": 0}, r"data\.cycles must be a number of trials or null, got 0"),
-        ({"gaps": "ignore"}, r"data\.gaps must be one of refuse, missing, bridge"),
-        ({"tare_s": [1.0, 0.5]}, r"data\.tare_s must be \[start, end\] in seconds"),
-        ({"slide_s": "long"}, r"data\.slide_s must be a finite number .*, got 'long'"),
-        ({"bridge_ms": 0.0, "gaps": "bridge"}, r"data\.bridge_ms must be a positive finite .* 0"),
-        ({"streams": 3}, r"data\.streams must be sets of channels by name, .* got 3"),
-        ({"streams": {"one": {"colour": "red"}}}, r"a stream has reading, .* got colour"),
-        ({"channels": 3}, r"data\.channels must be a list of rows of name, .* got 3"),
-        ({"channels": ["a"]}, r"data\.channels must be a list of rows of name, .* got \['a'\]"),
-        ({"reading": 3}, r"data\.reading must be what is said of files, got 3"),
-        ({"reading": {"rate": 5}}, "reading must be of sample_rate_hz, time"),
-        ({"reading": {"channels": 3}}, r"reading\.channels must be a list of columns, .* got 3"),
-        ({"reading": {"channels": ["a", "a"]}}, r"reading\.channels names a column twice"),
-        ({"reading": {"time_unit": "h"}}, r"reading\.time_unit must be one of s, ms, us, ns"),
-        ({"resample_hz": 199.9999}, "is no ratio of whole numbers up to 50000"),
-        ({"adapting": "quick"}, "adapting must be slow or fast, got 'quick'"),
-        ({"channels": [{"name": "a"}]}, "channel row 1: expected name, kind, finger, segment"),
-        ({"manifest": "other.csv"}, r"no manifest at .*other\.csv"),
-    ],
-)
+REFUSED = [
+    ({"materials": ["steel", "iron"]}, r"data\.materials steel; the set has wood, iron"),
+    ({"cycles": 0}, r"data\.cycles must be a number of trials or null, got 0"),
+    ({"gaps": "ignore"}, r"data\.gaps must be one of refuse, missing, bridge"),
+    ({"tare_s": [1.0, 0.5]}, r"data\.tare_s must be \[start, end\] in seconds"),
+    ({"slide_s": "long"}, r"data\.slide_s must be a finite number .*, got 'long'"),
+    ({"bridge_ms": 0.0, "gaps": "bridge"}, r"data\.bridge_ms must be a positive finite .* 0"),
+    ({"streams": 3}, r"data\.streams must be sets of channels by name, .* got 3"),
+    ({"streams": {"one": {"colour": "red"}}}, r"a stream has reading, .* got colour"),
+    ({"channels": 3}, r"data\.channels must be a list of rows of name, .* got 3"),
+    ({"channels": ["a"]}, r"data\.channels must be a list of rows of name, .* got \['a'\]"),
+    ({"reading": 3}, r"data\.reading must be what is said of files, got 3"),
+    ({"reading": {"rate": 5}}, "reading must be of sample_rate_hz, time"),
+    ({"reading": {"channels": 3}}, r"reading\.channels must be a list of columns, .* got 3"),
+    ({"reading": {"channels": ["a", "a"]}}, r"reading\.channels names a column twice"),
+    ({"reading": {"time_unit": "h"}}, r"reading\.time_unit must be one of s, ms, us, ns"),
+    ({"resample_hz": 199.9999}, "is no ratio of whole numbers up to 50000"),
+    ({"adapting": "quick"}, "adapting must be slow or fast, got 'quick'"),
+    ({"channels": [{"name": "a"}]}, "channel row 1: expected name, kind, finger, segment"),
+    ({"manifest": "other.csv"}, r"no manifest at .*other\.csv"),
+]
+
+
+@pytest.mark.parametrize(("options", "line"), REFUSED)
 def test_options_that_cannot_be_are_named(tables, options, line):
     refused(line, tables, **options)
 
@@ -608,21 +608,21 @@ def test_paths_say_what_recordings_are(folder):
     assert (other.onsets_s, other.slip_s) == ((), ((0.5, 1.5),))
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"root": "linked"}, r"n/pen9.csv: is a link out of the folder"),
-        ({"pattern": "("}, r"data.pattern='\(' is no regular expression"),
-        ({"pattern": "(?P<object>.*)"}, r"must have a group \(\?P<material>...\)"),
-        ({"labels": {"n": "slips"}}, "data.labels must be of slip and non-slip, got 'slips'"),
-        ({"labels": {"n": "slip"}}, r"2 problems in .*t/case1.csv: scene 't' is none of data.labe"),
-        ({"pattern": r"./(?P<material>pe)(?P<trial>.+)\.csv"}, "trial 'n0' is no num"),
-        (
-            {"pattern": r"./(?P<material>[a-z]+)(?P<trial>\d+)\.csv", "labels": None},
-            "trial 0 of pen, scene paper, was listed in n/pen0.csv",
-        ),
-    ],
-)
+UNSAID = [
+    ({"root": "linked"}, r"n/pen9.csv: is a link out of the folder"),
+    ({"pattern": "("}, r"data.pattern='\(' is no regular expression"),
+    ({"pattern": "(?P<object>.*)"}, r"must have a group \(\?P<material>...\)"),
+    ({"labels": {"n": "slips"}}, "data.labels must be of slip and non-slip, got 'slips'"),
+    ({"labels": {"n": "slip"}}, r"2 problems in .*t/case1.csv: scene 't' is none of data.labe"),
+    ({"pattern": r"./(?P<material>pe)(?P<trial>.+)\.csv"}, "trial 'n0' is no num"),
+    (
+        {"pattern": r"./(?P<material>[a-z]+)(?P<trial>\d+)\.csv", "labels": None},
+        "trial 0 of pen, scene paper, was listed in n/pen0.csv",
+    ),
+]
+
+
+@pytest.mark.parametrize(("options", "said"), UNSAID)
 def test_what_names_do_not_say_is_said_in_a_line(folder, options, said):
     given = {"root": "", **NAMED, **options}
     refused(said, folder / given.pop("root"), named_recordings, **given)

@@ -126,21 +126,21 @@ def test_parts_that_disagree_are_refused(detector):
 # Files -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("facts", "state"),
-    [
-        ([], {}),
-        ({"selected": ...}, {}),  # left out
-        ({"selected": [0, 1, 2]}, {}),
-        ({"channels": []}, {}),
-        ({"window_lengths": [51] * 23}, {}),
-        ({"pool": {"bin_samples": 10**9}}, {}),
-        ({"info": {"calibration": {"kind": "platt", "slope": math.inf, "offset": 0}}}, {}),
-        ({"kernel": {"kind": "polynomial", "degree": 10**400, "offset": 0.5}}, {}),
-        ({}, {"scaler.minimum": torch.full((12,), torch.nan)}),
-        ({}, {"head.constant": torch.tensor(torch.nan)}),
-    ],
-)
+NO_DETECTORS = [
+    ([], {}),
+    ({"selected": ...}, {}),  # left out
+    ({"selected": [0, 1, 2]}, {}),
+    ({"channels": []}, {}),
+    ({"window_lengths": [51] * 23}, {}),
+    ({"pool": {"bin_samples": 10**9}}, {}),
+    ({"info": {"calibration": {"kind": "platt", "slope": math.inf, "offset": 0}}}, {}),
+    ({"kernel": {"kind": "polynomial", "degree": 10**400, "offset": 0.5}}, {}),
+    ({}, {"scaler.minimum": torch.full((12,), torch.nan)}),
+    ({}, {"head.constant": torch.tensor(torch.nan)}),
+]
+
+
+@pytest.mark.parametrize(("facts", "state"), NO_DETECTORS)
 def test_what_describes_no_detector_is_refused_in_one_line(facts, state, detector, tmp_path):
     """Whole files, so the digest fits; another program wrote them."""
     path = tmp_path / "detector.pt"
