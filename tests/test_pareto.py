@@ -234,13 +234,9 @@ def test_landmarks_are_the_best_the_cheap_and_the_small():
     def found(*rows):
         return list(pareto.landmarks(rows).values())
 
-    best, third, poor, few, fewer, quick = (
-        at(60.0, us, accuracy, size)
-        for accuracy, us, size in (
-            *((0.99, 300.0, 100), (0.981, 100.0, 60), (0.979, 10.0, 30)),
-            *((0.95, 200.0, 20), (0.94, 90.0, 8), (0.99, 200.0, 100)),
-        )
-    )
+    best, quick = at(60.0, 300.0, 0.99, 100), at(60.0, 200.0, 0.99, 100)
+    third, poor = at(60.0, 100.0, 0.981, 60), at(60.0, 10.0, 0.979, 30)
+    few, fewer = at(60.0, 200.0, 0.95, 20), at(60.0, 90.0, 0.94, 8)
     assert found(poor, few, third, best, fewer) == [best, third, few]
     assert found(best, third, poor) == [best, third, None]
     assert found(best, quick, third) == [quick, None, None]  # as accurate: the quickest
@@ -427,9 +423,8 @@ def test_what_is_missed_is_named():
         "latency 57.90 ms above deadline_ms=57.8",
         "compute 400 us above compute_us=399",
     ]
-    assert Limits(100, 9999, [5.0]).misses(Latency(0.0, 50.0, 5.0, 5000.0)) == [
-        "compute 5000 us not below the hop 5 ms"
-    ]
+    missed = Limits(100, 9999, [5.0]).misses(Latency(0.0, 50.0, 5.0, 5000.0))
+    assert missed == ["compute 5000 us not below the hop 5 ms"]
     assert Latency(0.0, 50.0, 5.0, 1000.0).load == pytest.approx(0.2)
 
 
