@@ -61,7 +61,9 @@ class Abstaining(Benchmark):
         "splits=1 train_bins=30 scored_bins=40 num_features=20 penalties=[0.001] "
         "coverages=[0.5,0.8]"
     )
-    charts: ClassVar = {"": [(f"{role}: {of}", "coverage") for role, of in SEEN_ROLE.items()]}
+    charts: ClassVar = {
+        "": [(f"{role}: {of}", "coverage %", "asked %") for role, of in SEEN_ROLE.items()]
+    }
     overrides: tuple[str, ...] = ()
     num_held_out: int = 4
     splits: int = 8

@@ -55,6 +55,9 @@ class _Subject:
         return {str(one): self.bins[str(one)] for one in recordings}
 
 
+_TITLES = {"new": "New material", "old": "Old materials' test recordings"}
+
+
 @dataclass(frozen=True)
 class Adapting(Benchmark):
     """New materials by count, way and draw.
@@ -76,7 +79,11 @@ class Adapting(Benchmark):
         '"recipe.penalties=[0.0003]",split.train_fraction=0.75,baselines=false] counts=[1,2] '
         "draws=1 train_fraction=0.6 limited=2"
     )
-    charts: ClassVar = {"": [("New material", ""), ("Old materials' test recordings", "")]}
+    charts: ClassVar = {
+        "": [
+            (of, "mean", "recordings") for of in ("New material", "Old materials' test recordings")
+        ]
+    }
     training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
     counts: tuple[int, ...] = (1, 2, 5, 10)
     draws: int = 3
@@ -117,12 +124,13 @@ class Adapting(Benchmark):
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Limits, new and old materials, and how the weight was chosen."""
         rows, found = numbers["rows"], {}
-        for key, title in (("new", "New material"), ("old", "Old materials' test recordings")):
+        for key, title in _TITLES.items():
             cells = []
             for (way, count), of in by(rows, "way", "count").items():
-                row = {"way, recordings": f"{way}, {count}"}
+                row = {"way": way, "recordings": f"{count}"}
                 for (material,), own in by(of, "material").items():
                     row[material] = _cell([one[key] for one in own])
+                row["mean"] = percent(mean(one[key] for one in of))
                 cells.append(row)
             note = "Balanced accuracy, %, median of draws (lowest to highest)."
             found[title] = Table(cells, note)

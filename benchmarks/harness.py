@@ -33,7 +33,7 @@ from omegaconf import OmegaConf
 from threadpoolctl import threadpool_info  # type: ignore[import-untyped]
 
 from benchmarks import RESULTS, ROOT
-from benchmarks.tables import Report, Table, chart
+from benchmarks.tables import Report, Table, chart, is_barred, lines
 from tactslip_torch.__main__ import run
 from tactslip_torch.commands.stopping import errors_in_one_line, stopping
 from tactslip_torch.features.cache import source_digest
@@ -205,7 +205,8 @@ class Benchmark(ABC):
         has_headings: whether the section has its own; else the page says the rest.
         is_simulated: whether its data are.
         charts: by the ending of a figure's file name, of each panel the title of a table, and how
-            the names of the columns begin that it shows.
+            the names of the columns begin that it shows; or one column, and that which it is
+            drawn over.
         drawn: patterns of figures that a command leaves in the folder ``numbers["folder"]``, and
             what their names end in here.
     """
@@ -220,7 +221,7 @@ class Benchmark(ABC):
     is_page: ClassVar[bool] = False
     has_headings: ClassVar[bool] = True
     is_simulated: ClassVar[bool] = True
-    charts: ClassVar[Mapping[str, Sequence[tuple[str, str | tuple[str, ...]]]]] = {}
+    charts: ClassVar[Mapping[str, Sequence[tuple[Any, ...]]]] = {}
     drawn: ClassVar[Mapping[str, str]] = {}
 
     def __init_subclass__(cls) -> None:
@@ -238,13 +239,20 @@ class Benchmark(ABC):
         """Fill the figure of that ending: ``charts``, unless a subject draws something else."""
         tables = self.tables(numbers)
         panels = [of for of in self.charts[ending] if of[0] in tables]
-        shown = [(title, *tables[title].columns(starts)) for title, starts in panels]
-        heights = [len(names) + 3 for _, names, _ in shown]
+        shown = [tables[title].columns(starts) for title, starts, *_ in panels]
+        heights = [
+            14 if x else 3 + len(names) * max(1, 0.7 * len(columns) * is_barred(names, columns))
+            for (_, _, *x), (names, columns) in zip(panels, shown, strict=True)
+        ]
         drawing.set_size_inches(9.2, max(4.8, 0.22 * sum(heights)))
         places = drawing.subplots(len(shown), squeeze=False, height_ratios=heights)[:, 0]
-        for axes, (title, names, columns) in zip(places, shown, strict=True):
+        for axes, (title, _, *over), (names, columns) in zip(places, panels, shown, strict=True):
             only = next(iter(columns)) if len(columns) == 1 else ""
-            chart(axes, names, columns, f"{title}: {only}" if only else title)
+            about = f"{title}: {only}" if only else title
+            for x in over:
+                lines(axes, tables[title].curves(only, x), x, about)
+            if not over:
+                chart(axes, names, columns, about)
 
     @style.styled
     def figures(self, report: Report, path: Path) -> None:
@@ -258,7 +266,7 @@ class Benchmark(ABC):
         quick = "; QUICK, means nothing" if report["quick"] else ""
         titles = self.tables(numbers)
         for ending, panels in self.charts.items():
-            if panels and not any(title in titles for title, _ in panels):
+            if panels and not any(title in titles for title, *_ in panels):
                 continue
             drawing = Figure(figsize=(9.2, 4.8), layout="constrained")
             self.draw(numbers, drawing, ending)

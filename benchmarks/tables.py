@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import cycle, product
+from itertools import product
 from statistics import mean, median, quantiles, stdev
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ Report = Mapping[str, Any]
 """What a benchmark keeps: ``numbers`` that it measured, and what they were measured on."""
 MOST_BARS = 24
 """In a chart; more values are dots."""
+_DASHES = ("-", "--", ":")
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -121,6 +122,15 @@ class Table(NamedTuple):
             names.append(", ".join(told))
         return names, found
 
+    def curves(self, y: str, x: str) -> dict[str, tuple[list[float], list[float]]]:
+        """By the first column the numbers of column ``x``, and those of ``y``."""
+        found: dict[str, tuple[list[float], list[float]]] = {}
+        for row in self.rows:
+            points = found.setdefault(str(next(iter(row.values()))), ([], []))
+            for values, name in zip(points, (x, y), strict=True):
+                values.append(_first_number(row[name]) or 0.0)
+        return found
+
     def markdown(self) -> str:
         """A table of Markdown, columns of numbers to the right and of words to the left."""
         header, *rows = style.cells(self._shown())
@@ -178,6 +188,11 @@ def limits(rows: Iterable[tuple[str, float, float, str]], *, is_least: bool = Fa
     )
 
 
+def is_barred(names: Sequence[str], series: Mapping[str, object]) -> bool:
+    """Whether a chart has bars: they are few enough."""
+    return len(names) * len(series) <= MOST_BARS
+
+
 def chart(
     axes: Axes, names: Sequence[str], series: Mapping[str, Sequence[float | None]], about: str
 ) -> None:
@@ -192,7 +207,7 @@ def chart(
         series: values by their meaning, one a name, a colour each; ``None`` leaves one out.
         about: labels the axis of values.
     """
-    is_bars, height = len(series) * len(names) <= MOST_BARS, 0.8 / len(series)
+    is_bars, height = is_barred(names, series), 0.8 / len(series)
     looks = product("osD", style.PALETTE)
     for step, (label, (marker, color)) in enumerate(zip(series, looks, strict=False)):
         shift = height * (step - (len(series) - 1) / 2) if is_bars else 0.0
@@ -223,9 +238,12 @@ def chart(
 def lines(
     axes: Axes, series: Mapping[str, tuple[Sequence[float], Sequence[float]]], x: str, y: str
 ) -> None:
-    """Lines by their meaning, each its places and its values, and what both axes are."""
-    for (label, points), color in zip(series.items(), cycle(style.PALETTE), strict=False):
-        axes.plot(*points, ".-", color=color, label=label)
-    axes.set(xlabel=x, ylabel=y)
+    """Lines by their meaning, each its places and its values, and what these are."""
+    looks = product(_DASHES, style.PALETTE)
+    for (label, points), (dash, color) in zip(series.items(), looks, strict=False):
+        marker = "o" if len(points[0]) <= MOST_BARS else ""
+        axes.plot(*points, marker + dash, color=color, label=label, markersize=4)
+    axes.set_xlabel(x)
+    axes.set_title(y)
     if len(series) > 1:
-        axes.legend()
+        axes.legend(**style.UPPER_LEFT_OUTSIDE)
