@@ -304,7 +304,7 @@ _HALF = "the published matrices do not fit half a second on either side"
 SETTINGS = {
     "random_bins": ("Split at random over bins, as the authors did, the paper's recipe", ""),
     "unseen4": ("Split by cycle, whole slides, the paper's recipe", ""),
-    "unseen4 robust": ("Split by cycle, whole slides, the default recipe", "the recipe is ours"),
+    "unseen4 robust": ("Split by cycle, whole slides, recipe=robust", "the recipe is ours"),
     "half_second random_bins": ("Split at random, half a second on either side", _HALF),
     "half_second": ("Split by cycle, half a second on either side", _HALF),
 }
@@ -379,7 +379,11 @@ def _beside(numbers: Report, scores: Scores, experiment: str) -> Table:
     larger = [100 * max(of) / sum(of) for of in classes]
     what = "fraction of the larger class, test bins, %"
     row(what, 100 * published.LARGER_CLASS, larger, 2, "labels", "")
-    return Table(rows, f"{len(runs)} seeds.")
+    return Table(rows, f"{_seeds(len(runs))}.")
+
+
+def _seeds(number: int) -> str:
+    return f"{number} seed{'s' * (number != 1)}"
 
 
 def _mark(experiment: str, role: str, score: str, calibrated: Mapping[str, Any]) -> tuple[str, str]:
@@ -615,7 +619,7 @@ def _short_table(runs: Runs) -> Table:
     for name, role in shown:
         cells = {of: mean_sd(scores.of(name, role, of).values()) for of in SCORES}
         pooled = mean_sd(scores.of(name, role, baseline=POOLED).values())
-        row(f"`{name}` {role}, simulated, {len(runs[name])} seeds", cells, pooled)
+        row(f"`{name}` {role}, simulated, {_seeds(len(runs[name]))}", cells, pooled)
         if (name, role) in COMPARED:
             paper = {of: percent(getattr(published.SPLITS[role], of)) for of in SCORES}
             row(f"paper, real hand, {role}", paper, "")

@@ -114,12 +114,10 @@ class Table(NamedTuple):
         """
         chosen = [name for name in list(self.rows[0])[1:] if name.startswith(starts)]
         found = {name: [_first_number(row[name]) for row in self.rows] for name in chosen}
-        names = []
-        for row in self.rows:
-            before = list(row.items())[: min(3, list(row).index(chosen[0]))]
-            words = {name: of for name, of in before if isinstance(of, str)}
-            told = [f"{name} {of}" if of[:1].isdigit() else of for name, of in words.items()]
-            names.append(", ".join(told))
+        before = list(self.rows[0])[: min(3, list(self.rows[0]).index(chosen[0]))]
+        words = [name for name in before if isinstance(self.rows[0][name], str)]
+        bare = {n: "" if any(str(row[n])[:1].isalpha() for row in self.rows) else n for n in words}
+        names = [", ".join(f"{bare[n]} {row[n]}".strip() for n in words) for row in self.rows]
         return names, found
 
     def curves(self, y: str, x: str) -> dict[str, tuple[list[float], list[float]]]:
