@@ -116,8 +116,10 @@ class Table(NamedTuple):
         found = {name: [_first_number(row[name]) for row in self.rows] for name in chosen}
         before = list(self.rows[0])[: min(3, list(self.rows[0]).index(chosen[0]))]
         words = [name for name in before if isinstance(self.rows[0][name], str)]
-        bare = {n: "" if any(str(row[n])[:1].isalpha() for row in self.rows) else n for n in words}
-        names = [", ".join(f"{bare[n]} {row[n]}".strip() for n in words) for row in self.rows]
+        of = {
+            n: n if all(re.match(r"[+-]?\d", str(r[n])) for r in self.rows) else "" for n in words
+        }
+        names = [", ".join(f"{of[n]} {row[n]}".strip() for n in words) for row in self.rows]
         return names, found
 
     def curves(self, y: str, x: str) -> dict[str, tuple[list[float], list[float]]]:
