@@ -62,8 +62,10 @@ def stream(config: DictConfig, folder: Path) -> Counts:
     dtype = source.dtype if isinstance(source, FileInTime) else torch.float64
     masked = config.masked_channels or ()
     watching = StreamingDetector(detector, settings, dtype=dtype, masked_channels=masked)
-    logging.getLogger(StreamingDetector.__module__).setLevel(logging.ERROR)  # an event says it
+    log = logging.getLogger(StreamingDetector.__module__)
     with ExitStack() as stack, closing(source):
+        stack.callback(log.setLevel, log.level)
+        log.setLevel(logging.ERROR)  # an event says it
         stack.enter_context(_quick_threads())
         sinks: list[Sink] = [Callback(lambda alarm: None, _say)]
         if config.serve:
