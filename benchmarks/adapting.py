@@ -79,11 +79,7 @@ class Adapting(Benchmark):
         '"recipe.penalties=[0.0003]",split.train_fraction=0.75,baselines=false] counts=[1,2] '
         "draws=1 train_fraction=0.6 limited=2"
     )
-    charts: ClassVar = {
-        "": [
-            (of, "mean", "recordings") for of in ("New material", "Old materials' test recordings")
-        ]
-    }
+    charts: ClassVar = {"": [(title, "mean", "recordings") for title in _TITLES.values()]}
     training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
     counts: tuple[int, ...] = (1, 2, 5, 10)
     draws: int = 3

@@ -84,7 +84,7 @@ class Generalisation(Benchmark):
         "training materials. *Worst* is the worst seed; *wanted* was set before. Baselines were "
         "fitted on the same training bins. `+exp=hard` is the protocol on a simulated hand whose "
         "channels differ without slip, as real ones do ([how it was held against a real one]"
-        "(../benchmarks/results/realism.json): `python -m benchmarks.realism`)"
+        "(../benchmarks/results/realism.json): `python -m benchmarks.realism data.root=FOLDER`)"
     )
     page, is_page = "docs/generalisation.md", True
     quick = (

@@ -17,6 +17,7 @@ import json
 import os
 import platform
 import re
+import shlex
 import shutil
 import sys
 from abc import ABC, abstractmethod
@@ -276,7 +277,7 @@ class Benchmark(ABC):
     def section(self, report: Report) -> str:
         """What stands between the markers of the page, in Markdown."""
         tables = self.tables(report["numbers"])
-        command = " ".join([f"python -m benchmarks.{self.name}", *map(repr, report["overrides"])])
+        command = f"python -m benchmarks.{self.name} {shlex.join(report['overrides'])}".strip()
         if not self.has_headings:
             is_simulated = report["numbers"].get("simulated", report["simulated"])
             kind = "Simulated" if is_simulated else "Recorded"
@@ -284,7 +285,7 @@ class Benchmark(ABC):
             return "\n\n".join([*parts, *(table.markdown() for table in tables.values())])
         parts = [
             *([] if self.is_page else [f"## {self.title}"]),
-            f"`python -m benchmarks.{self.name}`, {ran_on(report)}.",
+            f"`{command}`, {ran_on(report)}.",
             *([f"**{QUICK_LINE}.**"] if report["quick"] else []),
             f"{self.about[:1].upper()}{self.about[1:]}.",
             f"![{self.title}](../benchmarks/results/{self.name}.png)",
@@ -349,7 +350,7 @@ class Benchmark(ABC):
             "machine": machine,
             "versions": versions(self.libraries),
             "settings": asdict(asked),
-            "overrides": given.overrides,
+            "overrides": [re.sub(r"root=.*", "root=FOLDER", text) for text in given.overrides],
             "numbers": numbers,
         }
         keep_numbers(report, path)

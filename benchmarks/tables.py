@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
@@ -128,7 +129,8 @@ class Table(NamedTuple):
         for row in self.rows:
             points = found.setdefault(str(next(iter(row.values()))), ([], []))
             for values, name in zip(points, (x, y), strict=True):
-                values.append(_first_number(row[name]) or 0.0)
+                value = _first_number(row[name])
+                values.append(math.nan if value is None else value)  # nothing is drawn of NaN
         return found
 
     def markdown(self) -> str:
@@ -145,7 +147,7 @@ class Table(NamedTuple):
 def _first_number(value: Any) -> float | None:
     """Such as the mean of ``mean ± sd``; of several numbers the median."""
     if isinstance(value, str):
-        found = re.match(r"[+-]?[\d,]*\.?\d+", value)
+        found = re.match(r"[+-]?[\d,]*\.?\d+(e[+-]?\d+)?", value)
         return float(found[0].replace(",", "")) if found else None
     middle: float | None = median(value) if isinstance(value, list) else value
     return middle

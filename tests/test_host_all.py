@@ -318,7 +318,7 @@ def test_a_model_that_is_not_what_it_should_be_is_one_line(seen):
 
 
 LIVE_S = float(os.environ.get("TACTSLIP_LIVE_S", "15"))
-"""Seconds of a live stream that are looked at; 120 are as many as the page is to keep."""
+"""Seconds of a live stream that are looked at."""
 
 
 def test_a_live_stream_is_drawn_whole_and_as_the_package_decides(script, tmp_path):
