@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"
 PACKAGE = Path(__file__).resolve().parent
 
 log = logging.getLogger(__name__)
