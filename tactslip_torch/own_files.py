@@ -83,7 +83,7 @@ def load_table(
     kind, number = form.rsplit(" ", 1)
     if content["format"] in {f"{kind} {earlier}" for earlier in range(1, int(number))}:
         raise ValueError(
-            f"{name} was made by version 0.1.0 or earlier; make it again, or use that version"
+            f"{name} was made by version 0.2.0 or earlier; make it again, or use that version"
         )
     if content["format"] != form:
         raise ValueError(f"{name} must be of format {form!r}, got {content['format']!r:.80}")
@@ -342,11 +342,9 @@ _ALARM = {
     "metadata": {"*": object},
     "onset?": _ONSET,
 }
-_ABSTAIN = {"coverage": _share, "low": _number(-1e300, 0), "high": _number(0, 1e300), "*": object}
 _INFO = {
     "alarm?": _ALARM,
     "calibration?": _CALIBRATION,
-    "abstain?": _ABSTAIN,
     "simulated?": bool,
     "units?": str,
     "features_dtype?": _one_of("float64", "float32"),
@@ -354,7 +352,7 @@ _INFO = {
     "train_sessions?": _names,
     "*": object,
 }
-CHECKPOINT = "tactslip_torch checkpoint 1"
+CHECKPOINT = "tactslip_torch checkpoint 2"
 _epoch = _number(0, 2, whole=True)
 _CHECKPOINT = {
     "format": _one_of(CHECKPOINT),
@@ -377,7 +375,6 @@ _CHECKPOINT = {
         "gaussians?": {"*": _tensor_of_finite},
         "selected": [_number(0, 10**7, whole=True), 10**6],
         "scaler": {"*": _tensor_of_finite},
-        "abstain?": _ABSTAIN,
         "*": object,
     },
     "*": object,
@@ -390,7 +387,7 @@ _SUMS = {
     "about?": {"*": object},
 }
 DETECTOR, SUMS, STATISTICS = (
-    "tactslip_torch detector 3",
+    "tactslip_torch detector 4",
     "tactslip_torch sums 2",
     "tactslip_torch statistics 4",
 )
@@ -454,7 +451,6 @@ SCHEMAS: Mapping[str, Wanted] = {
         "onnx_sha256": str,
         "detector_sha256": str,
         "calibration?": _CALIBRATION,
-        "abstain?": _ABSTAIN,
         "check": {"worst_sd": _number(0, 1e300), "*": object},
         "certificate?": {
             "holds": bool,

@@ -66,7 +66,6 @@ MISTAKES = {
     "train 'features.frames={SG: 51, PVDF: 11}}'": "'} too many'",
     "train 'seed=range(0,3)'": "-m",
     "train seed=first": "seed first whole",
-    "train coverage=95": "coverage 0 1 95",
     "train split.seen=M7": "M7 M1",
     "train ckpt_path=nowhere": "nowhere",
     "train --config-dir own +exp=odd": "recipe.us 'did you mean recipe.use?'",  # in its file

@@ -129,11 +129,8 @@ def test_a_fast_run_goes_all_the_way_and_caches_in_the_users_folder(tmp_path, mo
 
 
 def test_one_fold_per_material_leaves_a_folder_each(tiny, tmp_path):
-    _, metrics = run_train(tmp_path, *TINY_BY_FOLD, f"cache={tiny.cache}", "coverage=0.6")
+    _, metrics = run_train(tmp_path, *TINY_BY_FOLD, f"cache={tiny.cache}")
     folds, events = metrics["folds"], metrics["events"]
-    answers = metrics["answers"]["unseen"]["recordings"]  # pooled by recording
-    assert len(answers) == 3 * 4
-    assert {name.split("/", 1)[0] for name in answers} == set(folds)
     assert list(folds) == ["without_A", "without_B", "without_C"]
     for name, fold in folds.items():
         assert (tmp_path / name / "detector.pt").is_file()

@@ -10,11 +10,8 @@ from sklearn.metrics import confusion_matrix as oracle_confusion
 
 from tactslip_torch.model.calibration import reliability
 from tactslip_torch.report.metrics import (
-    answer_counts,
-    answer_metrics,
     bin_metrics,
     confusion_matrix,
-    covered_fractions,
     split_metrics,
     weights_at_share,
 )
@@ -87,8 +84,6 @@ FOUR = torch.tensor([True, False, True, True])
         (lambda: bin_metrics(FOUR, FOUR, ["a"] * 4, [2.0]), "speeds_mm_s must have one.*, 4, got"),
         (lambda: bin_metrics(FOUR, FOUR, "abcd", [2] * 4, ["s"]), "scenes must have one.*got 1"),
         (lambda: bin_metrics(FOUR, FOUR, "abcd", [2] * 4, None, []), "positions must have.*got 0"),
-        (lambda: answer_counts(FOUR, torch.ones(3)), "of one N"),
-        (lambda: answer_counts(FOUR, torch.tensor([1, 2, 0, 0])), "answers are -1, 0 or 1"),
         (lambda: weights_at_share(FOUR[2:], 0.5), "bins of slip and of non-slip"),
         (lambda: weights_at_share(FOUR, 0.0), "slip_share must lie between 0 and 1"),
     ],
@@ -96,43 +91,6 @@ FOUR = torch.tensor([True, False, True, True])
 def test_wrong_input_is_named(call, message):
     with pytest.raises(ValueError, match=message):
         call()
-
-
-# Prediction sets -------------------------------------------------------------------------------
-
-# truth by row (non-slip, slip), answer by column (abstains, non-slip, slip)
-RECORDINGS = {
-    "a/0": [[1, 3, 0], [2, 0, 2]],  # nothing wrong
-    "a/1": [[0, 1, 1], [0, 1, 9]],  # half of non-slip, a tenth of slip
-    "b/0": [[0, 0, 0], [1, 3, 0]],  # three quarters of slip; no non-slip
-}
-
-
-def test_coverage_is_a_mean_over_recordings_that_have_the_class():
-    found = answer_metrics(RECORDINGS, 0.8)
-    assert found == {
-        "coverage": 0.8,
-        "abstained": pytest.approx(4 / 24),
-        "decided_accuracy": pytest.approx((4 + 11) / 20),
-        "decided_balanced": pytest.approx((4 / 5 + 11 / 15) / 2),
-        "counts": [[1, 4, 1], [3, 4, 11]],
-        "recordings": RECORDINGS,
-        "slip": {
-            "coverage": pytest.approx((1 + 0.9 + 0.25) / 3),
-            "reached": pytest.approx(2 / 3),
-            "abstained": pytest.approx(3 / 18),
-            "num_recordings": 3,
-        },
-        "non_slip": {
-            "coverage": pytest.approx((1 + 0.5) / 2),
-            "reached": pytest.approx(1 / 2),
-            "abstained": pytest.approx(1 / 6),
-            "num_recordings": 2,
-        },
-    }
-    assert covered_fractions(torch.tensor(list(RECORDINGS.values())), 0).tolist() == [1.0, 0.5]
-    exactly = {str(i): [[0, 0, 0], [0, 1, 19]] for i in range(3)}
-    assert answer_metrics(exactly, 0.95)["slip"]["reached"] == 1
 
 
 # Weights ---------------------------------------------------------------------------------------

@@ -81,7 +81,7 @@ def test_sums_come_back_from_their_file(degree, tmp_path):
     again.merge(stats_of([BATCH], degree=degree))
     assert load_table(tmp_path / "sums.pt", FORMAT)[0]["degree"] == degree
     save_table(tmp_path / "other.pt", "tactslip_torch sums 1", {}, {})
-    with pytest.raises(ValueError, match=r"made by version 0\.1\.0 or earlier"):
+    with pytest.raises(ValueError, match=r"made by version 0\.2\.0 or earlier"):
         SufficientStats.load(tmp_path / "other.pt")
     with pytest.raises(FileNotFoundError):
         SufficientStats.load(tmp_path / "nothing.pt")

@@ -563,7 +563,7 @@ def test_what_could_not_be_tuned_is_refused_beforehand(small, values, changes, m
 @pytest.mark.slow
 def test_training_tunes_and_keeps_the_detectors_that_it_began_with(tmp_path):
     options = ("recipe=robust", "recipe.num_features=6", "recipe.group_by=cycle", "data.seed=0")
-    quick = ("baselines=false", "export=false", "cache=off", "coverage=null")
+    quick = ("baselines=false", "export=false", "cache=off")
     tuning = ("tuning=gradient", "tuning.bins=6", "tuning.steps=2", "tuning.learn=[penalty]")
     train(composed(*TINY, *options, *quick, *tuning), tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())

@@ -21,7 +21,7 @@ from tactslip_torch.onset.events import (
     recording_events,
 )
 from tactslip_torch.report import results
-from tactslip_torch.report.metrics import answer_metrics, bin_metrics, split_metrics
+from tactslip_torch.report.metrics import bin_metrics, split_metrics
 from tactslip_torch.report.onset import (
     REST,
     SLIP,
@@ -82,10 +82,6 @@ def events_of(quiet_s=60.0, compute_s=None):
 
 def no_events():
     return pooled_metrics([], num_resamples=50) | {"reason": REASON}
-
-
-RECORDINGS = {"a/0": [[1, 3, 0], [2, 0, 2]], "a/1": [[0, 1, 1], [0, 1, 9]]}
-ANSWERS = {"unseen": answer_metrics(RECORDINGS, 0.8), "test": answer_metrics({}, 0.8)}
 
 
 def stated(ece, count, **more):
@@ -178,16 +174,12 @@ def test_tuning_says_what_was_learned():
     assert results.tuning_tables(metrics_of()) == []
 
 
-def test_reliability_and_prediction_sets_have_a_row_for_each_role():
+def test_reliability_has_a_row_for_each_role():
     lines = results.reliability_table(metrics_of(alarm={"reliability": BY_ROLE})).splitlines()
     rows = [line.split() for line in lines[2:]]
     assert rows[0] == ["test", "all", "4000", "1.25", "2.50", "0.0625", "0.2500"]
     assert rows[1] == ["M1", "800", "2.00", "4.00", "0.0625", "0.2500"]
     assert [row[0] for row in rows[2:]] == ["unseen", "iron"]
-    lines = results.answers_table(metrics_of(answers=ANSWERS)).splitlines()
-    assert lines[2].split()[:4] == ["unseen", "15.00", "88.24", "85.83"]
-    assert set(lines[3].split()[1:-1]) == {"-"}
-    assert lines[4].startswith("asked: 80 % covered")
 
 
 def test_events_have_a_row_for_each_role_and_rule():
@@ -253,7 +245,6 @@ FIGURES = [
     (results.confusion_figure, {"splits": ABSENT}),
     (results.validation_figure, {"validation": [*CHOICES, RBF]}),
     (results.reliability_figure, {"alarm": {"reliability": BY_ROLE}}),
-    (results.answers_figure, {"answers": ANSWERS}),
     (results.events_figure, {"events": EVENTS}),
     (tuning_of, {}),
     (features_of, {}),
@@ -279,7 +270,6 @@ def test_results_have_a_table_and_a_figure_of_all_there_is(drawn, tmp_path, caps
     solve = {"method": "eigen", "rank": 7, "size": 9, "condition": 1.0, "error": 1e-16}
     everything = metrics_of(
         events={"test": {"two_of_three": events_of()}},
-        answers=ANSWERS,
         validation=CHOICES,
         solve=solve,
         timing_s={"features": 1.0},
@@ -288,11 +278,11 @@ def test_results_have_a_table_and_a_figure_of_all_there_is(drawn, tmp_path, caps
     results.write_results(tmp_path / "all", everything, features())
     results.print_results(everything, features())
     out = capsys.readouterr().out
-    for words in ("two of three", "asked: 80 %", "solved by eigen", "trained on materials A, B"):
+    for words in ("two of three", "solved by eigen", "trained on materials A, B"):
         assert words in out
     assert {path.name for path in (tmp_path / "all").iterdir()} == {
         *("metrics.json", "confusion.png", "selected_features.png", "events.png"),
-        *("answers.png", "validation.png"),
+        "validation.png",
     }
     kept = json.loads((tmp_path / "all" / "metrics.json").read_text())
     assert kept["splits"] == everything["splits"]
@@ -331,15 +321,15 @@ ALARMS = [{"alarm_s": 0.5, "onset_s": 0.43}, {"alarm_s": 1.25, "onset_s": 1.23}]
 
 
 def traces_of(films, view=(0.0, 1.4), num_decisions=130):
-    """Slip is decided from 0.5 to 1.2 s, 0.2 s of it not valid; from 0.9 to 1 s it abstains."""
+    """Slip is decided from 0.5 to 1.2 s, 0.2 s of it not valid."""
     times = np.round(0.07 + HOP_S * np.arange(num_decisions), 6)
     slip = (times >= 0.5) & (times < 1.2)
-    valid, abstains = (times < 0.6) | (times >= 0.8), (times >= 0.9) & (times < 1.0)
+    valid = (times < 0.6) | (times >= 0.8)
     names = [f"PVDF{i}" for i in range(1, 1 + len(films))]
     traces = Traces(names, RATE_HZ, HOP_S, view)
     traces.add_samples(films)
     score = np.where(times < 0.2, math.nan, 2.0 * slip)  # not before there is a floor
-    traces.add_decisions(times - 1e-9, 0.9 * slip + 0.05, slip, valid, abstains, score)
+    traces.add_decisions(times - 1e-9, 0.9 * slip + 0.05, slip, valid, score)
     return traces
 
 
@@ -384,7 +374,6 @@ def test_marks_stand_where_things_happened(draw):
         (1, f"truth {SLIP}"): [(0.42, 1.1)],
         (2, "onset"): [0.42],
         (2, "estimate"): [0.43, 1.23],
-        (2, "abstains"): [(0.9, 1.0)],
     }
     assert marks_of(figure) == {key: list(map(pytest.approx, of)) for key, of in expected.items()}
     (markers,) = [line for line in films.lines if line.get_marker() == "v"]
@@ -393,7 +382,7 @@ def test_marks_stand_where_things_happened(draw):
     np.testing.assert_allclose(chance.lines[0].get_ydata().max(), 0.95)
     assert chance.lines[0].get_drawstyle() == "steps-post"  # a decision holds until the next
     legend = {text.get_text() for text in figure.legends[0].get_texts()}
-    assert legend >= {"decided: slip", "onset, true", "not valid", "abstains"}
+    assert legend >= {"decided: slip", "onset, true", "not valid"}
 
 
 def test_an_onset_classifier_has_a_panel_with_its_threshold(draw):

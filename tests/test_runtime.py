@@ -246,7 +246,7 @@ def test_other_files_are_refused_and_nothing_in_them_is_executed(tmp_path):
     assert mark.exists(), "the trap is none"
     save_table(path, "test table 2", VALUES, tables())
     assert refusal(path) == f"{path} must be of format 'test table 1', got 'test table 2'"
-    with pytest.raises(ValueError, match=r"made by version 0\.1\.0 or earlier; make it"):
+    with pytest.raises(ValueError, match=r"made by version 0\.2\.0 or earlier; make it"):
         load_table(path, "test table 3")
     with pytest.raises(FileNotFoundError, match=r"no file at .*nowhere\.pt"):
         load_table(tmp_path / "nowhere.pt", FORM)

@@ -32,7 +32,7 @@ from tactslip_torch.live.rerun_log import RerunLog
 from tactslip_torch.live.sinks import Block, Sink
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import masked_names
-from tactslip_torch.onset.decisions import AlarmSettings, Decisions, answer_of
+from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.onset.events import (
     EventRules,
     LatencyParts,
@@ -145,8 +145,7 @@ def _detect_in(
     detector, config, hand = context.detector, context.config, context.detector.pool.hand
     rate, table = detector.pool.sample_rate_hz, context.folder / f"{name}_decisions.csv"
     given = hand_file(path, hand, rate, context.reading, context.units, config.tare_s)
-    header = (*Decisions._fields, "answer")
-    written = csv_writer(table, header) if config.decisions else nullcontext()
+    written = csv_writer(table, Decisions._fields) if config.decisions else nullcontext()
     with given as opened, written as write, ExitStack() as stack:
         samples, archived = opened.samples, opened.archived
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
@@ -177,13 +176,11 @@ def _detect_in(
             logs.append(stack.enter_context(rerun))
 
         def take(decisions: Decisions) -> None:
-            columns = decisions._asdict() | {"answer": answer_of(detector, decisions)}
-            of = {column: values.numpy() for column, values in columns.items()}
+            of = {column: values.numpy() for column, values in decisions._asdict().items()}
             times, is_valid, is_on = of["available_s"], of["is_valid"], of["is_on"]
             counts.add(times, of["llr"], is_valid, is_on, [asdict(a) for a in decisions.alarms])
             score = np.where(of["onset_score"] > NOTHING_YET, of["onset_score"], math.nan)
-            doubtful = of["answer"] < 0
-            traces.add_decisions(times, of["probability"], is_on, is_valid, doubtful, score)
+            traces.add_decisions(times, of["probability"], is_on, is_valid, score)
             for log in logs if len(decisions.number) else ():
                 log.decisions(decisions)
             if write:

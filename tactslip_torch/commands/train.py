@@ -46,7 +46,6 @@ from tactslip_torch.training.experiment import (
     write_tensorboard,
 )
 from tactslip_torch.training.learner import SlipLearner
-from tactslip_torch.training.plan import Abstaining
 from tactslip_torch.training.recipe import FeatureSelection, Recipe
 from tactslip_torch.training.tuning import Tuning
 
@@ -78,7 +77,6 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     maker = feature_maker(source, rule, **config.features)
     pool = maker.pool
     recipe.check_pool(len(pool.names))
-    abstaining = Abstaining(config.coverage, config.coverage_by)
     alarming: CalibratedAlarm | DebouncedAlarm | None
     alarming = instantiate(config.onset, _convert_="all") or None
     tuning: Tuning | None = instantiate(config.tuning, _convert_="all") or None
@@ -113,7 +111,6 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
                 pool,
                 maker.channel_filter,
                 recipe,
-                abstaining=abstaining,
                 with_baselines=config.baselines,
             )
             found: dict[str, Any] | None = None
@@ -238,7 +235,6 @@ def _settled(
         data.maker.channel_filter,
         recipe,
         selection=selection,
-        abstaining=first.abstaining,
         with_baselines=first.with_baselines,
     )
 

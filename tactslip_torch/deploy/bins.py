@@ -16,7 +16,7 @@ from tactslip_torch.deploy.value import BOOL, F64, Graph, Value
 from tactslip_torch.features.bank import Bank, Frame, Samples
 from tactslip_torch.features.ops import TINY
 from tactslip_torch.features.pool import LARGEST_SAMPLE
-from tactslip_torch.model.calibration import Abstention, Calibration, probability, widened_llr
+from tactslip_torch.model.calibration import Calibration, probability, widened_llr
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
 from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetEvidence
@@ -285,7 +285,7 @@ def _samples(windows: Value, detector: SlipDetector, frame: Frame) -> tuple[Samp
 def host_metadata(detector: SlipDetector, kind: str, precision: Precision) -> dict[str, Any]:
     """All that a host must know of a graph."""
     hand, info, raw = detector.pool.hand, detector.info, RawBin.of(detector)
-    calibrated, abstain = calibration_of(detector), Abstention.of(detector)
+    calibrated = calibration_of(detector)
     metadata = {
         "format": FORMAT,
         "version": __version__,
@@ -302,7 +302,6 @@ def host_metadata(detector: SlipDetector, kind: str, precision: Precision) -> di
         "slip_if_score_at_least": 0.0,
         "calibration": calibrated and calibrated[0].to_dict(),
         "slip_share": calibrated and calibrated[1],
-        "abstain": abstain and abstain.to_dict(),
         "experiment": info.get("experiment"),
         "train_materials": list(info.get("train_materials", ())),
         "simulated": info.get("simulated"),

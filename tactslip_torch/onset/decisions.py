@@ -2,8 +2,8 @@
 
 ``AlarmSettings`` are what makes alarms of scores, kept in the detector's file. ``score_stream``
 scores a whole recording, one bin every hop; ``Decider`` makes decisions and alarms of scores, piece
-by piece, for streams and whole recordings alike; ``answer_of`` is what a bin says alone;
-``stream_statistic`` is all of it with gradients, from raw volts to the statistic.
+by piece, for streams and whole recordings alike; ``stream_statistic`` is all of it with gradients,
+from raw volts to the statistic.
 """
 
 from __future__ import annotations
@@ -21,8 +21,6 @@ from torch import Tensor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import (
-    ABSTAIN,
-    Abstention,
     Calibration,
     calibration_from_dict,
     probability,
@@ -521,20 +519,6 @@ def is_usable(score: Tensor, is_missing: Tensor, needed_index: Tensor) -> Tensor
         - needed_index: ``[channels in use]``
     """
     return score.isfinite() & ~is_missing.index_select(-1, needed_index).all(-1)
-
-
-def answer_of(detector: SlipDetector, decisions: Decisions) -> Tensor:
-    """1 for slip, 0 for non-slip, -1 for none: the detector abstains.
-
-    By its thresholds, without any by the sign of the score. It abstains too where a sensor in
-    use is dead or broken: thresholds were set on recordings in which all were whole.
-
-    Shape:
-        - output: ``[*, m]`` as the decisions, int8
-    """
-    abstention = Abstention.of(detector) or Abstention(0.5, 0.0, 0.0)
-    given = abstention.answer(decisions.score)
-    return given.masked_fill(~decisions.is_valid, ABSTAIN)
 
 
 class StreamStatistic(NamedTuple):

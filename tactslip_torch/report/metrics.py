@@ -1,4 +1,4 @@
-"""Scores per bin of a split, of its groups and of prediction sets, in JSON-safe values."""
+"""Scores per bin of a split and of its groups, in JSON-safe values."""
 
 from __future__ import annotations
 
@@ -180,107 +180,6 @@ def merged_metrics(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         else:
             groups[kind] = {label: summed_metrics(of) for label, of in by_label.items()}
     return {**summed_metrics(scores), **groups}
-
-
-# Prediction sets ---------------------------------------------------------------------------------
-# A detector that may abstain answers with a set: slip, non-slip, or both. A set covers a bin unless
-# it is the other class. What was asked of its thresholds is a mean over recordings, so coverage is
-# counted by recording.
-Counts = Sequence[Sequence[int]]
-"""Bins of a recording by truth (non-slip, slip) and answer (abstains, non-slip, slip)."""
-
-CLASSES = ("non_slip", "slip")
-_ROUNDING = 1e-12  # of a fraction
-
-
-def answer_counts(is_slip: Tensor, answer: Tensor) -> list[list[int]]:
-    """Bins by truth and answer.
-
-    Args:
-        is_slip: the truth.
-        answer: 1 for slip, 0 for non-slip, -1 where the detector abstains.
-
-    Shape:
-        - is_slip (bool), answer: ``[N]``
-
-    Raises:
-        ValueError: if lengths differ or an answer is none of these.
-
-    Example:
-        >>> answer_counts(torch.tensor([True, True, False]), torch.tensor([1, -1, 0]))
-        [[0, 1, 0], [1, 0, 1]]
-    """
-    if is_slip.shape != answer.shape or is_slip.ndim != 1:
-        shapes = f"{tuple(is_slip.shape)} and {tuple(answer.shape)}"
-        raise ValueError(f"expected is_slip and answer [N] of one N, got {shapes}")
-    if len(answer) and not -1 <= int(answer.min()) <= int(answer.max()) <= 1:
-        raise ValueError(f"answers are -1, 0 or 1, got {answer.unique().tolist()}")
-    cells = torch.bincount(3 * is_slip.long() + answer.long() + 1, minlength=6)
-    counts: list[list[int]] = cells.view(2, 3).tolist()
-    return counts
-
-
-def answer_metrics(recordings: Mapping[str, Counts], coverage: float) -> dict[str, Any]:
-    """Scores of prediction sets: coverage by recording, how often it abstains, errors of the rest.
-
-    Returns ``coverage`` (as asked), ``abstained`` (fraction of all bins where the detector
-    abstains), ``decided_accuracy`` and ``decided_balanced`` (accuracies on the other bins),
-    ``counts`` (of all bins), ``recordings`` (the counts of each) and for each of ``CLASSES`` a
-    dict: ``coverage``, the mean over recordings of the fraction of bins whose truth is in the
-    answer; ``reached``, the fraction of recordings that have at least what was asked, which is not
-    guaranteed; ``abstained``, of its bins; ``num_recordings``, with bins of it. None where there
-    is nothing to divide by.
-
-    Args:
-        recordings: counts by name of the recording, as ``answer_counts`` has them.
-        coverage: that was asked for.
-    """
-    table = torch.tensor(list(recordings.values()), dtype=torch.int64).view(-1, 2, 3)
-    total = table.sum(0)
-    decided = total[:, 1:].double()
-    recalls = [_ratio(decided[c, c], decided[c].sum()) for c in (0, 1)]
-    scores: dict[str, Any] = {
-        "coverage": coverage,
-        "abstained": _ratio(total[:, 0].sum(), total.sum()),
-        "decided_accuracy": _ratio(decided.diagonal().sum(), decided.sum()),
-        "decided_balanced": _mean(recalls),
-        "counts": total.tolist(),
-    }
-    for index, name in enumerate(CLASSES):
-        covered = covered_fractions(table, index)
-        scores[name] = {
-            "coverage": _ratio(covered.sum(), len(covered)),
-            "reached": _ratio((covered >= coverage - _ROUNDING).sum(), len(covered)),
-            "abstained": _ratio(total[index, 0], total[index].sum()),
-            "num_recordings": len(covered),
-        }
-    return scores | {"recordings": {name: list(map(list, c)) for name, c in recordings.items()}}
-
-
-def covered_fractions(table: Tensor, truth: int) -> Tensor:
-    """Of recordings with bins of a class, the fraction of these whose truth is in the answer.
-
-    Shape:
-        - table: ``[R, 2, 3]``; output: at most ``[R]``, float64
-    """
-    own = table[:, truth].double()
-    own = own[own.sum(1) > 0]
-    return 1 - own[:, 2 - truth] / own.sum(1)  # the answer that is the other class
-
-
-def merged_answers(folds: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """``answer_metrics`` of several folds together, which were asked for one coverage.
-
-    A recording of several folds is one of each: ``recordings`` has it by fold and name.
-    """
-    if len(folds) == 1:
-        return dict(next(iter(folds.values())))
-    recordings = {
-        f"{fold}/{name}": counts
-        for fold, scores in folds.items()
-        for name, counts in scores["recordings"].items()
-    }
-    return answer_metrics(recordings, next(iter(folds.values()))["coverage"])
 
 
 def weights_at_share(is_slip: Tensor, slip_share: float) -> Tensor:

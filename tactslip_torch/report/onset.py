@@ -2,8 +2,8 @@
 
 The figure follows the paper's last one (section V-D): fast channels over time, blue where no slip
 is decided and yellow where slip is; below them the decided and the true status, and the probability
-of slip, behind which decisions are marked where the detector abstains. Everything stands at the
-time at which it was known, so the delay of a decision can be seen.
+of slip. Everything stands at the time at which it was known, so the delay of a decision can be
+seen.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ _WIDTH, _ROOM = 1.2, 40  # of marks, in points, as long as there are no more of 
 _INVALID: dict[str, Any] = {
     "facecolor": "none", "edgecolor": "#999999", "hatch": "////", "linewidth": 0, "zorder": 0.5,
 }  # fmt: skip
-_ABSTAINS: dict[str, Any] = {"facecolor": "#DDD6E8", "edgecolor": "none", "zorder": 0.2}
 _MOST_DELAYS = 12  # told beside their alarms
 _ONSET: dict[str, Any] = {"color": style.INK, "linestyle": "-."}
 _RELEASE: dict[str, Any] = {"color": style.GREY, "linestyle": ":"}
@@ -122,7 +121,7 @@ class Traces:
         self._first, self._stop = (round(edge * sample_rate_hz) for edge in view)
         length, num_decisions = self._stop - self._first, round((view[1] - view[0]) / hop_s)
         self._samples = Envelope(len(channels), length, _NUM_SEGMENTS)
-        self._decisions = Envelope(5, num_decisions, _NUM_SEGMENTS)
+        self._decisions = Envelope(4, num_decisions, _NUM_SEGMENTS)
         self._num_samples = 0
         self._first_s: float | None = None
 
@@ -138,7 +137,6 @@ class Traces:
         probability: Array,
         is_slip: Array,
         is_valid: Array,
-        abstains: Array,
         onset_score: Array,
     ) -> None:
         """Take the next decisions, each ``[m]``; without onset score it is not finite."""
@@ -147,7 +145,7 @@ class Traces:
         if self._first_s is None and is_seen.any():
             self._first_s = float(available_s[is_seen][0])
         # what is on anywhere stays seen
-        columns = (probability, is_slip, 1 - is_valid, abstains, onset_score)
+        columns = (probability, is_slip, 1 - is_valid, onset_score)
         self._decisions.add(np.stack(columns)[:, is_seen])
 
     def samples(self) -> tuple[NDArray[np.floating], Array]:
@@ -156,9 +154,9 @@ class Traces:
         return (self._first + numbers) / self._sample_rate_hz, values
 
     def decisions(self) -> tuple[NDArray[np.floating], Array]:
-        """Times in seconds, ``[M]``, and ``[5, M]``.
+        """Times in seconds, ``[M]``, and ``[4, M]``.
 
-        Probability, slip, not valid, abstaining and the onset score, NaN where there is none.
+        Probability, slip, not valid and the onset score, NaN where there is none.
         """
         numbers, values = self._decisions.points()
         return (self._first_s or 0.0) + numbers * self._hop_s, values
@@ -399,7 +397,7 @@ def onset_figure(
     onsets_s = [onset["onset_s"] for onset in onsets]
     first_s = [s for onset in onsets if (s := onset.get("first_release_s")) is not None]
     decided_s, (probability, *statuses, onset_score) = traces.decisions()
-    slips, invalid, doubtful = (_spans(decided_s, status, last) for status in statuses)
+    slips, invalid = (_spans(decided_s, status, last) for status in statuses)
     for axes in panels:
         _shade(axes, invalid, "invalid", **_INVALID)
     _draw_channels(panels[0], traces, slips)
@@ -409,7 +407,6 @@ def onset_figure(
     panels[2].plot(decided_s, probability, color=style.INK, linewidth=0.8, drawstyle="steps-post")
     panels[2].set(ylim=(-0.04, 1.04), yticks=[0, 0.5, 1])
     panels[2].set_ylabel("P(slip)")
-    _shade(panels[2], doubtful, "abstains", **_ABSTAINS)
     if onset_threshold is not None:
         panels[3].plot(decided_s, onset_score, color=style.INK, linewidth=0.8)
         panels[3].axhline(onset_threshold, color=style.ALARM, linewidth=0.8, linestyle="--")
@@ -434,7 +431,6 @@ def onset_figure(
     ]
     handles += [Line2D([], [], label="first release, true", **_RELEASE)] if first_s else []
     handles += [Line2D([], [], label="onset, true", **_ONSET)] if onsets_s else []
-    handles += [Patch(label="abstains", **_ABSTAINS)] if doubtful else []
     handles += [Patch(label="not valid", **_INVALID)] if invalid else []
     style.legend_below(figure, handles, len(handles))
     style.save(figure, path, dpi=120)

@@ -20,7 +20,6 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from tactslip_torch.report import published, style
-from tactslip_torch.report.metrics import CLASSES
 from tactslip_torch.runtime import write_json
 
 PAPER_LINE = f"paper: {published.PAPER}; real hand, random split over bins"
@@ -48,7 +47,7 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
     """Write ``metrics.json`` and the figures of a run into a folder.
 
     Results on several kinds of scenes also get ``confound.png``, those with events ``events.png``,
-    those of a detector that may abstain ``answers.png``, those that set an alarm ``alarm.png``
+    those that set an alarm ``alarm.png``
     and ``reliability.png``, those that chose a model ``validation.png``.
 
     Args:
@@ -65,7 +64,6 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
     for is_there, draw, name in (
         (_scene_rows(metrics), _confound_figure, "confound"),
         (_drawn_events(metrics), events_figure, "events"),
-        (metrics.get("answers"), answers_figure, "answers"),
         (alarm, alarm_figure, "alarm"),
         (alarm.get("reliability"), reliability_figure, "reliability"),
         (metrics.get("validation"), validation_figure, "validation"),
@@ -79,7 +77,6 @@ def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> N
     texts = [splits_table(metrics), *_trained_on_lines(metrics), materials_table(metrics)]
     for key, tables in (
         ("events", (events_table,)),
-        ("answers", (answers_table,)),
         ("alarm", (alarm_table, _scenes_table, reliability_table)),
     ):
         texts += [one(metrics) for one in tables if metrics.get(key)]
@@ -746,71 +743,6 @@ def reliability_figure(metrics: _Metrics, path: str | Path) -> None:
     errors.margins(x=0.15)
     errors.set_xlim(left=0)
     errors.set_xlabel("expected calibration error, %")
-    style.save(figure, path)
-
-
-# Prediction sets ---------------------------------------------------------------------------------
-_ANSWERS = {
-    "abstained": "abstains %",
-    "decided_accuracy": "of the others: right %",
-    "decided_balanced": "balanced %",
-}
-
-
-def answers_table(metrics: _Metrics) -> str:
-    """A row for each role: how often the detector abstains, how right the rest is, and coverage.
-
-    ``covered`` is the mean over recordings of the fraction of bins that are not answered with the
-    other class, ``reached`` the fraction of recordings that have what was asked in the mean.
-
-    Args:
-        metrics: the content of ``metrics.json``, with ``answers``.
-    """
-    answers = metrics["answers"]
-    rows: list[_Row] = []
-    for role, scores in answers.items():
-        row = {"prediction sets": role} | _percents(scores, _ANSWERS)
-        for name, said in (("slip", "slip"), ("non_slip", "non-slip")):
-            titles = {key: f"{said}: {key} %" for key in ("coverage", "reached", "abstained")}
-            row |= _percents(scores[name], titles)
-        rows.append(row | {"recordings": len(scores["recordings"])})
-    asked = sorted({scores["coverage"] for scores in answers.values()})
-    note = (
-        f"asked: {', '.join(f'{100 * coverage:g}' for coverage in asked)} % covered, of either "
-        "class in the mean over recordings of materials that were trained on; nothing is "
-        "guaranteed of others"
-    )
-    return style.marked(metrics["simulated"], style.table(rows), note)
-
-
-@style.styled
-def answers_figure(metrics: _Metrics, path: str | Path) -> None:
-    """Write how often each class is answered right, with "unsure", and wrong, by role, as a PNG.
-
-    Args:
-        metrics: the content of ``metrics.json``, with ``answers``.
-        path: the PNG to write, replaced as a whole if it exists.
-    """
-    answers: Mapping[str, Mapping[str, Any]] = metrics["answers"]
-    rows = [(role, truth) for role in answers for truth in (1, 0)]
-    title = 'Answers of a detector that may say "unsure"'
-    figure = style.new_figure(8.4, 1.7 + 0.5 * len(rows), title, simulated=metrics["simulated"])
-    axes = figure.subplots()
-    outcomes = {"right": style.GREEN, "unsure": "#BBBBBB", "wrong": style.ALARM}
-    for lane, (role, truth) in enumerate(rows):
-        unsure, *rest = answers[role]["counts"][truth]
-        scale = 100 / max(unsure + sum(rest), 1)
-        widths = [scale * count for count in (rest[truth], unsure, rest[1 - truth])]
-        style.stack(axes, lane, widths, outcomes.values())
-    asked: dict[str, Any] = {"color": style.INK, "ls": "--", "lw": 1}
-    for coverage in {scores["coverage"] for scores in answers.values()}:
-        axes.axvline(100 * coverage, **asked)
-    style.lanes(axes, [f"{role}, {CLASSES[truth].replace('_', '-')}" for role, truth in rows])
-    axes.grid(visible=False, axis="y")
-    axes.set(xlabel="bins of the class, %", xlim=(0, 100))
-    handles: list[Any] = [Patch(color=colour, label=label) for label, colour in outcomes.items()]
-    limit = "asked: wrong only right of this line"
-    style.legend_below(figure, [*handles, Line2D([], [], label=limit, **asked)], 4)
     style.save(figure, path)
 
 

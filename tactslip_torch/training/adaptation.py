@@ -33,8 +33,7 @@ from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.cache import cache_key
-from tactslip_torch.model.calibration import ABSTENTION as ABSTAIN
-from tactslip_torch.model.calibration import Abstention, fit_platt
+from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import (
     MOST_CONDITION,
@@ -791,9 +790,8 @@ def refitted(
     """A detector with another machine; features, scaling and filter stay.
 
     As training does it, but of the bins that are known: imputation values; the calibration, of
-    scores by machines without the bin's material, an alarm's too; thresholds for abstaining, by
-    machines without the recording or, as in training, the material. The latter go where they cannot
-    be told. An alarm keeps its threshold, which then stands for no rate.
+    scores by machines without the bin's material, an alarm's too. An alarm keeps its threshold,
+    which then stands for no rate.
 
     Args:
         detector: as it was; kept.
@@ -829,8 +827,6 @@ def refitted(
             info["calibration"] = calibration or info["calibration"]
         if ALARM in info:
             info[ALARM] = _alarm(info[ALARM], calibration)
-    if (abstention := Abstention.of(new)) is not None:
-        info[ABSTAIN] = _thresholds(bins, known, machine, abstention)
     return new
 
 
@@ -852,26 +848,6 @@ def _alarm(plain: Mapping[str, Any], calibration: Mapping[str, Any] | None) -> d
         "target_per_hour": None,
         "metadata": {**(plain.get("metadata") or {}), "adapted": adapted},
     }
-
-
-def _thresholds(
-    bins: TrainingBins, known: KnownBins, machine: Machine, kept: Abstention
-) -> dict[str, Any] | None:
-    """Conformal thresholds for the same coverage on the recordings that are known."""
-    left_out = "recording" if kept.metadata.get("left_out") == "recording" else "material"
-    metadata = dict(kept.metadata) | {
-        "left_out": left_out,
-        "adapted": "set anew on all recordings that are known, added ones included, each bin "
-        f"scored by a machine of the others without its {left_out}",
-    }
-    try:
-        groups = known.recording if left_out == "recording" else known.material
-        scores = _scores_without(groups, bins, machine)
-        found = Abstention.fit(scores, known.is_slip, known.recording, kept.coverage, metadata)
-    except ValueError as error:
-        log.warning("the detector abstains no more: %s", error)
-        return None
-    return found.to_dict()
 
 
 # Recordings of a source --------------------------------------------------------------------------

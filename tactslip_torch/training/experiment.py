@@ -36,7 +36,7 @@ from tactslip_torch.features.pooling import statistics_of
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.native import BackendName, backend_of
-from tactslip_torch.report.metrics import merged_answers, merged_metrics, summed_metrics
+from tactslip_torch.report.metrics import merged_metrics, summed_metrics
 from tactslip_torch.runtime import LEAD, Progress, check_choice
 from tactslip_torch.signals.filtering import Align, ChannelFilter, frame_lengths
 from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
@@ -47,21 +47,19 @@ from tactslip_torch.training.learner import event_numbers
 def merged_results(
     folds: Mapping[str, Mapping[str, Any]], *, by_fold: bool = False
 ) -> dict[str, Any]:
-    """Splits, baselines, events and answers of several tests as of one, by role.
+    """Splits, baselines and events of several tests as of one, by role.
 
     Args:
         folds: of each its ``metrics`` as ``SlipLearner`` has them, and ``recording_events``.
         by_fold: whether folds have the same bins, which then are not summed: results have each role
             of each fold, such as ``"protocol/unseen"``.
     """
-    splits, answers = defaultdict[str, list[Any]](list), defaultdict[str, dict[str, Any]](dict)
+    splits = defaultdict[str, list[Any]](list)
     baselines, events = (defaultdict[str, Any](lambda: defaultdict(list)) for _ in range(2))
     for fold, found in folds.items():
         before = f"{fold}/" if by_fold else ""
         for role, scores in found["splits"].items():
             splits[before + role].append(scores)
-        for role, own in found.get("answers", {}).items():
-            answers[before + role][fold] = own
         for name, about in found["baselines"].items():
             for role, scores in about["splits"].items():
                 baselines[name][before + role].append(scores)
@@ -77,7 +75,6 @@ def merged_results(
         "splits": {role: merged_metrics(scores) for role, scores in splits.items()},
         "baselines": summed if only is None else only,  # what they are is told of one fold alone
         "events": event_numbers(events),
-        "answers": {role: merged_answers(own) for role, own in answers.items()},
     }
 
 

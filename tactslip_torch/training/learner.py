@@ -44,7 +44,6 @@ from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool, is_rounding
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.statistics import TrainingStatistics
-from tactslip_torch.model.calibration import ABSTENTION, Abstention
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.events import (
     EventRules,
@@ -57,8 +56,6 @@ from tactslip_torch.onset.events import (
 )
 from tactslip_torch.own_files import CHECKPOINT, FORGED
 from tactslip_torch.report.metrics import (
-    answer_counts,
-    answer_metrics,
     bin_metrics,
     confusion_matrix,
     split_metrics,
@@ -66,7 +63,6 @@ from tactslip_torch.report.metrics import (
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import RecordingFeatures, SlipDataModule
 from tactslip_torch.training.plan import (
-    Abstaining,
     Plan,
     TrainingPass,
     plan_detector,
@@ -101,22 +97,18 @@ class EvaluatedBins(NamedTuple):
         says_slip: of the detector, ``[N]``, bool.
         baselines: decisions of baselines by name, ``[N]`` each.
         is_whole: whether these are all bins of the recording.
-        answer: slip, non-slip or none (``Abstention``), ``[N]``; None of a detector that
-            never abstains.
     """
 
     bins: RecordingFeatures
     says_slip: Tensor
     baselines: Mapping[str, Tensor]
     is_whole: bool
-    answer: Tensor | None = None
 
 
 def evaluated_bins(
     batch: RecordingFeatures,
     says_slip: Tensor,
     baselines: Mapping[str, Tensor],
-    answer: Tensor | None = None,
 ) -> dict[str, EvaluatedBins]:
     """Decisions ``[N]`` on the bins of a recording, for each role that some of them have."""
     light = batch._replace(features=batch.features[:, :0])
@@ -126,7 +118,6 @@ def evaluated_bins(
             says_slip[mask],
             {name: decisions[mask] for name, decisions in baselines.items()},
             bool(mask.all()),
-            None if answer is None else answer[mask],
         )
         for role, mask in batch.roles.items()
         if bool(mask.any())
@@ -236,15 +227,13 @@ class SlipLearner(L.LightningModule):
         channel_filter: of those bins, kept with the detector.
         recipe: how the machine is made.
         detector: a finished one, to be evaluated only.
-        abstaining: how thresholds for abstaining are set; by default none are.
         selection: features and ranges that were chosen elsewhere; by default the recipe finds them.
         with_baselines: fit baselines on the sample of training bins, to be evaluated beside.
 
     Attributes:
         detector: the result, after the second epoch.
         metadata: what the recipe found, such as the penalty.
-        metrics: ``{"splits": ..., "baselines": ..., "events": ...}`` after a test; ``"answers"`` of
-            a detector that may abstain.
+        metrics: ``{"splits": ..., "baselines": ..., "events": ...}`` after a test.
         events: what the test found in each recording, by role and rule; to be pooled with others.
         seconds: time of each stage of the fit.
         worker_seconds: what workers spent on each stage of making features, summed over them.
@@ -256,7 +245,6 @@ class SlipLearner(L.LightningModule):
         channel_filter: ChannelFilter,
         recipe: Recipe | None = None,
         detector: SlipDetector | None = None,
-        abstaining: Abstaining | None = None,
         selection: FeatureSelection | None = None,
         *,
         with_baselines: bool = True,
@@ -266,7 +254,6 @@ class SlipLearner(L.LightningModule):
         self.pool = pool
         self.channel_filter = channel_filter
         self.recipe = recipe or Recipe()
-        self.abstaining = abstaining or Abstaining()
         self.recipe.allowed(pool)  # refused before any work
         self._selection = selection
         self.detector = detector
@@ -384,9 +371,7 @@ class SlipLearner(L.LightningModule):
         scaled = self.detector.scaled(chosen.to(device))
         score = self.detector.head(scaled).cpu()
         baselines = self.baselines(batch.features, scaled.cpu()) if self.baselines else {}
-        abstention = Abstention.of(self.detector)
-        answer = abstention.answer(score) if abstention else None
-        for role, part in evaluated_bins(batch, score >= 0, baselines, answer).items():
+        for role, part in evaluated_bins(batch, score >= 0, baselines).items():
             self._evaluated[role].append(part)
 
     def on_test_epoch_end(self) -> None:
@@ -397,7 +382,7 @@ class SlipLearner(L.LightningModule):
         baselines = self.baselines.metadata() if self.baselines else {}
         for about in baselines.values():
             about["splits"] = {}
-        pool, abstention = self.detector.pool, Abstention.of(self.detector)
+        pool = self.detector.pool
         latency = LatencyParts(
             self.detector.look_ahead / pool.sample_rate_hz, pool.bin_samples / pool.sample_rate_hz
         )
@@ -412,14 +397,6 @@ class SlipLearner(L.LightningModule):
                 baselines[name]["splits"][role] = found
             self.metrics["splits"][role] = scores
             self.events[role] = events_by_rule(parts, latency)
-            if abstention:
-                counts = {
-                    str(part.bins.recording): answer_counts(part.bins.is_slip, part.answer)
-                    for part in parts
-                    if part.answer is not None
-                }
-                answers = answer_metrics(counts, abstention.coverage)
-                self.metrics.setdefault("answers", {})[role] = answers
             for name in ("accuracy", "balanced_accuracy"):
                 if scores[name] is not None:
                     self.log(f"{role}/{name}", scores[name], batch_size=1)
@@ -440,10 +417,10 @@ class SlipLearner(L.LightningModule):
 
     def _fingerprint(self) -> str:
         data: SlipDataModule = self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning's
-        return f"{data.fingerprint()} by {self.recipe}, {self.abstaining}"
+        return f"{data.fingerprint()} by {self.recipe}"
 
     def _planned(self) -> Plan:
-        plan = plan_detector(
+        return plan_detector(
             self.recipe,
             self._statistics,
             self.pool,
@@ -451,7 +428,6 @@ class SlipLearner(L.LightningModule):
             is_settled=self._selection is not None,
             show=True,
         )
-        return self.abstaining.settle(plan, self._statistics.sample.bins())
 
     def _solve(self, gathered: TrainingPass) -> None:
         started = time.perf_counter()
@@ -467,7 +443,7 @@ class SlipLearner(L.LightningModule):
         }
         solved = time.perf_counter()
         self.seconds["solve"] = solved - started
-        info = self.metadata | {"calibration": plan.calibration, ABSTENTION: plan.abstain}
+        info = self.metadata | {"calibration": plan.calibration}
         if self.with_baselines:
             sample = self._statistics.sample.bins()
             self.baselines = _from_first_process(

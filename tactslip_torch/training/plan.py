@@ -1,8 +1,8 @@
 """A plan: what is chosen before the second pass, and the machine that its training bins make.
 
 ``plan_detector`` decides from the statistics of the first pass; ``TrainingPass`` gathers the bins
-of the second in any order and solves; ``Abstaining`` sets the thresholds for abstaining. Features,
-K, degree, c and C are chosen by groups of recordings that are left out.
+of the second in any order and solves. Features, K, degree, c and C are chosen by groups of
+recordings that are left out.
 
 **Held** (``_choose_held``): features are ranked and scaled once; a held-out score is that of the
 machine refitted without the bin's group, in closed form (``HeldOut``). Ranking and scaling have
@@ -26,9 +26,9 @@ import itertools
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,7 +38,7 @@ from tactslip_torch.features.bin_sample import SampledBins, bin_keys
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.statistics import TrainingStatistics
-from tactslip_torch.model.calibration import Abstention, check_coverage, fit_platt
+from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Head, Kernel, Polynomial, kernel_from_dict
@@ -46,7 +46,7 @@ from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
-from tactslip_torch.runtime import SeenBatches, bar, check_choice, content_digest, for_each, steps
+from tactslip_torch.runtime import SeenBatches, bar, content_digest, for_each, steps
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.recipe import (
     FeatureSelection,
@@ -638,7 +638,6 @@ class Plan:
             evaluated.
         feature_filter: of a recipe that restricts the ranking: to what, how many features that
             leaves (``matching``), and the numbers chosen from after cutting them to it.
-        abstain: thresholds for abstaining, as ``Abstention.to_dict`` has them, if set.
         scene_weights: weight of a bin by scene, non-slip and slip, classes balanced; empty if
             scenes are not weighed.
     """
@@ -655,7 +654,6 @@ class Plan:
     validation: list[dict[str, Any]] = field(default_factory=list)
     nested: dict[str, Any] | None = None
     feature_filter: dict[str, Any] | None = None
-    abstain: dict[str, Any] | None = None
     scene_weights: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -928,66 +926,3 @@ def _dropped(recording: str, num: int, largest: float) -> Tensor:
     keys = bin_keys(f"{recording}, channels", num + 1)
     order = keys[1:].argsort()[: math.floor(float(keys[0]) * (math.floor(largest * num) + 1))]
     return torch.zeros(num, dtype=torch.bool).index_fill(0, order, True)
-
-
-# Abstention --------------------------------------------------------------------------------------
-
-LeftOut = Literal["recording", "group"]
-"""What the machine that scores a calibration bin was fitted without.
-
-``"recording"`` is what the guarantee is about: another recording of a material that was trained on.
-``"group"``, what validation leaves out, by default the material, is stricter: mistakes on unseen
-materials are counted. It is no guarantee for new ones: that would take materials as units, and for
-a coverage of 95 % 19 of them.
-"""
-
-
-@dataclass(frozen=True)
-class Abstaining:
-    """Whether and how thresholds for abstaining are set.
-
-    Calibration recordings are not set aside: each sampled bin is scored in closed form by the
-    machine that was fitted without its recording (``HeldOut``). Features, scaling, K, c and C are
-    the plan's, which saw all of them, and the detector itself is trained on the left-out recording
-    too, so the guarantee of ``Abstention`` holds as far as one recording of the training set
-    changes little; ``benchmarks.abstaining`` looks. A recording has the mean of its sampled bins,
-    which are drawn by a hash of the bin alone.
-
-    Args:
-        coverage: least mean fraction of a recording's bins of either class whose truth is in the
-            answer; None sets no thresholds, and the detector never abstains.
-        left_out: what the machine that scores a calibration bin was fitted without.
-
-    Raises:
-        ValueError: if these are no such values.
-    """
-
-    coverage: float | None = None
-    left_out: LeftOut = "recording"
-
-    def __post_init__(self) -> None:
-        if self.coverage is not None:
-            check_coverage(self.coverage)
-        check_choice("coverage_by", self.left_out, get_args(LeftOut))
-
-    def settle(self, plan: Plan, sample: SampledBins) -> Plan:
-        """The plan with thresholds; as it is, and with a warning, where there are too few."""
-        if self.coverage is None:
-            return plan
-        is_by_recording = self.left_out == "recording"
-        metadata = {
-            "unit": "recording",
-            "left_out": "recording" if is_by_recording else plan.recipe.group_by,
-            "how": "conformal risk control on closed-form held-out scores of sampled training bins",
-        }
-        groups = sample.recording if is_by_recording else sample.group
-        try:
-            held_out = HeldOut(plan.training_bins(sample), groups, plan.kernel)
-            scores = held_out.at(plan.penalty).scores
-            found = Abstention.fit(
-                scores, sample.is_slip, sample.recording, self.coverage, metadata
-            )
-        except ValueError as error:
-            log.warning("the detector never abstains: %s", error)
-            return plan
-        return replace(plan, abstain=found.to_dict())
