@@ -495,7 +495,7 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
                 layer = None
         scaler, head = self._selection.scaler, self._head
         return SlipDetector(
-            pool, features._filter, selected, scaler, head, self._info, None, None, layer,
+            pool, features._filter, selected, scaler, head, self._info, None, layer,
             backend=features.backend,
         )  # fmt: skip
 

@@ -372,7 +372,6 @@ _CHECKPOINT = {
         "bin_weight": _number(0, 1e300),
         "num_bins": _count,
         "imputation": _tensor_of_finite,
-        "gaussians?": {"*": _tensor_of_finite},
         "selected": [_number(0, 10**7, whole=True), 10**6],
         "scaler": {"*": _tensor_of_finite},
         "*": object,

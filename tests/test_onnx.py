@@ -16,9 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_detector import HAND, alarming_detector, raw_bins
 from streams import detector_of, onset_of, signal
-from test_dead_streams import alarming_with_gaussians
 from test_detector import VARIANTS, noise, random_detector
-from test_predictions import with_gaussians
+from test_predictions import with_imputation
 
 from tactslip_torch.deploy.bins import RawBin, Timing, bin_graph, described
 from tactslip_torch.deploy.check import (
@@ -33,7 +32,7 @@ from tactslip_torch.deploy.check import (
 from tactslip_torch.deploy.stream import onset_memory, onset_scores, stream_graph
 from tactslip_torch.deploy.value import F32, F64, I64, Graph
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.calibration import Isotonic, Platt, widened_llr
+from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
@@ -157,29 +156,14 @@ def broken_bins():
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("lost", [None, [2], [0, 3], [0, 1, 2, 3]], ids=str)
-def test_expected_scores_are_those_of_torch(precision, lost):
-    detector = with_gaussians()
+def test_scores_without_channels_are_those_of_torch(precision, lost):
+    detector = with_imputation()
     mask = None if lost is None else torch.zeros(4).bool().index_fill(0, torch.tensor(lost), True)
     spread = float(detector.predict_raw(raw_bins(24)).score.std())
     got = assert_scores(detector, precision, broken_bins(), mask, spread)
     if lost is not None and len(lost) == 4:
         assert not got["valid"].any()
         assert np.ptp(got["score"]) == 0  # nothing is known of any bin
-
-
-@pytest.mark.parametrize(
-    "calibration", [Platt(0.4, -0.2), Isotonic((-3.0, 0.0, 4), (-4.0, 0.5, 3))]
-)
-def test_probabilities_are_as_wide_as_the_scores_are_uncertain(calibration):
-    detector = with_gaussians()
-    detector.info["calibration"] = calibration.to_dict()
-    samples = broken_bins()
-    found = detector.predict_raw(samples)
-    wide = torch.sigmoid(widened_llr(calibration, found.score, found.variance)).numpy()
-    got = run_on(detector, "float64", samples)["probability"]
-    np.testing.assert_allclose(got, wide, atol=1e-9)
-    certain = torch.sigmoid(calibration.llr(found.score)).numpy()
-    assert (np.abs(got - 0.5) < np.abs(certain - 0.5) - 1e-6)[found.variance.numpy() > 0].any()
 
 
 # The file --------------------------------------------------------------------------------------
@@ -197,7 +181,7 @@ def operators(graph):
 
 
 def test_a_file_has_operators_of_onnx_alone_and_one_input(capfd):
-    model = bin_graph(with_gaussians()).model()
+    model = bin_graph(with_imputation()).model()
     assert [each.domain for each in model.opset_import] == [""]
     assert not SLOW.intersection(operators(model.graph))
     session = session_of(model)
@@ -343,9 +327,9 @@ def test_rounding_is_no_error_where_it_decides_a_score():
 
 @pytest.mark.parametrize("kind", ["bin", "stream"])
 @pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
-def test_a_model_of_other_gaussians_is_refused(kind, precision):
-    detector, other = alarming_with_gaussians(), alarming_with_gaussians()
-    other.gaussians.mean += 0.5
+def test_a_model_of_other_imputation_values_is_refused(kind, precision):
+    detector, other = alarming_detector(), alarming_detector()
+    other.imputation += 0.5
     right, wrong = (
         bin_graph(made_of, precision).model()
         if kind == "bin"

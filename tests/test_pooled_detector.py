@@ -94,7 +94,6 @@ def test_dead_channels_are_left_out_of_their_pools(detector, recording):
     columns = detector.columns(features, mask.expand(len(bins), -1))
     wanted = detector.head(detector.scaler(columns))
     torch.testing.assert_close(judged.score, wanted, rtol=1e-10, atol=1e-12)
-    assert (judged.variance == 0).all()
     assert not judged.is_valid.any()
     holed = bins.clone()
     holed[:, mask, 7] = torch.nan

@@ -11,7 +11,6 @@ from test_detector import noise, random_detector
 
 from tactslip_torch.deploy.check import EXTREMES, extreme_bins
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import ClassGaussians, expected_score
 
 BAD = [float("nan"), float("inf"), -float("inf"), 1e308]
 
@@ -26,27 +25,21 @@ def scaled_of(detector, samples):
     return detector.scaler(detector.pool(bins)[:, list(detector.selected)])
 
 
-def with_gaussians(**options):
-    """The small detector, with the Gaussians of some bins cut in two by their score."""
+def with_imputation(**options):
+    """The small detector, with imputation values that differ."""
     made = small_detector(**options)
-    z = scaled_of(made, raw_bins(200, 5))
-    gaussians = ClassGaussians.fit(z, made.head(z) >= 0)
-    return SlipDetector(*parts_of(made), made.head, made.info, gaussians=gaussians)
+    values = torch.linspace(-0.9, 0.9, len(made.selected), dtype=torch.float64)
+    return SlipDetector(*parts_of(made), made.head, made.info, imputation=values)
 
 
-@pytest.fixture(scope="module", params=["imputation", "gaussians"])
-def detector(request):
-    """With imputation values alone, and with Gaussians of the features."""
-    made = random_detector()
-    if request.param == "gaussians":
-        z = scaled_of(made, noise(100, seed=5))
-        made.gaussians = ClassGaussians.fit(z, made.head(z) >= 0)
-    return made
+@pytest.fixture(scope="module")
+def detector():
+    return random_detector()
 
 
 @pytest.fixture(scope="module")
 def small():
-    return with_gaussians()
+    return with_imputation()
 
 
 def used_channel(detector):
@@ -80,7 +73,6 @@ def test_a_missing_channel_gets_its_imputation_values(bad, detector):
 @pytest.mark.parametrize("num", [3, 30])
 @pytest.mark.parametrize("bad", [*BAD, "masked"])
 def test_a_channel_no_feature_needs_changes_nothing(bad, num, detector):
-    """Once an error of torch, of every detector with Gaussians: no bin to take the patterns of."""
     samples, unused = noise(num), unused_channel(detector)
     expected = detector.predict_raw(samples)
     if bad == "masked":
@@ -90,7 +82,6 @@ def test_a_channel_no_feature_needs_changes_nothing(bad, num, detector):
         samples[:, unused] = bad
         found = detector.predict_raw(samples)
     assert torch.equal(found.score, expected.score)
-    assert torch.equal(found.variance, torch.zeros_like(found.score))
     assert found.is_valid.all()
     assert found.is_missing.sum(-1).tolist() == [1] * num
 
@@ -161,10 +152,10 @@ def test_what_are_no_samples_of_this_hand_is_refused_in_words(samples, message, 
 
 
 @pytest.mark.parametrize("num", [1, 9, 40], ids="of {} bins".format)
-def test_a_masked_channel_leaves_the_expected_score_and_its_variance(num, small):
+def test_a_masked_channel_takes_its_imputation_values_whatever_it_says(num, small):
     samples, channel = raw_bins(num), int(small.channel_index[0])
-    is_lost = (small.channel_index == channel).expand(num, -1)
-    expected = expected_score(small.head, small.gaussians, scaled_of(small, samples), is_lost)
+    is_lost, z = small.channel_index == channel, scaled_of(small, samples)
+    expected = small.head(torch.where(is_lost, small.imputation, z))
     mask = torch.arange(len(HAND)) == channel
     broken = samples.clone()
     broken[:, channel] = torch.nan
@@ -176,34 +167,22 @@ def test_a_masked_channel_leaves_the_expected_score_and_its_variance(num, small)
         small.predict(bins, masked_channels=[name]),
         small.predict_raw(broken),
     ):
-        torch.testing.assert_close((found.score, found.variance), expected, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(found.score, expected, rtol=1e-9, atol=1e-9)
         assert torch.equal(found.is_missing, mask.expand(num, -1))
         assert not found.is_valid.any()
-    assert (found.variance > 0).all()
     alone = small.predict(bins[0], masked_channels=[name])  # without batch axes
-    assert alone.score.shape == alone.variance.shape == ()
+    assert alone.score.shape == ()
     torch.testing.assert_close(alone.score, found.score[0], rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["gaussians", "quadratic", "sum"])
-def test_the_file_holds_what_stands_in_for_a_channel(kind, small, tmp_path):
-    made = small
-    if kind != "gaussians":
-        made = small_detector(head=kind)
-        imputation = torch.linspace(-0.9, 0.9, 12, dtype=torch.float64)
-        made = SlipDetector(*parts_of(made), made.head, imputation=imputation)
+@pytest.mark.parametrize("kind", ["quadratic", "sum"])
+def test_the_file_holds_what_stands_in_for_a_channel(kind, tmp_path):
+    made = with_imputation(head=kind)
     made.save(tmp_path / "detector.pt")
     again, samples = SlipDetector.load(tmp_path / "detector.pt"), raw_bins(9)
     expected = made.predict_raw(samples, masked_channels=["PVDF1"])
     found = again.predict_raw(samples, masked_channels=["PVDF1"])
     torch.testing.assert_close(found, expected, rtol=0, atol=0)
-    assert bool(found.variance.any()) == (kind == "gaussians")
-    if kind == "gaussians":
-        single = copy.deepcopy(made).float()
-        assert torch.equal(single.gaussians.covariance, made.gaussians.covariance)
-        near = single.predict_raw(samples.float(), masked_channels=["PVDF1"])
-        assert near.variance.dtype == torch.float32
-        assert float((near.score - expected.score).abs().max()) < 1e-4 * expected.score.std()
 
 
 NO_CHANNELS = [
@@ -222,9 +201,9 @@ def test_what_is_no_channel_of_the_hand_is_refused_in_one_line(masked, said, sma
 SEED = 4  # of a detector that needs no SG1
 
 
-@pytest.fixture(scope="module", params=["imputation", "gaussians"])
-def either(request):
-    return {"imputation": small_detector, "gaussians": with_gaussians}[request.param](seed=SEED)
+@pytest.fixture(scope="module")
+def either():
+    return with_imputation(seed=SEED)
 
 
 def healthy_bins(either):
@@ -276,7 +255,7 @@ def test_gradients_are_those_of_backward(bins_of, either):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
 def test_a_detector_compiles():
-    either = with_gaussians(seed=SEED)
+    either = with_imputation(seed=SEED)
     torch.compiler.reset()
     compiled = torch.compile(either, backend="eager")
     bins = healthy_bins(either)

@@ -16,7 +16,7 @@ from tactslip_torch.deploy.value import BOOL, F64, Graph, Value
 from tactslip_torch.features.bank import Bank, Frame, Samples
 from tactslip_torch.features.ops import TINY
 from tactslip_torch.features.pool import LARGEST_SAMPLE
-from tactslip_torch.model.calibration import Calibration, probability, widened_llr
+from tactslip_torch.model.calibration import Calibration, probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
 from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetEvidence
@@ -143,21 +143,16 @@ class Scored(NamedTuple):
         score: ``[B]``, at least 0 is slip.
         is_valid: ``[B]``, bool: every channel in use can be trusted.
         is_usable: ``[B]``, bool: the score tells something (``onset.decisions.is_usable``).
-        variance: ``[B]``, float64, of the score; None: of none.
     """
 
     score: Value
     is_valid: Value
     is_usable: Value
-    variance: Value | None
 
     def llr(self, calibration: Calibration) -> Any:
-        """Log likelihood ratios ``[B]`` of finite scores, as wide as their variance asks for."""
+        """Log likelihood ratios ``[B]`` of finite scores."""
         score: Any = self.score
-        if self.variance is None:
-            return calibration.llr(score)
-        variance: Any = self.variance
-        return widened_llr(calibration, score, variance)
+        return calibration.llr(score)
 
 
 def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph:
@@ -209,10 +204,10 @@ def score_bins(windows: Value, detector: SlipDetector) -> Scored:
         - windows: ``[B, channels in use, RawBin.length]``, at least one bin
     """
     features, is_missing, is_trusted = described(windows, detector)
-    score, variance = scored(features, is_missing, detector, windows.dtype)
+    score = scored(features, is_missing, detector, windows.dtype)
     is_finite = score.isfinite()
     is_valid = is_trusted.all(1) & is_finite
-    return Scored(score, is_valid, is_finite & ~is_missing.all(1), variance)
+    return Scored(score, is_valid, is_finite & ~is_missing.all(1))
 
 
 def described(windows: Value, detector: SlipDetector) -> tuple[Value, Value, Value]:

@@ -30,7 +30,7 @@ from torch.nn.functional import pad
 
 from tactslip_torch.deploy.bins import Precision, RawBin, Timing
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.calibration import probability, widened_llr
+from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import Prediction, without
 from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
@@ -275,7 +275,7 @@ class _BinComparison(_Comparison):
         found = self.score_error(error, degenerate, what)
         if calibrated is not None:
             calibration, slip_share = calibrated
-            llr = widened_llr(calibration, torch.from_numpy(score), exact.variance.double())
+            llr = calibration.llr(torch.from_numpy(score))
             off = np.abs(got["probability"] - probability(llr, slip_share).numpy())
             _worst(off, WORST_PROBABILITY[self.precision], "", f"{what}: probability")
         return found

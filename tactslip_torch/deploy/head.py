@@ -8,15 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.deploy.value import F32, F64, I64, Value
+from tactslip_torch.deploy.value import F32, F64, Value
 from tactslip_torch.features.pooling import over_channels
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernels import Head, KernelSum, Polynomial, QuadraticForm
-from tactslip_torch.model.missing_channels import (
-    ClassGaussians,
-    added_by_missing,
-    score_of_mixture,
-)
+from tactslip_torch.model.kernels import Head, KernelSum, Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 
 _LARGEST = float(np.finfo(np.float64).max)
@@ -24,8 +19,8 @@ _LARGEST = float(np.finfo(np.float64).max)
 
 def scored(
     features: Value, is_missing: Value, detector: SlipDetector, dtype: np.dtype[Any]
-) -> tuple[Value, Value | None]:
-    """Scores, and their variance: None of a detector that knows of none.
+) -> Value:
+    """Scores; columns of missing channels take their imputation values.
 
     Args:
         features: of channels, float64; anything where missing.
@@ -35,18 +30,15 @@ def scored(
 
     Shape:
         - features: ``[B, M]``; is_missing: ``[B, channels in use]``
-        - scores: ``[B]``; variance: ``[B]``, float64
+        - output: ``[B]``
     """
-    head, gaussians = detector.head, detector.gaussians
     channels = detector.extractor.plan.channels
     z = scaled(_pooled(features, is_missing, detector), detector.scaler)
     # a column that is pooled is of no channel; a product is quicker than to pick flags
     of_channel = np.equal.outer(np.array(channels), detector.channel_index.numpy())
     is_lost = is_missing.cast(F32) @ of_channel > 0.0  # [B, K]
-    score = machine(is_lost.graph.where(is_lost, _float64(z, detector.imputation), z), head, dtype)
-    if gaussians is None or not isinstance(head, QuadraticForm):
-        return score, None
-    return _expected_scores(score, z, is_lost, head, gaussians)
+    z = z.graph.where(is_lost, _float64(z, detector.imputation), z)
+    return machine(z, detector.head, dtype)
 
 
 def _pooled(features: Value, is_missing: Value, detector: SlipDetector) -> Value:
@@ -123,81 +115,6 @@ def _kernel_sum(z: Value, head: KernelSum) -> Value:
         squares = (z * z).sum(1, keepdim=True) + norms - gram * 2.0
         values = (squares.clamp(min=0.0) * -kernel.gamma).exp()
     return (values @ head.beta[:, None].double()).squeeze(1)
-
-
-# Missing channels ------------------------------------------------------------------------------
-
-
-def _expected_scores(
-    score: Value, z: Value, is_lost: Value, head: QuadraticForm, gaussians: ClassGaussians
-) -> tuple[Value, Value]:
-    """Expected scores and variances (``model.missing_channels``); 0 of bins that miss nothing.
-
-    ONNX has no solver. The precision of the features is swept on those that are missing, one after
-    the other (``Scan``): a step is one term of rank one, so all of it is exact, of as many steps as
-    features are missing, and of the memory of one mask however many bins come. Bins that miss the
-    same as the one before share its matrices. Where nothing is missing, none of it is run.
-    """
-    graph, num = score.graph, head.num_features
-
-    def bin_by_bin() -> list[Value]:
-        rows = [graph.where(is_lost, 0.0, z), is_lost.cast(F64), score.cast(F64)]
-        no_mask = graph.constant([-1.0] * num, F64)  # no bin has it
-        zeros = graph.constant([0.0, 0.0], F64)
-        start = [no_mask, graph.constant(np.zeros((2, num, num)), F64), zeros, zeros, zeros]
-        shapes = [(num,), (2, num, num), (2,), (2,), (2,), (num,), (num,), ()]
-        _, (mean, variance) = graph.scan(one_bin, start, rows, shapes)
-        largest = float(np.finfo(score.dtype).max)
-        return [mean.clamp(-largest, largest).cast(score.dtype), variance]
-
-    def one_bin(before: list[Value], row: list[Value]) -> tuple[list[Value], list[Value]]:
-        own_z, own_lost, own_score = row
-
-        def missing() -> list[Value]:
-            is_same = (own_lost - before[0]).abs().amax(0) <= 0.0
-            mask = graph.if_(is_same, lambda: before, lambda: _swept(own_lost, head, gaussians))
-            of_mask: list[Any] = [mask[1:3], mask[3:]]
-            bins: list[Any] = [own_z.unsqueeze(0), own_lost > 0.0]  # [1, K] and [K]
-            found: list[Any] = list(score_of_mixture(head, gaussians, *bins, *of_mask))
-            return [*mask, *(each.squeeze(0) for each in found)]
-
-        def whole() -> list[Value]:
-            return [*before, own_score, graph.constant(0.0, F64)]
-
-        made = graph.if_(own_lost.amax(0) > 0.0, missing, whole)
-        return made[:-2], made[-2:]
-
-    is_any = is_lost.cast(I64).amax(1).amax(0) > 0
-    mean, variance = graph.if_(is_any, bin_by_bin, lambda: [score, score.cast(F64) * 0.0])
-    return mean, variance
-
-
-def _swept(is_lost: Value, head: QuadraticForm, gaussians: ClassGaussians) -> list[Value]:
-    """What a mask makes of both classes, behind the mask itself ``[K]``, 1 or 0.
-
-    The swept precision ``[2, K, K]``, the log determinant of the observed covariance ``[2]``, and
-    what the missing features add to the mean and to the variance of a score, ``[2]`` each.
-    """
-    graph, (precision, log_det_of_all) = is_lost.graph, gaussians.precision()
-    count = np.arange(head.num_features)
-    places = graph.op("NonZero", is_lost > 0.0, dtype=I64).squeeze(0)
-
-    def on_one(state: list[Value], row: list[Value]) -> tuple[list[Value], list[Value]]:
-        swept, log_det = state
-        unit = graph.constant(count, I64).eq(row[0]).cast(F64)  # [K]
-        column = graph.op("Gather", swept, row[0], axis=2)  # [2, K]
-        pivot = (column * unit).sum(1, keepdim=True)
-        away = column - unit
-        corner = unit.unsqueeze(1) * unit.unsqueeze(0) * 2.0
-        after = swept - (away / pivot).unsqueeze(2) * away.unsqueeze(1) - corner
-        return [after, log_det + pivot.log().squeeze(1)], []
-
-    start = [_float64(is_lost, precision), _float64(is_lost, -log_det_of_all)]
-    shapes = [(2, len(count), len(count)), (2,), ()]
-    (swept, log_det), _ = graph.scan(on_one, start, [places], shapes)
-    pair: list[Any] = [is_lost.unsqueeze(1) * is_lost, swept]
-    added: list[Any] = list(added_by_missing(head, *pair))
-    return [is_lost, swept, log_det, *added]
 
 
 def _float64(like: Value, x: Tensor) -> Value:

@@ -358,10 +358,6 @@ class Value:
         """Place of the first of the largest."""
         return self.graph.op("ArgMax", self, dtype=I64, axis=axis, keepdims=int(keepdim))
 
-    def softmax(self, axis: int) -> Value:
-        """Exponentials over their sum."""
-        return self.graph.op("Softmax", self, axis=axis)
-
     def gather(self, axis: int, index: Value) -> Value:
         """Entries along an axis, at places that were computed, as many axes as these have."""
         return self.graph.op("GatherElements", self, index, axis=axis)

@@ -204,32 +204,6 @@ def probability(llr: Tensor, slip_share: float) -> Tensor:
     return (llr + (math.log(slip_share) - math.log1p(-slip_share))).sigmoid()
 
 
-def widened_llr(calibration: Calibration, score: Tensor, variance: Tensor) -> Tensor:
-    """Log likelihood ratios of scores that are known up to a variance.
-
-    The mean of ``sigmoid(llr)`` over scores ``N(score, variance)`` is about ``sigmoid(llr / sqrt(1
-    + pi / 8 s^2))``, ``s`` being the standard deviation of llr; here half the difference of the
-    ratios one standard deviation above and below, which for ``Platt`` is exact. A variance of 0
-    leaves the ratio as it is.
-
-    Args:
-        calibration: from a score to its ratio.
-        score: expected.
-        variance: of the score.
-
-    Shape:
-        - score, variance, output: ``[*]``; dtype of ``score``
-
-    Reference:
-        MacKay (1992), Neural Computation 4(5), 720-736.
-    """
-    llr, wide = calibration.llr(score).double(), score.double()
-    # 0 gives way to what changes no ratio, and has a finite slope
-    away = variance.double().clamp(min=torch.finfo(torch.float64).tiny).sqrt()
-    spread = (calibration.llr(wide + away) - calibration.llr(wide - away)) / 2
-    return (llr / (spread * spread * (math.pi / 8) + 1.0).sqrt()).type_as(score)
-
-
 def reliability(
     probability: Tensor, is_slip: Tensor, num_cells: int = 15, weights: Tensor | None = None
 ) -> dict[str, Any]:

@@ -26,16 +26,14 @@ from tactslip_torch.features.ops import (
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.calibration import Calibration, calibration_from_dict, widened_llr
+from tactslip_torch.model.calibration import Calibration, calibration_from_dict
 from tactslip_torch.model.calibration import probability as stated
 from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_from_dict
 from tactslip_torch.model.missing_channels import (
     ChannelMask,
-    ClassGaussians,
     Nonfinite,
     Prediction,
     check_nonfinite,
-    missing_scores,
     predict_in_parts,
     without,
 )
@@ -68,8 +66,6 @@ class SlipDetector(nn.Module):
         head: the machine on scaled features.
         info: JSON-able facts about the training, kept in the file.
         imputation: scaled features in place of those of a missing channel, ``[K]``; default 0.
-        gaussians: of the scaled features; with them, what is missing leaves the expected score and
-            its variance (``expected_score``), instead of the score of ``imputation`` values.
         pooling: from the features that are read to the columns; ``None``: they are the columns.
         backend: what features are made by where no gradient is asked for (``FeaturePool``).
 
@@ -97,7 +93,6 @@ class SlipDetector(nn.Module):
         head: Head,
         info: Mapping[str, Any] | None = None,
         imputation: Tensor | None = None,
-        gaussians: ClassGaussians | None = None,
         pooling: ChannelPooling | None = None,
         *,
         backend: BackendName = "auto",
@@ -108,7 +103,7 @@ class SlipDetector(nn.Module):
         self.pool, self.channel_filter = pool, channel_filter
         self.extractor = pool.select(selected, backend)
         self.selected = self.extractor.selected
-        self.pooling, self.scaler, self.head, self.gaussians = pooling, scaler, head, gaussians
+        self.pooling, self.scaler, self.head = pooling, scaler, head
         self.info = dict(info or {})
         self._engine: _Engine | None = None
         self._check_parts(imputation)
@@ -209,8 +204,8 @@ class SlipDetector(nn.Module):
 
         Args:
             bins: in volts.
-            nonfinite: what to do about NaN and Inf. ``"mask"``: the channel counts as missing, the
-                score is the one expected without it, and not valid. ``"raise"``: refuse.
+            nonfinite: what to do about NaN and Inf. ``"mask"``: the channel counts as missing, its
+                columns take their imputation values, the score is not valid. ``"raise"``: refuse.
             given: dtype of the samples that the bins were filtered from, float32 or float64, by
                 default theirs; that of the score, and what a sensor must resolve to be trusted
                 (``FeaturePool.validity``: the raw samples are not known here).
@@ -269,7 +264,7 @@ class SlipDetector(nn.Module):
         x = torch.as_tensor(samples)
         is_filtered = x.ndim > 0 and x.shape[-1] == self.pool.bin_samples
         found = self.predict(x) if is_filtered else self.predict_raw(x)
-        return stated(widened_llr(known[0], found.score, found.variance), known[1])
+        return stated(known[0].llr(found.score), known[1])
 
     def predict_proba(self, samples: Tensor | NDArray[Any]) -> Tensor:
         """Probabilities of non-slip and slip, ``[*, 2]``; otherwise as ``probability``."""
@@ -371,18 +366,16 @@ class SlipDetector(nn.Module):
         if not is_whole:
             bins = torch.where(is_missing[..., None], 0.0, bins)
         scaled = self.scaled(self._features(bins), None if is_whole else is_missing)
-        score = saturating(self.head(scaled), given)
-        variance = torch.zeros_like(score)
         if not is_whole:
-            score, variance = self._without(score, scaled, is_missing)
+            scaled = torch.where(self._is_lost(is_missing), self.imputation, scaled)
+        score = saturating(self.head(scaled), given)
         is_valid = self._needed(is_alive & ~is_missing) & score.isfinite()
-        return Prediction(score, is_valid, is_missing, variance)
+        return Prediction(score, is_valid, is_missing)
 
-    def _without(self, score: Tensor, scaled: Tensor, is_missing: Tensor) -> tuple[Tensor, Tensor]:
-        """Scores ``[*]`` and variances where channels ``[*, C]`` are missing."""
+    def _is_lost(self, is_missing: Tensor) -> Tensor:
+        """Which columns ``[*, K]`` are of channels ``[*, C]`` that are missing."""
         pooled = torch.zeros_like(is_missing[..., :1])  # never lost: it is of the other channels
-        is_lost = torch.cat([is_missing, pooled], -1).index_select(-1, self.channel_index)
-        return missing_scores(self.head, self.gaussians, self.imputation, score, scaled, is_lost)
+        return torch.cat([is_missing, pooled], -1).index_select(-1, self.channel_index)
 
     def _engine_of(self, x: Tensor) -> _Engine | None:
         """The native engine of the whole detector, where only values are asked for."""
@@ -418,7 +411,7 @@ class SlipDetector(nn.Module):
 
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> SlipDetector:
         """``float()`` and ``to()``: what is known of features stays float64, as offsets cancel."""
-        modules = [m for m in (self.scaler, self.gaussians, self.pooling) if m is not None]
+        modules = [m for m in (self.scaler, self.pooling) if m is not None]
         exact = [(each, *part) for each in modules for part in each.named_buffers()]
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]  # torch has no annotations
         for module, name, value in exact:
@@ -453,10 +446,6 @@ class SlipDetector(nn.Module):
             raise ValueError(
                 f"imputation must be {num} scaled features in [-1, 1], got "
                 f"{tuple(imputation.shape)} of at most {float(imputation.abs().max()):g}"
-            )
-        if self.gaussians is not None and self.gaussians.num_features != num:
-            raise ValueError(
-                f"Gaussians of {self.gaussians.num_features} features do not fit {num} of them"
             )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -544,7 +533,6 @@ class SlipDetector(nn.Module):
             head,
             metadata["info"],
             state["imputation"],
-            ClassGaussians(**gaussians) if (gaussians := part("gaussians")) else None,
             pooling and ChannelPooling.from_dict(hand, pooling, part("pooling")),
             backend=backend,
         )
@@ -609,14 +597,15 @@ class _Engine:
     def predict(self, x: Tensor, is_raw: bool, given: torch.dtype) -> Prediction:
         """As ``SlipDetector._predict``."""
         flat, found, score = self._run(x, is_raw, given, self._inverse[given, is_raw])
-        is_valid, variance = found.is_valid & np.isfinite(score), np.zeros(len(score), score.dtype)
-        arrays = (score, is_valid, found.is_missing, variance)
+        arrays = (score, found.is_valid & np.isfinite(score), found.is_missing)
         parts = Prediction(*map(torch.from_numpy, arrays))
         if found.is_missing.any():
-            scaled = torch.from_numpy(found.scaled).to(self._of.imputation)
-            of_whole, of_lost = self._of._without(parts.score, scaled, parts.is_missing)
-            parts = parts._replace(score=of_whole, variance=of_lost)
-            parts = parts._replace(is_valid=parts.is_valid & of_whole.isfinite())
+            is_lost = self._of._is_lost(parts.is_missing)
+            rows = is_lost.any(-1)
+            scaled = torch.from_numpy(found.scaled).to(self._of.imputation)[rows]
+            filled = torch.where(is_lost[rows], self._of.imputation, scaled)
+            parts.score[rows] = saturating(self._of.head(filled), given)
+            parts.is_valid.logical_and_(parts.score.isfinite())
         for row in found.is_odd.nonzero()[0].tolist():
             one = torch.from_numpy(flat[row : row + 1])
             own = self._of._predict_by_torch(one, is_raw, given)

@@ -164,7 +164,7 @@ class BaselineDetector:
         is_missing = is_silent.new_zeros(samples.shape[:-1])
         is_missing[..., films] = is_silent
         is_valid = (is_alive & ~is_silent).all(-1)
-        return Prediction(score, is_valid, is_missing, torch.zeros_like(score))
+        return Prediction(score, is_valid, is_missing)
 
     @cached_property
     def _of_films(self) -> tuple[FeaturePool, ChannelFilter]:

@@ -24,7 +24,6 @@ from tactslip_torch.model.calibration import (
     Calibration,
     calibration_from_dict,
     probability,
-    widened_llr,
 )
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import Prediction
@@ -231,7 +230,7 @@ def score_stream(
         samples = samples.detach()
         if samples.shape[-1] < max(length, *(lengths[channel] for channel in used)):
             empty, none = samples.new_empty(0), samples.new_empty(0, len(samples)).bool()
-            return Prediction(empty, none[:, 0], none, empty)
+            return Prediction(empty, none[:, 0], none)
         whole = extended(detector.pool.widen(samples), detector.channel_filter, used)
         bins = whole.unfold(-1, length + 2 * detector.channel_filter.context, hop_samples)
         parts = [
@@ -376,7 +375,6 @@ class Decider:
         score: Tensor,
         is_valid: Tensor,
         is_usable: Tensor | None = None,
-        variance: Tensor | None = None,
     ) -> Decisions:
         """The next decisions.
 
@@ -385,7 +383,6 @@ class Decider:
             is_valid: whether every channel in use could be trusted; handed on.
             is_usable: whether the score tells anything (``is_usable``); where not, the evidence is
                 ``NEUTRAL``. By default ``is_valid``.
-            variance: of scores that are expected ones; evidence is the weaker for it. Default: 0.
 
         Shape:
             - all: ``[*, m]``; m may be 0, the streams ``*`` are always the same
@@ -397,10 +394,7 @@ class Decider:
             of_rule, none = start if like.ndim else start.tolist(), np.zeros(like.shape, np.int64)
             self._state = of_rule, [Latch()] * like.numel(), none
         of_rule, latches, run = self._state
-        if variance is None:
-            llr = settings.calibration.llr(score)
-        else:
-            llr = widened_llr(settings.calibration, score, variance)
+        llr = settings.calibration.llr(score)
         tells = is_valid if is_usable is None else is_usable
         ratios = llr.detach().numpy()
         ratios = np.where(tells.numpy() & np.isfinite(ratios), ratios, ratios.dtype.type(NEUTRAL))
@@ -509,9 +503,8 @@ class Decider:
 def is_usable(score: Tensor, is_missing: Tensor, needed_index: Tensor) -> Tensor:
     """Whether a score tells anything: it is finite, and some channel in use was there.
 
-    A hand that lost a sensor goes on feeling with the others: the score is the one expected without
-    it, the decision is flagged as not valid and still counts, the less the less certain the score
-    is. One that lost them all feels nothing.
+    A hand that lost a sensor goes on feeling with the others: the decision is flagged as not valid
+    and still counts. One that lost them all feels nothing.
 
     Shape:
         - score, output: ``[*]``
@@ -584,8 +577,8 @@ def stream_statistic(
     is_used[used] = True
     bins = bins.movedim(-3, -2)  # [*, m, C, n + context]
     bins = torch.where(is_used | bins.isfinite(), bins, 0.0)  # or 0 times NaN comes back
-    score, _, is_missing, variance = detector.predict_raw(bins, given=samples.dtype)
-    llr = widened_llr(settings.calibration, score, variance)
+    score, _, is_missing = detector.predict_raw(bins, given=samples.dtype)
+    llr = settings.calibration.llr(score)
     tells = is_usable(score, is_missing, detector.needed_index) & llr.isfinite()
     llr = torch.where(tells, llr, NEUTRAL)
     statistic, _ = settings.rule.scan(llr, settings.rule.start(llr[..., 0]))

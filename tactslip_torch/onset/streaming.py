@@ -289,11 +289,10 @@ class StreamingDetector:
             scores = detector.predict_raw(
                 windows, given=self.dtype, masked_channels=self._masked_channels or None
             )
-            tells, variance = scores.is_valid, None
+            tells = scores.is_valid
             if not tells.numpy().all():
                 tells = is_usable(scores.score, scores.is_missing, detector.needed_index)
-                variance = scores.variance
-            decisions = self._decider.decide(scores.score, scores.is_valid, tells, variance)
+            decisions = self._decider.decide(scores.score, scores.is_valid, tells)
         self._number += count
         self._drop()
         return decisions

@@ -43,7 +43,6 @@ from tactslip_torch.model.fit import (
     residuals_without,
 )
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
-from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.onset.decisions import KEY as ALARM
 from tactslip_torch.own_files import FORGED, load_table, save_table
@@ -804,10 +803,9 @@ def refitted(
     scale = statistics.sums.class_scale(machine.balance)
     weights = scale[known.is_slip.long()] * known.sample_weight
     bins = TrainingBins(known.z, known.is_slip, weights)
-    gaussians = ClassGaussians.fit(bins.features, bins.is_slip, weights)
-    new.imputation.copy_(gaussians.mean.mean(0))  # both classes counting alike
-    if new.gaussians is not None:
-        new.gaussians = gaussians
+    z, is_slip = bins.features.double(), bins.is_slip
+    means = [weights[own] @ z[own] / weights[own].sum() for own in (is_slip, ~is_slip)]
+    new.imputation.copy_((means[0] + means[1]) / 2)  # both classes counting alike
     info, taken_in = new.info, statistics.sums.seen_batches
     info["solve"] = solve_metadata(solved.head)
     info["num_bins"] = int(statistics.sums.count.sum())

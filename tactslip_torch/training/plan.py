@@ -42,7 +42,6 @@ from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Head, Kernel, Polynomial, kernel_from_dict
-from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
@@ -75,9 +74,6 @@ fold, so its cost grows with the bins."""
 MOST_EXTENSIONS = 3
 """Decades by which a grid of penalties that ends at its edge is extended, at either end."""
 _SCALED_BINS = 256  # at a time, which fits the cache of a processor
-MOST_GAUSSIAN = 256
-"""So many features at most have the expected score where channels are missing: its matrices are of
-their number squared."""
 MOST_KEPT_BINS = 8192
 """So many bins at most for a kernel that does not fold: its machine is a matrix of bins by bins."""
 
@@ -630,7 +626,6 @@ class Plan:
         num_bins: how many bins are trained on; about, where fractions are below 1.
         imputation: mean of the scaled features, both classes counting alike; for channels that are
             missing.
-        gaussians: of the scaled features, for channels that are missing; of a kernel that folds.
         validation: one row per choice: what was chosen from, the balanced accuracy of each
             held-out group; of the one that was taken also ``chosen``, and the calibration of its
             held-out scores.
@@ -650,7 +645,6 @@ class Plan:
     bin_weight: float
     num_bins: int
     imputation: Tensor
-    gaussians: ClassGaussians | None = None
     validation: list[dict[str, Any]] = field(default_factory=list)
     nested: dict[str, Any] | None = None
     feature_filter: dict[str, Any] | None = None
@@ -709,7 +703,6 @@ class Plan:
             head,
             info,
             self.imputation,
-            self.gaussians,
             selection.pooling,
             backend=backend or pool.backend,
         )
@@ -723,7 +716,6 @@ class Plan:
             "scaler": dict(self.selection.scaler.state_dict()),
             "pooling": pooling and (pooling.to_dict(), dict(pooling.state_dict())),
             "kernel": self.kernel.to_dict(),
-            "gaussians": self.gaussians and dict(self.gaussians.state_dict()),
         }
 
     @classmethod
@@ -734,7 +726,6 @@ class Plan:
         pooling = values.pop("pooling")
         pooling = pooling and ChannelPooling.from_dict(pool.hand, *pooling)
         values["kernel"] = kernel_from_dict(values["kernel"])
-        values["gaussians"] = values["gaussians"] and ClassGaussians(**values["gaussians"])
         return cls(recipe, FeatureSelection(tuple(selected), scaler, pooling), **values)
 
 
@@ -770,11 +761,10 @@ def plan_detector(
     allowed = None if pool is None else recipe.allowed(pool)
     fractions, bin_weight = class_fractions(recipe, sample), 1.0
     num_bins = number_of_bins(recipe, sample)
-    nested, most_gaussian = None, math.inf
+    nested = None
     if recipe.validation == "nested" and selection is None:
         if pool is None and set(recipe.uses) != {"channel"}:
             raise ValueError("recipe.use=pooled needs the pool of features; hand it over as pool=")
-        most_gaussian = MOST_GAUSSIAN
         if len(sample_groups(sample)[1]) > 1:
             choice = choose_model(recipe, pool, sample, is_nested=is_nested, show=show)
             structure, penalty = choice.structure, choice.penalty
@@ -808,9 +798,6 @@ def plan_detector(
     means = [
         weights[own] @ z[own] / weights[own].sum() for own in (sample.is_slip, ~sample.is_slip)
     ]
-    gaussians = None
-    if kernel.collapses and selection.pooling is None and selection.size <= most_gaussian:
-        gaussians = ClassGaussians.fit(z, sample.is_slip, weights)
     feature_filter = None
     if recipe.feature_filter is not None and allowed is not None:
         matching = int(allowed.sum())
@@ -828,7 +815,6 @@ def plan_detector(
         bin_weight=bin_weight,
         num_bins=num_bins,
         imputation=(means[0] + means[1]) / 2,
-        gaussians=gaussians,
         validation=rows,
         nested=nested,
         feature_filter=feature_filter,
