@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from tactslip_torch.hand import Channel as Channel
     from tactslip_torch.hand import HandLayout as HandLayout
     from tactslip_torch.model.detector import SlipDetector as SlipDetector
-    from tactslip_torch.model.missing_channels import Prediction as Prediction
     from tactslip_torch.model.moments import SufficientStats as SufficientStats
+    from tactslip_torch.model.prediction import Prediction as Prediction
     from tactslip_torch.onset.decisions import AlarmSettings as AlarmSettings
     from tactslip_torch.onset.streaming import StreamingDetector as StreamingDetector
     from tactslip_torch.pretrained import sample_recording as sample_recording
@@ -27,7 +27,7 @@ _MODULES = {
     "FeatureName": "features.names",
     "FeaturePool": "features.pool",
     "HandLayout": "hand",
-    "Prediction": "model.missing_channels",
+    "Prediction": "model.prediction",
     "Recording": "data.recording",
     "Scene": "simulation",
     "SlipClassifier": "estimators",

@@ -328,6 +328,14 @@ _ONSET = {
     "constant": _finite,
     "threshold": _threshold,
     "lead_s": _number(-1e6, 1e6),
+    "least_rms": [[_number(0, 1e300), 64], MOST_CHANNELS],
+    "min_alive": _number(1, MOST_CHANNELS, whole=True),
+}
+_SENSING = {
+    "rest_span": [_number(0, 1e300), MOST_CHANNELS],
+    "most_span": [_either(_number(0, 1e300), _one_of(None)), MOST_CHANNELS],
+    "min_alive": _number(1, MOST_CHANNELS, whole=True),
+    "stuck_samples": _count,
 }
 _ALARM = {
     "hop_samples": _number(1, 10**7, whole=True),
@@ -338,6 +346,7 @@ _ALARM = {
     "slip_share": _share,
     "rearm_s": _seconds,
     "refractory_s": _seconds,
+    "hold_s": _seconds,
     "lead_s": _number(-1e6, 1e6),
     "metadata": {"*": object},
     "onset?": _ONSET,
@@ -390,7 +399,7 @@ DETECTOR, SUMS, STATISTICS = (
     "tactslip_torch sums 2",
     "tactslip_torch statistics 4",
 )
-SIDECAR = "tactslip_torch onnx 1"
+SIDECAR = "tactslip_torch onnx 2"
 SCHEMAS: Mapping[str, Wanted] = {
     DETECTOR: {
         "channels": _CHANNELS,
@@ -402,6 +411,7 @@ SCHEMAS: Mapping[str, Wanted] = {
         "selected": [_number(0, 10**7, whole=True), 10**6],
         "pooling?": {"names": [[str, 8], 10**6]},
         "kernel?": _KERNEL,
+        "sensing": _SENSING,
         "info": _INFO,
     },
     SUMS: {**_SUMS, "batches": {"*": str}},

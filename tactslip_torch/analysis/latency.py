@@ -483,9 +483,7 @@ def _layers(pool: FeaturePool, statistics: Sequence[str]) -> Iterator[ChannelPoo
     for number in (8, 60, 240):
         some = _spread(names, max(number, len(pool.hand.kinds)))
         families = {(n.channel, n.component, n.domain, n.descriptor) for n in some}
-        used = {name.channel for name in some}
-        zeros = torch.zeros(len(some)), torch.zeros(len(used))
-        yield ChannelPooling(pool.hand, some, torch.ones(len(families)), *zeros)
+        yield ChannelPooling(pool.hand, some, torch.ones(len(families)), torch.zeros(len(some)))
 
 
 def _designs(needed: Sequence[set[Part]], sizes: Sequence[int]) -> Iterator[list[int]]:

@@ -9,6 +9,7 @@ are done all the same; the exit status is 2 then.
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 import time
 from collections.abc import Callable
@@ -31,7 +32,7 @@ from tactslip_torch.live.mcap_log import McapLog
 from tactslip_torch.live.rerun_log import RerunLog
 from tactslip_torch.live.sinks import Block, Sink
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import masked_names
+from tactslip_torch.model.prediction import masked_names
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.onset.events import (
     EventRules,
@@ -57,6 +58,8 @@ from tactslip_torch.report.onset import (
 )
 from tactslip_torch.report.style import csv_writer
 from tactslip_torch.runtime import plain, steps
+
+log = logging.getLogger(__name__)
 
 FORMAT = "tactslip_torch onsets 1"
 _PIECE_S = 1.0
@@ -145,7 +148,8 @@ def _detect_in(
     detector, config, hand = context.detector, context.config, context.detector.pool.hand
     rate, table = detector.pool.sample_rate_hz, context.folder / f"{name}_decisions.csv"
     given = hand_file(path, hand, rate, context.reading, context.units, config.tare_s)
-    written = csv_writer(table, Decisions._fields) if config.decisions else nullcontext()
+    columns = Decisions._fields[:-1]
+    written = csv_writer(table, columns) if config.decisions else nullcontext()
     with given as opened, written as write, ExitStack() as stack:
         samples, archived = opened.samples, opened.archived
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
@@ -159,6 +163,7 @@ def _detect_in(
         truth = archived.recording if archived else None
         counts = DecisionCounts(first_releases(truth.onsets_s, truth.released_s) if truth else ())
         logs: list[Sink] = []
+        events: list[dict[str, Any]] = []
         if config.mcap:
             mcap = McapLog(
                 context.folder / f"{name}.mcap",
@@ -176,15 +181,22 @@ def _detect_in(
             logs.append(stack.enter_context(rerun))
 
         def take(decisions: Decisions) -> None:
-            of = {column: values.numpy() for column, values in decisions._asdict().items()}
+            of = {column: getattr(decisions, column).numpy() for column in columns}
             times, is_valid, is_on = of["available_s"], of["is_valid"], of["is_on"]
-            counts.add(times, of["llr"], is_valid, is_on, [asdict(a) for a in decisions.alarms])
+            alarms = [
+                {name: _cell(value) for name, value in asdict(alarm).items()}
+                for alarm in decisions.alarms
+            ]
+            counts.add(times, of["llr"], is_valid, is_on, alarms)
             score = np.where(of["onset_score"] > NOTHING_YET, of["onset_score"], math.nan)
             traces.add_decisions(times, of["probability"], is_on, is_valid, score)
             for log in logs if len(decisions.number) else ():
                 log.decisions(decisions)
             if write:
-                write(zip(*(values.tolist() for values in of.values()), strict=True))
+                lost = [" ".join(decisions.names_lost(i)) for i in range(len(times))]
+                told = of | {"channels_lost": np.array(lost, object)}
+                write(zip(*(map(_cell, values.tolist()) for values in told.values()), strict=True))
+            events.extend(event._asdict() for event in stream.take_events())
 
         for first, piece in enumerate(pieces(samples, context.piece_samples)):
             traces.add_samples(piece.numpy())
@@ -196,15 +208,24 @@ def _detect_in(
         if not counts.num_decisions:
             raise ValueError(f"{path} has {samples.num_samples} samples, too few for a decision")
     entry["decisions"] = {"number": counts.num_decisions, "invalid": counts.num_invalid}
-    entry["alarms"], entry["truth"], events = counts.alarms, None, None
+    entry["alarms"], entry["truth"], entry["events"], known = counts.alarms, None, events, None
+    for event in events:
+        log.warning("%s, %.3f s: %s", name, event["time_s"], event["text"])
     if archived and archived.recording.has_truth:
-        entry, events = _with_truth(entry, archived.recording, counts, stream)
+        entry, known = _with_truth(entry, archived.recording, counts, stream)
     if config.figure:
         title = onsets_title(entry, of_simulated=bool(detector.info.get("simulated")))
         place, onset = context.folder / f"{name}_onsets.png", context.settings.onset
         threshold = None if onset is None else onset.threshold
         onset_figure(traces, entry, place, onset_threshold=threshold, title=title)
-    return entry, events
+    return entry, known
+
+
+def _cell(value: Any) -> Any:
+    """What stands in a cell or in JSON: nothing for NaN, names of channels as one text."""
+    if isinstance(value, tuple):
+        return " ".join(value)
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _with_truth(

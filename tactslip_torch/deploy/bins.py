@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -12,11 +13,15 @@ import numpy as np
 import torch
 
 from tactslip_torch.deploy.head import scored
-from tactslip_torch.deploy.value import BOOL, F64, Graph, Value
+from tactslip_torch.deploy.value import BOOL, F32, F64, Graph, Value
 from tactslip_torch.features.bank import Bank, Frame, Samples
 from tactslip_torch.features.ops import TINY
-from tactslip_torch.features.pool import LARGEST_SAMPLE
-from tactslip_torch.model.calibration import Calibration, probability
+from tactslip_torch.features.sensing import (
+    FEWEST_SAMPLES,
+    LARGEST_SAMPLE,
+    is_enough,
+)
+from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
 from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetEvidence
@@ -70,8 +75,8 @@ class RawBin:
         return self.before + self.bin + self.after
 
 
-SAID_OF_BIN = ("score", "probability", "statistic", "valid", "onset_s")
-"""What is kept of the last bin for decisions with an onset classifier."""
+SAID_OF_BIN = ("score", "probability", "statistic", "valid", "in_range", "onset_s")
+"""What is kept of the last bin for decisions with an onset classifier; lost channels behind it."""
 
 
 @dataclass(frozen=True)
@@ -101,13 +106,14 @@ class Timing:
         """That of a detector with these settings."""
         raw = RawBin.of(detector)
         frame = max(detector.channel_filter.window_lengths[i] for i in raw.channels)
-        size = 6 + len(rule_start(settings.rule))
+        num_channels = len(detector.pool.hand)
+        size = 7 + 2 * num_channels + len(rule_start(settings.rule))
         times = settings.hop_samples, raw.bin + raw.after, frame
         if settings.onset is None:
             return cls(raw, *times, raw.length - 1, size)
         evidence = settings.onset.evidence
         tail = max(raw.length, evidence.context + evidence.hop_samples) - 1
-        size += len(SAID_OF_BIN) + memory_size(evidence)
+        size += 1 + len(SAID_OF_BIN) + num_channels + memory_size(evidence)
         return cls(raw, *times, tail, size, evidence.hop_samples)
 
     def decisions(self, num: int) -> int:
@@ -118,8 +124,8 @@ class Timing:
 
 
 def memory_size(evidence: OnsetEvidence) -> int:
-    """Numbers that are kept: scores of hops, half the log power and the means of blocks."""
-    return MEAN_HOPS - 1 + sum(rows * width for rows, width in memory_shapes(evidence))
+    """Numbers that are kept: lost and known blocks, scores, half the log power and the means."""
+    return 2 + MEAN_HOPS - 1 + sum(rows * width for rows, width in memory_shapes(evidence))
 
 
 def memory_shapes(evidence: OnsetEvidence) -> list[tuple[int, int]]:
@@ -140,19 +146,16 @@ class Scored(NamedTuple):
     """What a graph makes of ``B`` bins.
 
     Attributes:
-        score: ``[B]``, at least 0 is slip.
-        is_valid: ``[B]``, bool: every channel in use can be trusted.
-        is_usable: ``[B]``, bool: the score tells something (``onset.decisions.is_usable``).
+        score: ``[B]``, at least 0 is slip; NaN where not valid.
+        is_valid: ``[B]``, bool: enough channels are alive, and the score is finite.
+        in_range: ``[B]``, bool: and they move about as much as in training.
+        channels_lost: ``[B, C]``, bool, of all channels of the hand.
     """
 
     score: Value
     is_valid: Value
-    is_usable: Value
-
-    def llr(self, calibration: Calibration) -> Any:
-        """Log likelihood ratios ``[B]`` of finite scores."""
-        score: Any = self.score
-        return calibration.llr(score)
+    in_range: Value
+    channels_lost: Value
 
 
 def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph:
@@ -164,7 +167,8 @@ def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph
 
     Shape:
         - in ``samples``: ``[batch, C, RawBin.length]``, volts
-        - out ``score``, ``valid`` (bool) and, if calibrated, ``probability``: ``[batch]``
+        - out ``score``, ``valid`` and ``in_range`` (bool) and, if calibrated, ``probability``:
+          ``[batch]``; ``channels_lost`` (bool): ``[batch, C]``
 
     Raises:
         ValueError: for another precision.
@@ -173,23 +177,28 @@ def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph
     num_channels = len(detector.pool.hand)
     samples = graph.input("samples", dtype, ("batch", num_channels, raw.length))
     calibrated = calibration_of(detector)
-    outputs: dict[str, np.dtype[Any]] = {"score": dtype, "valid": BOOL}
+    outputs = dict(zip(Scored._fields, (dtype, BOOL, BOOL, BOOL), strict=True))
     if calibrated is not None:
         outputs["probability"] = dtype
 
     def scores() -> list[Value]:
         found = score_bins(samples.take(raw.channels, 1), detector)
         if calibrated is None:
-            return [found.score, found.is_valid]
-        stated: Any = probability(found.llr(calibrated[0]), calibrated[1])
-        return [found.score, found.is_valid, stated]
+            return list(found)
+        known: Any = graph.where(found.is_valid, found.score, 0.0)
+        stated: Any = probability(calibrated[0].llr(known), calibrated[1])
+        return [*found, graph.where(found.is_valid, stated, math.nan)]
 
     def nothing() -> list[Value]:  # onnxruntime reduces and reshapes no empty batch
-        return [graph.constant([], kind) for kind in outputs.values()]
+        shapes = {"channels_lost": (0, num_channels)}
+        return [
+            graph.constant(np.zeros(shapes.get(name, 0)), kind) for name, kind in outputs.items()
+        ]
 
     made = graph.if_(samples.length(0).squeeze(0) > 0, scores, nothing)
     for name, value in zip(outputs, made, strict=True):
-        graph.output(name, value, ("batch",))
+        shape = ("batch", num_channels) if name == "channels_lost" else ("batch",)
+        graph.output({"is_valid": "valid"}.get(name, name), value, shape)
     return graph
 
 
@@ -203,22 +212,24 @@ def score_bins(windows: Value, detector: SlipDetector) -> Scored:
     Shape:
         - windows: ``[B, channels in use, RawBin.length]``, at least one bin
     """
-    features, is_missing, is_trusted = described(windows, detector)
-    score = scored(features, is_missing, detector, windows.dtype)
-    is_finite = score.isfinite()
-    is_valid = is_trusted.all(1) & is_finite
-    return Scored(score, is_valid, is_finite & ~is_missing.all(1))
+    features, alive, span = described(windows, detector)
+    channels, graph = RawBin.of(detector).channels, windows.graph
+    score = scored(features, ~alive, detector, windows.dtype)
+    counted = detector.counted[list(channels)]
+    valid, in_range = is_enough(alive, span, counted, detector.sensing, channels)
+    valid = valid & score.isfinite()
+    of_hand = np.equal.outer(np.array(channels), np.arange(len(detector.pool.hand)))
+    lost = (~alive).cast(F32) @ of_hand.astype(np.float32) > 0.0
+    return Scored(graph.where(valid, score, math.nan), valid, in_range & valid, lost)
 
 
 def described(windows: Value, detector: SlipDetector) -> tuple[Value, Value, Value]:
-    """Features of raw bins, and which channels are missing, and which can be trusted.
-
-    A channel is missing where a NaN or Inf is within the frame of its filter; it is trusted where
-    it is neither missing nor dead (``FeaturePool.validity``).
+    """Features of raw bins, which channels are alive, and spans of the filtered bins.
 
     Shape:
         - windows: as ``score_bins``
-        - output: ``[B, M]``, float64, the selected features in their order; ``[B, channels]`` twice
+        - output: ``[B, M]``, float64, the selected features in their order; ``[B, channels]``
+          twice, bool and float64
     """
     used, graph = RawBin.of(detector).channels, windows.graph
     layer, films = detector.channel_filter, set(detector.pool.hand.fast)
@@ -233,21 +244,19 @@ def described(windows: Value, detector: SlipDetector) -> tuple[Value, Value, Val
         )
         for (_, is_film), channels in alike.items()
     ]
-    samples, is_missing, is_trusted = zip(
+    samples, alive, span = zip(
         *(_samples(windows, detector, frame) for frame in frames), strict=True
     )
     dtype = torch.float64 if windows.dtype == F64 else torch.float32
     features: Any = Bank(detector.pool.maps, detector.extractor.plan, frames, dtype)(samples)
     order = [channel for frame in frames for channel in frame.channels]
     places = [order.index(channel) for channel in used]
-    missing, trusted = (
-        graph.concat(*each, axis=1).take(places, 1) for each in (is_missing, is_trusted)
-    )
-    return features, missing, trusted
+    living, spans = (graph.concat(*each, axis=1).take(places, 1) for each in (alive, span))
+    return features, living, spans
 
 
 def _samples(windows: Value, detector: SlipDetector, frame: Frame) -> tuple[Samples, Value, Value]:
-    """What rows are made of; which channels of the frame are missing, and which can be trusted."""
+    """What rows are made of; which channels of the frame are alive, and the spans of their bins."""
     raw, graph, dtype = RawBin.of(detector), windows.graph, windows.dtype
     assert frame.smooth is not None  # frames of raw samples have a filter
     before, after = detector.channel_filter.reaches[frame.channels[0]]
@@ -271,10 +280,17 @@ def _samples(windows: Value, detector: SlipDetector, frame: Frame) -> tuple[Samp
     largest = min(LARGEST_SAMPLE, float(np.finfo(dtype).max))
     is_known = (probe if unit is None else probe * unit) <= largest
     given = torch.float64 if dtype == F64 else torch.float32
-    inverse = detector.pool.inverse_span(given, is_raw=True)[list(frame.channels)]
-    is_alive = (high - low) * inverse > loudest
+    channels = list(frame.channels)
+    inverse = detector.pool.inverse_span(given, is_raw=True)[channels]
+    span = high - low
+    volts = span if unit is None else span * unit
+    alive = is_known
+    if raw.bin >= FEWEST_SAMPLES:
+        floor = torch.tensor(detector.sensing.floor, dtype=torch.float64)[channels]
+        moves = span * inverse > loudest
+        alive = moves & (volts >= floor) & is_known
     values: tuple[Any, ...] = shifted, moving, scale, unit
-    return Samples(*values), ~is_known, is_alive & is_known
+    return Samples(*values), alive, volts
 
 
 def host_metadata(detector: SlipDetector, kind: str, precision: Precision) -> dict[str, Any]:

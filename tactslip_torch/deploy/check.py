@@ -32,7 +32,7 @@ from tactslip_torch.deploy.bins import Precision, RawBin, Timing
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import Prediction, without
+from tactslip_torch.model.prediction import Prediction, without
 from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
 from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.onset.streaming import StreamingDetector
@@ -80,7 +80,7 @@ _SIMULATED, _EACH = 256, 16  # bins, and of each degenerate kind
 _BEFORE_S, _AFTER_S = 1.0, 0.5  # of the simulated onset
 _FEWEST_BINS = 4  # that the simulated slip lasts at least, whatever the rate
 _SPARE = 10  # samples that the simulator may leave out at the ends
-_QUIET_V = 2e-3  # twice the least range of a channel of a detector of simulated recordings
+_QUIET_V = 0.02  # span at rest of a channel of a detector of simulated recordings, at most
 _DECISIONS = 12  # of the stream, at least
 _STATISTIC = {"float32": 1e-3, "float64": 1e-8}  # by which it may differ, as a part of its range
 _LATE_S = 1e-9  # by which times may differ
@@ -194,7 +194,9 @@ def _worst(error: NDArray[Any], most: float, unit: str, what: str) -> float:
 
 
 def _same_flags(got: NDArray[Any], expected: NDArray[Any], what: str) -> None:
-    if places := np.flatnonzero(got != expected).tolist():
+    differs = got != expected
+    differs = differs.any(-1) if differs.ndim > 1 else differs
+    if places := np.flatnonzero(differs).tolist():
         num = len(expected)
         raise ValueError(
             f"{what} differs from torch at {len(places)} of {num}, the first is number {places[0]}"
@@ -256,27 +258,35 @@ class _BinComparison(_Comparison):
         Raises:
             ValueError: if anything differs by more than it may.
         """
-        exact = _predicted(self.detector, samples.double())
+        # a channel is alive by what its samples resolve in the precision they come in
+        exact = _predicted(self.detector, samples.double(), samples.dtype)
         of_score, calibrated = f"{self.precision}[{len(samples)}]", calibration_of(self.detector)
-        wanted = {"score": of_score, "valid": f"bool[{len(samples)}]"}
+        wanted = {"score": of_score} | dict.fromkeys(("valid", "in_range"), f"bool[{len(samples)}]")
+        wanted["channels_lost"] = f"bool{[len(samples), samples.shape[1]]}"
         if calibrated is not None:
             wanted["probability"] = of_score
         got = self.outputs({"samples": samples.numpy()}, wanted, what)
         score = got["score"].astype(np.float64)
-        if not np.isfinite(score).all():
-            raise ValueError(f"{what}: {(~np.isfinite(score)).sum()} scores are not finite")
-        # a channel is trusted by what its samples resolve in the precision they come in
-        is_valid = _predicted(self.detector, samples).is_valid.numpy()
-        _same_flags(got["valid"], is_valid, f"{what}: valid")
-        error = np.abs(score - exact.score.numpy())[behind:] / self.sd
+        for name, flags in (
+            ("valid", exact.is_valid),
+            ("in_range", exact.in_range),
+            ("channels_lost", exact.channels_lost),
+        ):
+            _same_flags(got[name], flags.numpy(), f"{what}: {name}")
+        if (odd := np.isfinite(score) != got["valid"]).any():
+            raise ValueError(f"{what}: {odd.sum()} scores are not finite, or valid without a score")
+        known = got["valid"] & exact.is_valid.numpy()
+        error = np.where(known, np.abs(score - exact.score.numpy()), 0.0)[behind:] / self.sd
         worst = WORST_DEGENERATE_SD[self.precision]
         if degenerate and not (error <= worst).all():
             error = np.where(self._rounding_decides(samples, exact.score, worst), 0.0, error)
         found = self.score_error(error, degenerate, what)
         if calibrated is not None:
             calibration, slip_share = calibrated
-            llr = calibration.llr(torch.from_numpy(score))
-            off = np.abs(got["probability"] - probability(llr, slip_share).numpy())
+            llr = calibration.llr(torch.from_numpy(score[got["valid"]]))
+            off = np.abs(got["probability"][got["valid"]] - probability(llr, slip_share).numpy())
+            if np.isfinite(got["probability"][~got["valid"]]).any():
+                raise ValueError(f"{what}: a decision that is not valid has a probability")
             _worst(off, WORST_PROBABILITY[self.precision], "", f"{what}: probability")
         return found
 
@@ -297,12 +307,14 @@ class _BinComparison(_Comparison):
         return ((moved - score).abs() > worst * self.sd).any(0).numpy()
 
 
-def _predicted(detector: SlipDetector, samples: Tensor) -> Prediction:
+def _predicted(
+    detector: SlipDetector, samples: Tensor, given: torch.dtype | None = None
+) -> Prediction:
     """What the detector says of a graph's bins; what no filter in use takes in is 0."""
     raw = RawBin.of(detector)
     ends = detector.context_before - raw.before, detector.context_after - raw.after
     with torch.no_grad():
-        return detector.predict_raw(pad(samples, ends))
+        return detector.predict_raw(pad(samples, ends), given=given)
 
 
 # Streams ---------------------------------------------------------------------------------------
@@ -312,6 +324,8 @@ _COLUMNS = {
     "probability": "probability",
     "statistic": "statistic",
     "valid": "is_valid",
+    "in_range": "in_range",
+    "channels_lost": "channels_lost",
     "alarm": "is_alarm",
     "on": "is_on",
     "time_s": "available_s",
@@ -320,7 +334,9 @@ _COLUMNS = {
 """Outputs of the graph, and the fields of ``Decisions`` that they are."""
 _OF_ONSETS = {"onset_score": "onset_score", "by_onset": "by_onset"}
 """The same, with an onset classifier."""
-_FLAGS, _TIMES = ("valid", "alarm", "on", "by_onset"), ("time_s", "onset_s")
+_FLAGS = ("valid", "in_range", "channels_lost", "alarm", "on", "by_onset")
+_TIMES = ("time_s", "onset_s")
+_OF_CHANNELS = ("valid", "in_range", "channels_lost")
 
 
 def _columns(settings: AlarmSettings) -> dict[str, str]:
@@ -407,19 +423,22 @@ class _StreamComparison(_Comparison):
         got = self._watched(samples.numpy(), settings, cuts, what)
         for name in expected.keys() & _FLAGS:
             _same_flags(got[name], expected[name], f"{what}: {name}")
-        off = {name: np.abs(got[name].astype(np.float64) - expected[name]) for name in expected}
+        off = {name: _off(got[name], expected[name]) for name in expected.keys() - {*_FLAGS}}
         if settings.onset is not None:
             _worst(off["onset_score"], _ONSET_SCORE, "", f"{what}: onset_score")
         for name in _TIMES:
             _worst(off[name], _LATE_S, "s", f"{what}: {name}")
         found = self.score_error(off["score"] / self.sd, degenerate, what)
-        tells = expected["statistic"] > NOTHING_YET  # before that a rule has seen too few decisions
+        tells = (
+            expected["statistic"] > NOTHING_YET
+        )  # not NaN; before that a rule has seen too few decisions
         span = float(np.ptp(expected["statistic"][tells])) if tells.any() else 0.0
         error = off["statistic"][tells] / (span or 1.0)
         _worst(error, _STATISTIC[self.precision], "of its range", f"{what}: statistic")
-        llr = settings.calibration.llr(torch.from_numpy(got["score"].astype(np.float64)))
+        known = np.isfinite(got["score"])
+        llr = settings.calibration.llr(torch.from_numpy(got["score"][known].astype(np.float64)))
         stated = probability(llr, settings.slip_share).numpy()
-        error = np.abs(got["probability"] - stated)[got["valid"]]
+        error = np.abs(got["probability"][known] - stated)
         _worst(error, WORST_PROBABILITY[self.precision], "", f"{what}: probability")
         return found
 
@@ -439,6 +458,7 @@ class _StreamComparison(_Comparison):
             num = timing.decisions(stop) - timing.decisions(start)
             wanted = dict.fromkeys(columns, f"{self.precision}[{num}]")
             wanted |= dict.fromkeys(columns.keys() & _FLAGS, f"bool[{num}]")
+            wanted["channels_lost"] = f"bool{[num, samples.shape[1]]}"
             wanted |= dict.fromkeys(columns.keys() & {*_TIMES, "onset_score"}, f"float64[{num}]")
             wanted["next_tail"] = f"{self.precision}{[timing.tail, samples.shape[1]]}"
             wanted["next_state"] = f"float64{[timing.state_size]}"
@@ -457,12 +477,19 @@ def _decided(
         StreamingDetector(detector, settings, dtype=dtype)
         for dtype in (torch.float64, samples.dtype)
     )
-    decisions = exact.push(samples)
-    columns = {
-        name: getattr(decisions, field).numpy() for name, field in _columns(settings).items()
+    decisions, own = exact.push(samples), in_its_own.push(samples)
+    # a channel is alive by what its samples resolve in the precision they come in
+    return {
+        name: getattr(own if name in _OF_CHANNELS else decisions, field).numpy()
+        for name, field in _columns(settings).items()
     }
-    # a channel is trusted by what its samples resolve in the precision they come in
-    return columns | {"valid": in_its_own.push(samples).is_valid.numpy()}
+
+
+def _off(got: NDArray[Any], expected: NDArray[Any]) -> NDArray[Any]:
+    """By how much numbers differ; NaN does not differ from NaN, and without end from others."""
+    off = np.abs(got.astype(np.float64) - expected)
+    none = np.isnan(got) & np.isnan(expected)
+    return np.where(none | (got == expected), 0.0, np.nan_to_num(off, nan=np.inf))
 
 
 def _middle_threshold(statistic: NDArray[Any]) -> float:
@@ -568,8 +595,7 @@ def _unit_of(detector: SlipDetector) -> float:
     A detector that leaves out channels which hardly move was trained in some unit; in what it is
     tried on, something must move by it.
     """
-    least = None if detector.pooling is None else detector.pooling.least_range
-    quietest = 0.0 if least is None or not len(least) else float(least.max()) / _QUIET_V
+    quietest = max(detector.sensing.rest_span) / _QUIET_V
     return 2.0 ** max(math.ceil(math.log2(quietest)), 0) if quietest > 0 else 1.0
 
 

@@ -1,4 +1,4 @@
-"""From features to scores, as nodes: pooling, scaling, head, missing channels."""
+"""From features to scores, as nodes: pooling, scaling, head, lost channels."""
 
 from __future__ import annotations
 
@@ -17,31 +17,30 @@ from tactslip_torch.model.scaling import FeatureScaler
 _LARGEST = float(np.finfo(np.float64).max)
 
 
-def scored(
-    features: Value, is_missing: Value, detector: SlipDetector, dtype: np.dtype[Any]
-) -> Value:
-    """Scores; columns of missing channels take their imputation values.
+def scored(features: Value, is_lost: Value, detector: SlipDetector, dtype: np.dtype[Any]) -> Value:
+    """Scores; columns of lost channels take their imputation values.
 
     Args:
-        features: of channels, float64; anything where missing.
-        is_missing: which channels in use are, bool.
+        features: of channels, float64; anything where lost.
+        is_lost: which channels in use are, bool.
         detector: whose columns, scaler and head.
         dtype: of scores.
 
     Shape:
-        - features: ``[B, M]``; is_missing: ``[B, channels in use]``
+        - features: ``[B, M]``; is_lost: ``[B, channels in use]``
         - output: ``[B]``
     """
     channels = detector.extractor.plan.channels
-    z = scaled(_pooled(features, is_missing, detector), detector.scaler)
+    z = scaled(_pooled(features, is_lost, detector), detector.scaler)
     # a column that is pooled is of no channel; a product is quicker than to pick flags
     of_channel = np.equal.outer(np.array(channels), detector.channel_index.numpy())
-    is_lost = is_missing.cast(F32) @ of_channel > 0.0  # [B, K]
-    z = z.graph.where(is_lost, _float64(z, detector.imputation), z)
+    if of_channel.any():
+        is_filled = is_lost.cast(F32) @ of_channel > 0.0  # [B, K]
+        z = z.graph.where(is_filled, _float64(z, detector.imputation), z)
     return machine(z, detector.head, dtype)
 
 
-def _pooled(features: Value, is_missing: Value, detector: SlipDetector) -> Value:
+def _pooled(features: Value, is_lost: Value, detector: SlipDetector) -> Value:
     """Columns for the scaler, ``[B, K]``, float64: ``ChannelPooling``; without one as they are."""
     layer, graph = detector.pooling, features.graph
     if layer is None:
@@ -50,11 +49,9 @@ def _pooled(features: Value, is_missing: Value, detector: SlipDetector) -> Value
     columns, is_some = list[Any](), list[Value]()
     if layer.singles:
         columns.append(features.take(layer.singles, 1))
-    for index, group in enumerate(layer.groups):
+    for group in layer.groups:
         num = len(group.channels)
-        least = float(layer.least_range[index])
-        is_lost = is_missing.take([used.index(channel) for channel in group.channels], 1)
-        in_use: Any = ~((features.take(group.ranges, 1) < least) | is_lost)
+        in_use: Any = ~is_lost.take([used.index(channel) for channel in group.channels], 1)
         is_some.append(in_use.any(1, keepdim=True))
         values = features.take(group.columns, 1).reshape(0, len(group.families), num)
         knee = layer.knee[list(group.families), None].double()

@@ -34,9 +34,9 @@ from tactslip_torch.deploy.head import machine, scaled
 from tactslip_torch.deploy.value import BOOL, END, F64, I64, Graph, Value
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decisions import AlarmSettings
+from tactslip_torch.onset.decisions import LARGEST, AlarmSettings
 from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetClassifier, OnsetEvidence
-from tactslip_torch.onset.rules import NEUTRAL, NOTHING_YET, Cusum, Rule
+from tactslip_torch.onset.rules import NOTHING_YET, Cusum, Rule, most_lost
 from tactslip_torch.signals.filtering import past_matrix
 
 LATCH_START = (0.0, 0.0, 2.0**52)
@@ -49,18 +49,21 @@ def stream_graph(
     """The graph of a stream: what comes next, and what was kept, to decisions and what is kept.
 
     Inputs ``samples [n, C]``, ``tail [r, C]``, ``state [s]`` and ``threshold [t]``; outputs
-    ``score``, ``probability``, ``statistic``, ``valid``, ``alarm``, ``on``, ``time_s``,
-    ``onset_s``, ``[k]`` each, ``next_tail [Timing.tail, C]`` and ``next_state
-    [Timing.state_size]``. A stream begins with an empty tail and state; without a threshold that of
-    the settings counts. Where nothing can be decided, next to nothing is computed.
+    ``score``, ``probability``, ``statistic``, ``valid``, ``in_range``, ``alarm``, ``on``,
+    ``time_s``, ``onset_s``, ``[k]`` each, ``channels_lost [k, C]``, ``next_tail [Timing.tail, C]``
+    and ``next_state [Timing.state_size]``. A stream begins with an empty tail and state; without a
+    threshold that of the settings counts. Where nothing can be decided, next to nothing is
+    computed.
 
     State, in float64: samples and decisions so far, where the run of positive ratios began, whether
-    an alarm stands, decisions in a row that were low, decisions since the last alarm, and the
+    an alarm stands, decisions in a row that were low, decisions since the last alarm, decisions in
+    a row that are not valid, the last sample of each channel, how many were equal to it, and the
     memory of the rule.
 
     With an onset classifier there are ``onset_score``, float64, and ``by_onset`` too, the threshold
-    is the classifier's, and behind the memory of the rule the state has what is said of the last
-    bin (``SAID_OF_BIN``) and the memory of blocks (``onset_scores``).
+    is the classifier's, and behind the memory of the rule the state has decisions of the alarm in a
+    row that are not valid, what is said of the last bin (``SAID_OF_BIN``, and the channels that
+    were lost) and the memory of blocks (``onset_scores``).
 
     Args:
         detector: that scores the bins.
@@ -80,23 +83,29 @@ def stream_graph(
     onset = settings.onset
     before = 0.0 if onset is None else math.nan  # what no stream has is no evidence
     nothing = graph.constant(np.full((timing.tail, num_channels), before), dtype)
-    held = graph.concat(nothing, tail, samples, axis=0)
-    start = graph.constant([0, 0, 0, *LATCH_START, *rule_start(settings.rule)], F64)
+    no_sample = [math.nan] * num_channels + [0.0] * num_channels
+    starts = [0, 0, 0, *LATCH_START, 0, *no_sample, *rule_start(settings.rule)]
+    start = graph.constant(starts, F64)
     if onset is not None:
-        says_nothing = graph.constant([0.0, settings.slip_share, NOTHING_YET, 0.0, math.inf], F64)
-        start, given = graph.concat(start, says_nothing, axis=0), state
+        says_nothing = [0.0, *([math.nan] * 3), 0.0, 0.0, math.inf, *([0.0] * num_channels)]
+        start, given = graph.concat(start, graph.constant(says_nothing, F64), axis=0), state
         small = timing.state_size - memory_size(onset.evidence)
         state = given.slice(0, small, 0)
     else:
         small = timing.state_size
     state = graph.concat(state, start, axis=0).slice(0, small, 0)
+    marked, stuck = without_stuck(
+        samples, state.slice(7, 7 + 2 * num_channels, 0), detector.sensing.stuck_samples
+    )
+    held = graph.concat(nothing, tail, marked, axis=0)
     seen = state.slice(0, 1, 0) + samples.length(0).cast(F64)
     decided = ((seen + float(timing.hop - timing.first)) / float(timing.hop)).floor().clamp(min=0.0)
     if timing.frame > timing.first:
         decided = graph.where(seen >= float(timing.frame), decided, 0.0)
     outputs: dict[str, np.dtype[Any]] = dict.fromkeys(("score", "probability", "statistic"), dtype)
-    outputs |= dict.fromkeys(("valid", "alarm", "on"), BOOL)
+    outputs |= dict.fromkeys(("valid", "in_range", "alarm", "on"), BOOL)
     outputs |= dict.fromkeys(("time_s", "onset_s"), F64)
+    outputs["channels_lost"] = BOOL
     if onset is not None:
         outputs |= {"onset_score": F64, "by_onset": BOOL}
     rate_hz = detector.pool.sample_rate_hz
@@ -105,79 +114,135 @@ def stream_graph(
         for seconds in (settings.rearm_s, settings.refractory_s)
     )
 
+    window = timing.raw.length
+    hold = round(settings.hold_s * rate_hz)
+
     def level(own: float, of_dtype: np.dtype[Any]) -> Value:
         """The threshold that is given, or the file's."""
         known = graph.concat(threshold, graph.constant([own], F64), axis=0)
         return known.slice(0, 1, 0).cast(of_dtype)
 
-    def bins(made: Value, of_rule: Value) -> tuple[Value, Scored, Value, Value, Value]:
-        """Number, scores, ratios and statistics of the next bins, and the memory of the rule."""
+    def bins(made: Value) -> tuple[Value, Scored, Value]:
+        """Number, scores and ratios of the next bins; a ratio counts where the score is valid."""
         places = _count_up((decided - made).cast(I64))
         number = places.cast(F64) + made
         windows = _windows(held, seen, made * float(timing.hop), places, detector, timing)
         scored = score_bins(windows.cast(dtype), detector)
-        llr = graph.where(scored.is_usable, scored.llr(settings.calibration), NEUTRAL)
-        return number, scored, llr, *statistic_of(settings.rule, llr, of_rule)
+        known: Any = graph.where(scored.is_valid, scored.score, 0.0)
+        llr: Any = settings.calibration.llr(known)
+        return number, scored, llr.clamp(-LARGEST, LARGEST)
+
+    def only_valid(value: Any, scored: Scored) -> Value:
+        return graph.where(scored.is_valid, value, math.nan)
 
     def stated(ratio: Any) -> Any:
         return probability(ratio, settings.slip_share)
 
+    most = most_lost(window, hold, timing.hop)
+    sizes_before = [1, 1, 1, 3, 1, 2 * num_channels, len(rule_start(settings.rule))]
+
     def decide() -> list[Value]:
-        sizes = graph.axes(1, 1, 1, 3, timing.state_size - 6)
-        _, made, run, of_latch, of_rule = graph.ops("Split", state, sizes, dtypes=[F64] * 5, axis=0)
-        number, scored, llr, statistic, of_rule = bins(made, of_rule)
+        sizes = graph.axes(*sizes_before)
+        parts = graph.ops("Split", state, sizes, dtypes=[F64] * 7, axis=0)
+        _, made, run, of_latch, lost, _, of_rule = parts
+        number, scored, llr = bins(made)
         high = level(settings.threshold, dtype)
-        latch = latched(statistic, high, number, of_latch, rearm=rearm, refractory=refractory)
-        run = _latest(llr <= 0.0, run, number + 1.0)
+
+        def simply() -> list[Value]:
+            statistic, after = statistic_of(settings.rule, llr, of_rule)
+            latch = latched(statistic, high, number, of_latch, rearm=rearm, refractory=refractory)
+            runs = _latest(llr <= 0.0, run, number + 1.0)
+            return [statistic, *latch, runs, after, lost]
+
+        def with_gaps() -> list[Value]:
+            gaps = Gaps.of(scored.is_valid, number, lost, most)
+            statistic, after = gaps.statistic_of(settings.rule, llr, of_rule)
+            latch = gaps.latched(statistic, high, number, of_latch, rearm, refractory)
+            is_end = ((llr <= 0.0) & scored.is_valid) | gaps.is_over
+            return [statistic, *latch, _latest(is_end, run, number + 1.0), after, gaps.lost_after]
+
+        is_whole = _is_whole(scored.is_valid, lost)
+        statistic, alarm, on, memory, runs, after, lost = graph.if_(is_whole, simply, with_gaps)
         return [
             scored.score,
-            stated(llr),
+            only_valid(stated(llr), scored),
             statistic,
             scored.is_valid,
-            latch.alarm,
-            latch.on,
-            *_times_s(number, run, settings, timing, rate_hz),
-            graph.concat(seen, decided, _last(run), latch.memory, of_rule, axis=0),
+            scored.in_range,
+            alarm,
+            on,
+            *_times_s(number, runs, settings, timing, rate_hz),
+            scored.channels_lost,
+            graph.concat(seen, decided, _last(runs), memory, lost, stuck, after, axis=0),
         ]
 
-    def wait() -> list[Value]:
+    def nothing_made() -> list[Value]:
         empty = [graph.constant([], kind) for kind in outputs.values()]
-        return [*empty, graph.concat(seen, state.slice(1, END, 0), axis=0)]
+        place = list(outputs).index("channels_lost")
+        empty[place] = graph.constant(np.zeros((0, num_channels)), BOOL)
+        return empty
+
+    def wait() -> list[Value]:
+        rest = state.slice(7 + 2 * num_channels, END, 0)
+        return [*nothing_made(), graph.concat(seen, state.slice(1, 7, 0), stuck, rest, axis=0)]
 
     def join(onset: OnsetClassifier) -> list[Value]:
         """Decisions a hop of the classifier apart, from its scores and the last bin by then."""
-        num_said = len(SAID_OF_BIN)
-        sizes = graph.axes(1, 1, 1, 3, small - 6 - num_said, num_said)
-        parts = graph.ops("Split", state, sizes, dtypes=[F64] * 6, axis=0)
-        before, made, run, of_latch, of_rule, said = parts
+        num_said = len(SAID_OF_BIN) + num_channels
+        sizes = graph.axes(*sizes_before, 1, num_said)
+        parts = graph.ops("Split", state, sizes, dtypes=[F64] * 9, axis=0)
+        before, made, run, of_latch, lost, _, of_rule, alarm_lost, said = parts
         memory = onset_memory(given, small, onset.evidence)
 
         def decide_bins() -> list[Value]:
-            number, scored, llr, statistic, after = bins(made, of_rule)
-            runs = _latest(llr <= 0.0, run, number + 1.0)
+            number, scored, llr = bins(made)
+
+            def simply() -> list[Value]:
+                statistic, after = statistic_of(settings.rule, llr, of_rule)
+                return [statistic, _latest(llr <= 0.0, run, number + 1.0), after, lost]
+
+            def with_gaps() -> list[Value]:
+                gaps = Gaps.of(scored.is_valid, number, lost, most)
+                statistic, after = gaps.statistic_of(settings.rule, llr, of_rule)
+                is_end = ((llr <= 0.0) & scored.is_valid) | gaps.is_over
+                runs = _latest(is_end, run, number + 1.0)
+                return [statistic, runs, after, gaps.lost_after]
+
+            is_whole = _is_whole(scored.is_valid, lost)
+            statistic, runs, after, now_lost = graph.if_(is_whole, simply, with_gaps)
             unwaiting = replace(timing, frame=0)
             onset_s = _times_s(number, runs, settings, unwaiting, rate_hz)[1]
-            columns = scored.score, stated(llr), statistic, scored.is_valid, onset_s
-            made_rows = graph.concat(*(x.cast(F64).unsqueeze(1) for x in columns), axis=1)
+            columns = (
+                scored.score,
+                only_valid(stated(llr), scored),
+                statistic,
+                scored.is_valid,
+                scored.in_range,
+                onset_s,
+            )
+            of_bins = [x.cast(F64).unsqueeze(1) for x in columns]
+            made_rows = graph.concat(*of_bins, scored.channels_lost.cast(F64), axis=1)
             rows = graph.concat(said.unsqueeze(0), made_rows, axis=0)
-            return [rows, decided, _last(runs), after]
+            return [rows, decided, _last(runs), after, now_lost]
 
         rows, *of_bins = graph.if_(
-            decided > made, decide_bins, lambda: [said.unsqueeze(0), made, run, of_rule]
+            decided > made, decide_bins, lambda: [said.unsqueeze(0), made, run, of_rule, lost]
         )
         hop, of_bin = float(onset.evidence.hop_samples), float(timing.hop)
         hops, first = (seen / hop).floor(), (before / hop).floor()
 
-        def next_state(of_latch: Value, memory: Sequence[Value]) -> Value:
-            kept = (seen, *of_bins[:2], of_latch, of_bins[2], _last(rows).squeeze(0), *memory)
-            return graph.concat(*kept, axis=0)
+        def next_state(of_latch: Value, alarm_lost: Value, memory: Sequence[Value]) -> Value:
+            now_decided, run, after, lost = of_bins
+            kept = (seen, now_decided, run, of_latch, lost, stuck, after, alarm_lost)
+            return graph.concat(*kept, _last(rows).squeeze(0), *memory, axis=0)
 
         def decide_hops() -> list[Value]:
             places = _count_up((hops - first).cast(I64))
             number = places.cast(F64) + first
             origin = first * hop - seen - float(onset.evidence.context)  # counted from the end
             x = held.slice(origin.cast(I64), END, 0)
-            onset_score, after = onset_scores(x, places, memory, onset)
+            most_blocks = most_lost(onset.evidence.context + int(hop), hold, int(hop))
+            onset_score, after = onset_scores(x, places, memory, onset, most_blocks)
             by_onset = onset_score >= level(onset.threshold, F64)
             samples = (number + 1.0) * hop
             last = ((samples - float(timing.first)) / of_bin).floor()
@@ -185,28 +250,44 @@ def stream_graph(
                 last = graph.where(samples >= float(timing.frame), last, -1.0)
             place = (last - made + 1.0).clamp(min=0.0).cast(I64)  # row 0 is what was known before
             told = graph.op("Gather", rows, place, axis=0)
-            score, stated, statistic, valid, onset_s = (told[..., i] for i in range(num_said))
+            score, stated, statistic, valid, in_range, onset_s = (
+                told[..., i] for i in range(len(SAID_OF_BIN))
+            )
             statistic, time_s = statistic.cast(dtype), samples / rate_hz
+            is_valid = valid.cast(BOOL) | (onset_score > NOTHING_YET)
             is_high = (by_onset | (statistic >= settings.threshold)).cast(F64)
-            one, times = graph.constant([1.0], F64), {"rearm": rearm, "refractory": refractory}
-            latch = latched(is_high, one, number, of_latch, **times)
+            one = graph.constant([1.0], F64)
+
+            def simply() -> list[Value]:
+                made = latched(is_high, one, number, of_latch, rearm=rearm, refractory=refractory)
+                return [*made, alarm_lost]
+
+            def with_gaps() -> list[Value]:
+                of_hops = most_lost(window, hold, int(hop))
+                gaps = Gaps.of(is_valid, number, alarm_lost, of_hops)
+                found = gaps.latched(is_high, one, number, of_latch, rearm, refractory)
+                return [*found, gaps.lost_after]
+
+            is_whole = _is_whole(is_valid, alarm_lost)
+            alarm, on, of_alarm, now_lost = graph.if_(is_whole, simply, with_gaps)
             return [
                 score.cast(dtype),
                 stated.cast(dtype),
                 statistic,
-                valid.cast(BOOL),
-                latch.alarm,
-                latch.on,
+                is_valid,
+                in_range.cast(BOOL),
+                alarm,
+                on,
                 time_s,
                 graph.where(by_onset, time_s - onset.lead_s, onset_s).minimum(time_s),
+                told.slice(len(SAID_OF_BIN), END, 1).cast(BOOL),
                 onset_score,
                 by_onset,
-                next_state(latch.memory, after),
+                next_state(of_alarm, now_lost, after),
             ]
 
         def wait_for_hop() -> list[Value]:
-            empty = [graph.constant([], kind) for kind in outputs.values()]
-            return [*empty, next_state(of_latch, memory)]
+            return [*nothing_made(), next_state(of_latch, alarm_lost, memory)]
 
         return graph.if_(hops > first, decide_hops, wait_for_hop)
 
@@ -215,7 +296,7 @@ def stream_graph(
     else:
         *made, next_state = join(onset)
     for name, value in zip(outputs, made, strict=True):
-        graph.output(name, value, ("k",))
+        graph.output(name, value, ("k", num_channels) if name == "channels_lost" else ("k",))
     graph.output("next_tail", held.slice(-timing.tail, END, 0), (timing.tail, num_channels))
     graph.output("next_state", next_state, (timing.state_size,))
     return graph
@@ -302,11 +383,54 @@ def _times_s(
     return waited_s, waited_s - (time_s - onset_s)
 
 
+def without_stuck(samples: Value, known: Value, most: int) -> tuple[Value, Value]:
+    """Samples with NaN where a channel is stuck (``StuckChannels``), and what is kept.
+
+    Args:
+        samples: that came next.
+        known: the last sample of each channel, and how many were equal to it, one behind the other.
+        most: equal samples in a row that are let pass.
+
+    Shape:
+        - samples: ``[n, C]``, n may be 0; known: ``[2 C]``, float64
+    """
+    graph = samples.graph
+    num = samples.length(0)
+
+    def mark() -> list[Value]:
+        sizes = graph.op("Div", known.length(0), graph.axes(2))
+        last, run = (
+            each.unsqueeze(0) for each in (known.slice(0, sizes, 0), known.slice(sizes, END, 0))
+        )
+        before = graph.concat(last.cast(samples.dtype), samples.slice(0, -1, 0), axis=0)
+        is_new = ~samples.eq(before)
+        place = (_count_up(num) + 1).unsqueeze(1)  # [n, 1]
+        counted, places = num.cast(F64), place.cast(F64)
+        began = graph.where(is_new, places, 0.0).amax(0, keepdim=True)
+        run_after = graph.where(began > 0.0, counted + 1.0 - began, run + counted)
+
+        def is_stuck() -> list[Value]:
+            seen = is_new.cast(I64).cumsum(0)
+            none = graph.op("Sub", seen.slice(0, 1, 0), seen.slice(0, 1, 0))
+            ago = graph.op("Max", place - most, graph.axes(0)).squeeze(1)
+            earlier = graph.op("Gather", graph.concat(none, seen, axis=0), ago, axis=0)
+            keeps = seen.eq(earlier) & ((run + places) > float(most))
+            return [graph.where(keeps, math.nan, samples)]
+
+        may_be = (run.amax(1) + counted).squeeze(0) > float(most)
+        marked = graph.if_(may_be, is_stuck, lambda: [samples])[0]
+        now = samples.slice(-1, END, 0).cast(F64).squeeze(0)
+        return [marked, graph.concat(now, run_after.squeeze(0), axis=0)]
+
+    marked, after = graph.if_(num.squeeze(0) > 0, mark, lambda: [samples, known])
+    return marked, after
+
+
 # Onset scores ----------------------------------------------------------------------------------
 
 
 def onset_memory(state: Value, start: int, evidence: OnsetEvidence) -> list[Value]:
-    """Scores of hops, half the log powers of blocks and their means, as a state has them; flat.
+    """Lost and known blocks, scores of hops, half the log powers of blocks, and their means; flat.
 
     Args:
         state: in which they lie last; empty: of no stream yet, NaN, on which no score rests.
@@ -314,7 +438,8 @@ def onset_memory(state: Value, start: int, evidence: OnsetEvidence) -> list[Valu
         evidence: whose they are.
     """
     graph = state.graph
-    sizes = [MEAN_HOPS - 1, *(num * width for num, width in memory_shapes(evidence) if width)]
+    sizes = [1, 1, MEAN_HOPS - 1]
+    sizes += [num * width for num, width in memory_shapes(evidence) if width]
 
     def known() -> list[Value]:
         dtypes = [F64] * (1 + len(sizes))
@@ -322,13 +447,20 @@ def onset_memory(state: Value, start: int, evidence: OnsetEvidence) -> list[Valu
 
     def nothing() -> list[Value]:
         nan = numpy_helper.from_array(np.array([np.nan]))
-        return [graph.op("ConstantOfShape", graph.axes(n), dtype=F64, value=nan) for n in sizes]
+        none = [graph.constant([0.0], F64)] * 2
+        return none + [
+            graph.op("ConstantOfShape", graph.axes(n), dtype=F64, value=nan) for n in sizes[2:]
+        ]
 
     return graph.if_(state.length(0) > 0, known, nothing)
 
 
 def onset_scores(
-    samples: Value, places: Value, memory: Sequence[Value], classifier: OnsetClassifier
+    samples: Value,
+    places: Value,
+    memory: Sequence[Value],
+    classifier: OnsetClassifier,
+    most: int,
 ) -> tuple[Value, list[Value]]:
     """Scores of hops, ``NOTHING_YET`` where there is no evidence, and what is kept.
 
@@ -337,6 +469,7 @@ def onset_scores(
         places: of the hops, from 0.
         memory: of ``onset_memory`` or the call before; as it is large, copied as seldom as can be.
         classifier: that scores.
+        most: lost blocks in a row, beyond which the memory begins anew.
 
     Shape:
         - samples: ``[m, C]``; places: ``[k]``, int64, k at least 1
@@ -345,14 +478,8 @@ def onset_scores(
     evidence, graph = classifier.evidence, samples.graph
     fast, slow = evidence.hand.fast, evidence.hand.slow
     hop, context, num_filters = evidence.hop_samples, evidence.context, len(evidence.fast_knee)
-    longest, num_windows = evidence.windows[-1], len(evidence.windows)
-    first = places.unsqueeze(1)
-
-    def windows(rows: Value, start: Value, places: range) -> Value:
-        """Rows at some places behind each start: ``[m, *]`` to ``[k, places, *]``."""
-        return graph.op("Gather", rows, start + graph.axes(*places), axis=0)
-
-    frames = windows(samples.take(fast, 1), first * hop, range(context + hop)).cast(F64)
+    num_windows, first = len(evidence.windows), places.unsqueeze(1)
+    frames = _rows(samples.take(fast, 1), first * hop, range(context + hop)).cast(F64)
     filters = evidence.filter_matrix.reshape(context + hop, -1).T
     heard = graph.constant(filters, F64) @ (frames - frames.slice(0, 1, 1))
     to_power = np.kron(np.eye(num_filters), np.full(hop, 1 / hop))
@@ -360,65 +487,110 @@ def onset_scores(
     power = square + np.square(evidence.fast_knee)[:, None]
     made = [power.reshape(0, num_filters * len(fast)).log() * 0.5]
     if slow:
-        block = windows(samples.take(slow, 1), first * hop, range(context, context + hop))
+        block = _rows(samples.take(slow, 1), first * hop, range(context, context + hop))
         made.append(block.cast(F64).mean(1))
     shapes = memory_shapes(evidence)[: len(made)]
-    of_hops, *kept = memory
+    lost, filled, of_hops, *kept = memory
     kept = [x.reshape(*shape) for x, shape in zip(kept, shapes, strict=True)]
+    of_fast = made[0].reshape(0, num_filters, len(fast)).sum(1).isfinite()
+    is_known = of_fast.cast(F64).sum(1) >= float(evidence.min_alive or 1)  # [k]
+    longest, num_floor = evidence.windows[-1], evidence.memory - evidence.windows[-1]
 
-    def latest(of: int, num: int) -> Value:
-        """Rows up to each hop, as many: ``[k, num, *]``."""
-        rows = graph.concat(kept[of].slice(1 - num, END, 0), made[of], axis=0)
-        return windows(rows, first, range(num))
+    def scores_of(made: Sequence[Value], num_rows: Value) -> list[Value]:
+        """Scores of known blocks, which have so many rows; and what is kept, but for ``lost``."""
+        first = _count_up(made[0].length(0)).unsqueeze(1)
 
-    num_floor = evidence.memory - longest
+        def latest(of: int, num: int) -> Value:
+            """Rows up to each hop, as many: ``[k, num, *]``."""
+            rows = graph.concat(kept[of].slice(1 - num, END, 0), made[of], axis=0)
+            return _rows(rows, first, range(num))
 
-    def one_floor() -> list[Value]:  # by a product, which copies nothing
-        weights = np.append(np.full(num_floor, 1 / num_floor), np.zeros(longest - 1))
-        return [graph.constant(weights[None], F64) @ kept[0]]
+        def one_floor() -> list[Value]:  # by a product, which copies nothing
+            weights = np.append(np.full(num_floor, 1 / num_floor), np.zeros(longest - 1))
+            return [graph.constant(weights[None], F64) @ kept[0]]
 
-    def floors() -> list[Value]:
-        rows = graph.concat(kept[0], made[0], axis=0)
-        return [windows(rows, first, range(num_floor)).mean(1)]
+        def floors() -> list[Value]:
+            rows = graph.concat(kept[0], made[0], axis=0)
+            return [_rows(rows, first, range(num_floor)).mean(1)]
 
-    (floor,) = graph.if_(places.length(0).eq(1), one_floor, floors)
-    to_means = np.zeros((num_windows, longest))
-    for row, length in zip(to_means, evidence.windows, strict=True):
-        row[-length:] = 1 / length
-    power = (latest(0, longest) * 2.0).exp()
-    measured: list[Any] = [
-        (graph.constant(to_means, F64) @ power).reshape(0, num_windows, num_filters, len(fast)),
-        floor.reshape(0, num_filters, len(fast)),
-        None,
-        graph.constant(np.ones(len(fast)), BOOL),
-        None,
-    ]
-    if slow:
-        means = latest(1, len(evidence.step_matrix))
-        measured[2] = graph.constant(evidence.step_matrix.T, F64) @ (means - means.slice(0, 1, 1))
-        measured[4] = graph.constant(np.ones(len(slow)), BOOL)
-    pooled: Any = evidence.pooled(*measured)
-    columns, is_usable = pooled
-    score = machine(scaled(columns, classifier.scaler), classifier.head, F64)
-    scores = graph.concat(of_hops, graph.where(is_usable, score, math.nan), axis=0)
-    mean = windows(scores, first, range(MEAN_HOPS)).mean(1)
-    after = [scores.slice(1 - MEAN_HOPS, END, 0)]
-    for before, own, (num, _) in zip(kept, made, shapes, strict=True):
-        after.append(before.slice(own.length(0), END, 0).reshape(-1))
-        after.append(own.slice(-num, END, 0).reshape(-1))
-    return graph.where(mean.isfinite(), mean, NOTHING_YET), after
+        (floor,) = graph.if_(made[0].length(0).eq(1), one_floor, floors)
+        to_means = np.zeros((num_windows, longest))
+        for row, length in zip(to_means, evidence.windows, strict=True):
+            row[-length:] = 1 / length
+        power = (latest(0, longest) * 2.0).exp()
+        measured: list[Any] = [
+            (graph.constant(to_means, F64) @ power).reshape(0, num_windows, num_filters, len(fast)),
+            floor.reshape(0, num_filters, len(fast)),
+            None,
+            graph.constant(np.ones(len(fast)), BOOL),
+            None,
+        ]
+        if slow:
+            means = latest(1, len(evidence.step_matrix))
+            steps = graph.constant(evidence.step_matrix.T, F64)
+            measured[2] = steps @ (means - means.slice(0, 1, 1))
+            measured[4] = graph.constant(np.ones(len(slow)), BOOL)
+        pooled: Any = evidence.pooled(*measured)
+        columns, is_usable = pooled
+        is_usable = is_usable & (num_rows >= float(evidence.memory))
+        score = machine(scaled(columns, classifier.scaler), classifier.head, F64)
+        scores = graph.concat(of_hops, graph.where(is_usable, score, math.nan), axis=0)
+        mean = _rows(scores, first, range(MEAN_HOPS)).mean(1)
+        mean = graph.where(mean.isfinite(), mean, NOTHING_YET)
+        after = [_last(num_rows), scores.slice(1 - MEAN_HOPS, END, 0)]
+        for before, own, (num, _) in zip(kept, made, shapes, strict=True):
+            after.append(before.slice(own.length(0), END, 0).reshape(-1))
+            after.append(own.slice(-num, END, 0).reshape(-1))
+        return [mean, *after]
+
+    def all_known() -> list[Value]:
+        num_rows = places.cast(F64) + (filled + 1.0)
+        mean, *after = scores_of(made, num_rows)
+        return [mean, lost * 0.0, *after]
+
+    def some_lost() -> list[Value]:
+        gaps = Gaps.of(is_known, places.cast(F64), lost, most)
+
+        def nothing_known() -> list[Value]:
+            mean = graph.where(is_known, 0.0, graph.constant([NOTHING_YET], F64))
+            parts = [filled, of_hops]
+            for own, rows in zip(kept, made, strict=True):  # in two parts, as of scores
+                parts += [own.reshape(-1), rows.slice(0, 0, 0).reshape(-1)]
+            return [mean, *parts]
+
+        def those_known() -> list[Value]:
+            own = [gaps.valid_of(rows) for rows in made]
+            place = _count_up(own[0].length(0)).cast(F64)
+            begins = _latest(gaps.valid_of(gaps.begins_anew), -filled, place)
+            mean, *after = scores_of(own, place - begins + 1.0)
+            mean = gaps.spread(mean, graph.constant([NOTHING_YET], F64))
+            return [graph.where(is_known, mean, NOTHING_YET), *after]
+
+        mean, *after = graph.if_(gaps.has_valid, those_known, nothing_known)
+        return [mean, gaps.lost_after, *after]
+
+    score, *after = graph.if_(_is_whole(is_known, lost), all_known, some_lost)
+    return score, after
+
+
+def _rows(rows: Value, start: Value, places: range) -> Value:
+    """Rows at some places behind each start: ``[m, *]`` to ``[k, places, *]``."""
+    return rows.graph.op("Gather", rows, start + rows.graph.axes(*places), axis=0)
 
 
 # Rules and alarms ------------------------------------------------------------------------------
 
 
-def statistic_of(rule: Rule, llr: Value, memory: Value) -> tuple[Value, Value]:
+def statistic_of(
+    rule: Rule, llr: Value, memory: Value, anew: Value | None = None
+) -> tuple[Value, Value]:
     """The statistic of each decision as the rule's ``scan`` makes it, and the memory behind.
 
     Args:
         rule: whose statistic.
         llr: finite ratios.
         memory: of ``rule_start`` or the call before.
+        anew: decisions with which the rule begins anew, ``[k]``, bool; default: none.
 
     Shape:
         - llr, statistic: ``[k]``, k at least 1
@@ -429,14 +601,16 @@ def statistic_of(rule: Rule, llr: Value, memory: Value) -> tuple[Value, Value]:
         step = llr - rule.drift if rule.drift else llr
         step = step * rule.evidence if rule.evidence != 1 else step
 
+        rows = [step] if anew is None else [step, graph.where(anew, 0.0, step * 0.0 + 1.0)]
+
         def add(state: list[Value], row: list[Value]) -> tuple[list[Value], list[Value]]:
-            total = state[0] + row[0]
+            total = state[0] + row[0] if anew is None else state[0] * row[1] + row[0]
             return [total.clamp(0.0, rule.ceiling)], [total]
 
         # where every step takes away at least what is there, the sum is 0 without a walk
         is_quiet = before + step.amax(0, keepdim=True) <= 0.0
         totals = graph.if_(
-            is_quiet, lambda: [step], lambda: graph.scan(add, [before.squeeze(0)], [step])[1]
+            is_quiet, lambda: [step], lambda: graph.scan(add, [before.squeeze(0)], rows)[1]
         )
         total = totals[0].clamp(0.0, rule.ceiling)
         return total, _last(total).cast(F64)
@@ -445,9 +619,118 @@ def statistic_of(rule: Rule, llr: Value, memory: Value) -> tuple[Value, Value]:
     known = graph.concat(before, llr, axis=0)  # [n - 1 + k]
     places = _count_up(llr.length(0)).unsqueeze(1) + graph.axes(*range(rule.n))
     last_n = graph.op("Gather", known, places, axis=0)  # [k, n]
-    largest = graph.ops("TopK", last_n, graph.axes(rule.k), dtypes=(None, I64))[0]
     kept = known.slice(1 - rule.n, END, 0).cast(F64)
+    if anew is not None:  # what was before a beginning is not known
+        run = anew.cast(I64).cumsum(0)
+        run = graph.concat(graph.constant([0] * (rule.n - 1), I64), run, axis=0)
+        is_own = graph.op("Gather", run, places, axis=0).eq(
+            run.slice(rule.n - 1, END, 0).unsqueeze(1)
+        )
+        last_n = graph.where(is_own, last_n, NOTHING_YET)
+        kept = graph.where(run.slice(1 - rule.n, END, 0).eq(_last(run)), kept, NOTHING_YET)
+    largest = graph.ops("TopK", last_n, graph.axes(rule.k), dtypes=(None, I64))[0]
     return largest.slice(rule.k - 1, rule.k, 1).squeeze(1), kept
+
+
+class Gaps(NamedTuple):
+    """Decisions of which some are not valid: these are left out, and put back (``rules``).
+
+    Attributes:
+        valid: which count, ``[k]``, bool.
+        has_valid: whether any does.
+        begins_anew: valid ones behind more than ``most`` that are not, ``[k]``, bool.
+        is_over: those that are not, behind at least ``most``, ``[k]``, bool.
+        lost_after: not valid ones in a row at the end, ``[1]``.
+    """
+
+    valid: Value
+    has_valid: Value
+    begins_anew: Value
+    is_over: Value
+    lost_after: Value
+
+    @classmethod
+    def of(cls, valid: Value, number: Value, lost: Value, most: int) -> Gaps:
+        """Of decisions.
+
+        Args:
+            valid: which count.
+            number: of each, ``[k]``, float64, rising by one.
+            lost: decisions in a row before these that do not, ``[1]``.
+            most: of these in a row that change nothing.
+        """
+        graph = valid.graph
+        before = number.slice(0, 1, 0) - lost - 1.0
+        in_row = number - _latest(valid, before, number)
+        ahead = graph.concat(lost, in_row.slice(0, -1, 0), axis=0)
+        has_valid = valid.cast(I64).amax(0).cast(BOOL)
+        anew = valid & (ahead > float(most))
+        return cls(valid, has_valid, anew, in_row > float(most), _last(in_row))
+
+    def valid_of(self, values: Value) -> Value:
+        """Those of valid decisions."""
+        return values.graph.op("Compress", values, self.valid, axis=0)
+
+    def spread(self, values: Value, before: Value) -> Value:
+        """Values of valid decisions to all, of others the last one; ``before [1]`` the first."""
+        graph = values.graph
+        place = self.valid.cast(I64).cumsum(0)
+        return graph.op("Gather", graph.concat(before, values, axis=0), place, axis=0)
+
+    def statistic_of(self, rule: Rule, llr: Value, memory: Value) -> tuple[Value, Value]:
+        """As ``statistic_of``; NaN where not valid."""
+        graph = llr.graph
+
+        def some() -> list[Value]:
+            own, anew = self.valid_of(llr), self.valid_of(self.begins_anew)
+            found, after = statistic_of(rule, own, memory, anew)
+            return [self.spread(found, graph.constant([math.nan], llr.dtype)), after]
+
+        def none() -> list[Value]:
+            return [llr, memory]
+
+        found, after = graph.if_(self.has_valid, some, none)
+        return graph.where(self.valid, found, math.nan), after
+
+    def latched(
+        self,
+        statistic: Value,
+        level: Value,
+        number: Value,
+        memory: Value,
+        rearm: int,
+        refractory: int,
+    ) -> Latched:
+        """As ``latched``; decisions that are not valid raise nothing, and end an alarm in time."""
+        graph = statistic.graph
+
+        def some() -> list[Value]:
+            found = latched(
+                self.valid_of(statistic),
+                level,
+                self.valid_of(number),
+                memory,
+                rearm=rearm,
+                refractory=refractory,
+                first=number.slice(0, 1, 0),
+                anew=self.valid_of(self.begins_anew),
+            )
+            was_on = memory.slice(0, 1, 0) > 0.0
+            on = self.spread(found.on, was_on)
+            alarm = self.spread(found.alarm, was_on) & self.valid
+            since = _last(number) - _last(self.valid_of(number))
+            return [alarm, on, found.memory + graph.constant([0, 0, 1], F64) * since]
+
+        def none() -> list[Value]:
+            was_on = memory.slice(0, 1, 0) > 0.0
+            num = number.length(0).cast(F64)
+            after = memory + graph.constant([0, 0, 1], F64) * num
+            return [self.valid, self.spread(self.valid_of(self.valid), was_on), after]
+
+        alarm, on, after = graph.if_(self.has_valid, some, none)
+        is_over = _last(self.is_over)
+        armed = graph.concat(*[graph.constant([0.0, 0.0], F64), after.slice(2, 3, 0)], axis=0)
+        return Latched(alarm, on & ~self.is_over, graph.where(is_over, armed, after))
 
 
 class Latched(NamedTuple):
@@ -465,7 +748,15 @@ class Latched(NamedTuple):
 
 
 def latched(
-    statistic: Value, level: Value, number: Value, memory: Value, *, rearm: int, refractory: int
+    statistic: Value,
+    level: Value,
+    number: Value,
+    memory: Value,
+    *,
+    rearm: int,
+    refractory: int,
+    first: Value | None = None,
+    anew: Value | None = None,
 ) -> Latched:
     """Alarms as ``onset.rules.latch`` raises them.
 
@@ -481,10 +772,12 @@ def latched(
             decisions since the last alarm (``LATCH_START``); float64.
         rearm: decisions in a row that must be low.
         refractory: shortest distance of two alarms, in decisions.
+        first: number of the first decision behind the memory, where others were left out.
+        anew: decisions before which the latch is armed, and no decision was low, ``[k]``, bool.
 
     Shape:
         - statistic, number: ``[k]``, k at least 1
-        - level: ``[1]``
+        - level, first: ``[1]``
         - memory: ``[3]``
     """
     graph, is_high = statistic.graph, statistic >= level
@@ -495,20 +788,26 @@ def latched(
 
     def awake() -> list[Value]:
         on, below, since = graph.ops("Split", memory, dtypes=[F64] * 3, axis=0, num_outputs=3)
-        before = number.slice(0, 1, 0) - 1.0
-        last = before - since
-        high = _latest(is_high, before - below, number)  # the last one that was not low
-        rearmed = _latest(number - high >= float(max(rearm, 1)), last - on, number)
+        last = (number.slice(0, 1, 0) if first is None else first) - 1.0 - since
+        place = _count_up(number.length(0)).cast(F64)
+        high = _latest(is_high, -1.0 - below, place)  # the last one that was not low
+        if anew is not None:  # before such a one, none was low
+            is_edge = is_high | anew
+            high = _latest(is_edge, -1.0 - below, graph.where(is_high, place, place - 1.0))
+        rearms, since_when = place - high >= float(max(rearm, 1)), number
+        if anew is not None:  # armed before it, so that it may raise an alarm itself
+            rearms, since_when = rearms | anew, graph.where(anew & is_high, number - 1.0, number)
+        rearmed = _latest(rearms, last - on, since_when)
         allowed = rearmed.minimum(number - float(refractory))
         allowed = graph.where(is_high, allowed, -math.inf)
         (end,), (alarms,) = graph.scan(raise_, [last.squeeze(0)], [allowed, number])
         is_on = alarms > rearmed
         now = _last(number)
-        after = _last(is_on).cast(F64), now - _last(high), now - end
+        after = _last(is_on).cast(F64), _last(place) - _last(high), now - end
         return [alarms.eq(number), is_on, graph.concat(*after, axis=0)]
 
     def asleep() -> list[Value]:  # nothing is high
-        num = number.length(0).cast(F64)
+        num = _last(number) + 1.0 - (number.slice(0, 1, 0) if first is None else first)
         return [is_high, is_high, memory + graph.constant([0, 0, 1], F64) * num]
 
     is_awake = (statistic.amax(0, keepdim=True) >= level) | (memory.slice(0, 1, 0) > 0.0)
@@ -526,6 +825,11 @@ def _latest(mask: Value, start: Value, values: Value) -> Value:
     graph = values.graph
     held = graph.concat(start, graph.op("Compress", values, mask, axis=0), axis=0)
     return graph.op("Gather", held, mask.cast(I64).cumsum(0), axis=0)
+
+
+def _is_whole(valid: Value, lost: Value) -> Value:
+    """Whether all decisions ``[k]`` are valid, and so was the one before, a scalar."""
+    return valid.cast(I64).amin(0).cast(BOOL) & (lost <= 0.0).squeeze(0)
 
 
 def _last(value: Value) -> Value:

@@ -70,24 +70,26 @@ class FeatureCache:
         self.folder = Path(folder)
         self.most_bytes = most_bytes
 
-    def load(self, key: str) -> Tensor | None:
-        """The features ``[N, F]``, or ``None`` if there are none or their file is damaged."""
+    def load(self, key: str) -> tuple[Tensor, int] | None:
+        """Features ``[N, F]`` and the longest run of equal samples; ``None`` if damaged or none."""
         path = self._path(key)
         try:
             with path.open("rb") as file, np.load(file) as content:
                 features = torch.from_numpy(content["features"])
+                longest_run = int(content["longest_run"])
             os.utime(path)  # prune drops what was used longest ago
         except FileNotFoundError:
             return None
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
             log.warning("cached features %s are damaged; computing them again", path)
             return None
-        return features
+        return features, longest_run
 
-    def store(self, key: str, features: Tensor) -> None:
-        """Write features ``[N, F]``, whole or not at all."""
+    def store(self, key: str, features: Tensor, longest_run: int) -> None:
+        """Write features ``[N, F]`` and the longest run, whole or not at all."""
         with whole_file(self._path(key)) as temporary, temporary.open("wb") as file:
-            np.savez(file, features=features.numpy().astype("<f4", order="C"))
+            array = features.numpy().astype("<f4", order="C")
+            np.savez(file, features=array, longest_run=np.int64(longest_run))
 
     def prune(self) -> None:
         """Delete the least recently used files until the folder holds at most ``most_bytes``."""

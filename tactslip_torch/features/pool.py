@@ -37,7 +37,6 @@ from tactslip_torch.features.ops import (
     bounded_gradient,
     full_precision,
     is_concrete,
-    is_traced,
     saturating,
 )
 from tactslip_torch.hand import Channel, HandLayout
@@ -61,14 +60,6 @@ NATIVE_SPAN = 2.0**-10
 LEAST_SPAN = {torch.float32: 2.0**-17, torch.float64: 2.0**-22}
 """Part of the largest raw sample within reach that a filtered span must exceed, by the dtype of the
 raw samples: 64 roundings of float32; of float64, what leaves seven digits to a filtered sample."""
-VALIDITY = (
-    "every channel in use is finite, and its filtered span above 2^-22 of the largest raw sample "
-    "that its filter takes in, of float32 samples above 2^-17; in native float32 a film's above "
-    "2^-10"
-)
-"""``FeaturePool.validity`` of the channels in use, in words for people."""
-LARGEST_SAMPLE = torch.finfo(torch.float64).max / 64
-"""Volts; what is larger counts as Inf, because its branches and spectra may leave float64."""
 MOST_LEVELS = 4
 """Wavelet levels of the paper."""
 _FEW_BINS = 4  # so few are done here: another thread would take longer to start
@@ -317,45 +308,6 @@ class FeaturePool(nn.Module):
         x = bounded_gradient(x)
         return x if self.arithmetic == "native" else x.double()
 
-    def validity(self, bins: Tensor) -> Tensor:
-        """Which channels of filtered bins can be trusted.
-
-        False where a channel holds a NaN or Inf (``is_missing``) or its span is within 64 eps of
-        its magnitude (a dead sensor, or a vibration the dtype cannot resolve). In native float32 a
-        film's span must be a thousandth of it, for its branches to survive. What the filter took
-        away is not seen here: ``SlipDetector.predict_raw`` compares with the raw samples.
-
-        Shape:
-            - bins: ``[*, C, n]``
-            - output: ``[*, C]``, bool
-
-        Raises:
-            ValueError: as ``forward``.
-        """
-        self.check(bins)
-        return self.is_alive(bins) & ~self.is_missing(bins)
-
-    def is_alive(
-        self, bins: Tensor, given: torch.dtype | None = None, raw_magnitude: Tensor | None = None
-    ) -> Tensor:
-        """Which channels have a span that can be resolved: ``validity`` but for its limit.
-
-        Args:
-            bins: filtered.
-            given: dtype of the samples that they were filtered from, by default theirs.
-            raw_magnitude: of these samples (``ChannelFilter.raw_magnitude``), by which a span is
-                decided (``LEAST_SPAN``); without, by the magnitude of the filtered bin.
-
-        Shape:
-            - bins: ``[*, C, n]``; raw_magnitude: ``[*, C]``
-            - output: ``[*, C]``, bool
-        """
-        high, low = bins.amax(-1).double(), bins.amin(-1).double()
-        is_raw = raw_magnitude is not None
-        magnitude = torch.maximum(high, -low) if raw_magnitude is None else raw_magnitude
-        inverse = self.inverse_span(given or bins.dtype, is_raw).to(high.device)
-        return (high - low) * inverse > magnitude  # by the inverse, so that nothing underflows
-
     def inverse_span(self, given: torch.dtype, is_raw: bool) -> Tensor:
         """One over the least span that is resolved, as a part of the magnitude, ``[C]``, float64.
 
@@ -373,18 +325,6 @@ class FeaturePool(nn.Module):
                 inverse = torch.tensor(least, dtype=torch.float64, device="cpu").reciprocal()
             self._inverses[given, is_raw] = inverse
         return inverse
-
-    def is_missing(self, bins: Tensor) -> Tensor:
-        """Which channels hold a NaN or Inf, or a sample beyond ``LARGEST_SAMPLE``.
-
-        Shape:
-            - bins: ``[*, C, n]``
-            - output: ``[*, C]``, bool
-        """
-        largest = min(LARGEST_SAMPLE, torch.finfo(bins.dtype).max)
-        if is_traced():  # onnxruntime's maxima pass over NaN
-            return (~(bins.abs() <= largest)).any(-1)
-        return ~(torch.maximum(bins.amax(-1), -bins.amin(-1)) <= largest)
 
     def check(self, bins: Tensor) -> None:
         """Refuse what are no bins of this hand.

@@ -6,13 +6,12 @@ features that any backend has made, before scaling and head:
 
     y_c = k sign(x_c) log(1 + |x_c| / k),    pooled = statistic of y_c over the channels c in use
 
-with ``k`` the training median of ``|x|`` of the descriptor. A channel that is missing or stuck is
-left out of its pools.
+with ``k`` the training median of ``|x|`` of the descriptor. Channels that are lost (missing or
+silent, ``features.sensing``) are left out of their pools.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
@@ -39,12 +38,7 @@ from tactslip_torch.runtime import for_each
 STATISTICS = ("mean", "std", "min", "max", "median")
 SORTED = "sorted"
 """In place of a list of statistics: the values in ascending order, ``rank1`` to ``rankN``."""
-STUCK_FRACTION = 0.1
-"""A channel that ranges less than this part of what channels of its kind range at their quietest
-in training is stuck. Ours: ten times below what was ever seen of a working channel."""
-QUIET_QUANTILE = 0.01
 CHUNK_BINS = 2048  # whose features are pooled at a time
-_RANGE_OF = {"slow": "raw", "fast": "A1"}  # the component whose range tells that a channel lives
 _RANK = re.compile(r"rank([1-9]\d*)")
 
 
@@ -149,8 +143,6 @@ class ChannelPooling(nn.Module):
         names: what comes out, K features, pooled or of channels.
         knee: ``k`` of the compression, one for each of ``families``.
         fill: what a pooled column is where no channel of its kind is in use; others are not read.
-        least_range: of the filtered bin of a channel of each of ``kinds``, below which it counts as
-            stuck; in the unit of the samples. 0: no channel ever does.
 
     Attributes:
         names: of the columns.
@@ -159,7 +151,7 @@ class ChannelPooling(nn.Module):
         families: descriptors that are pooled, as names without statistic, kind by kind.
 
     Shape:
-        - knee: ``[families]``; fill: ``[K]``; least_range: ``[kinds]``
+        - knee: ``[families]``; fill: ``[K]``
 
     Raises:
         ValueError: if shapes disagree or a value is not finite, or a name is unknown.
@@ -167,15 +159,9 @@ class ChannelPooling(nn.Module):
 
     knee: Tensor
     fill: Tensor
-    least_range: Tensor
 
     def __init__(
-        self,
-        hand: HandLayout,
-        names: Sequence[FeatureName],
-        knee: Tensor,
-        fill: Tensor,
-        least_range: Tensor,
+        self, hand: HandLayout, names: Sequence[FeatureName], knee: Tensor, fill: Tensor
     ) -> None:
         super().__init__()
         self.hand, self.names = hand, tuple(names)
@@ -190,27 +176,24 @@ class ChannelPooling(nn.Module):
             if not (name.statistic in STATISTICS or _RANK.fullmatch(name.statistic)):
                 raise ValueError(f"unknown statistic over channels in {str(name)!r}")
         self.families = _families(self.kinds, pooled)
-        shapes = [tuple(each.shape) for each in (knee, fill, least_range)]
-        wanted = [(len(self.families),), (len(self.names),), (len(self.kinds),)]
+        shapes = [tuple(each.shape) for each in (knee, fill)]
+        wanted = [(len(self.families),), (len(self.names),)]
         if shapes != wanted:
-            raise ValueError(f"expected knee, fill, least_range of shapes {wanted}, got {shapes}")
-        if not (bool((knee > 0).all()) and bool((least_range >= 0).all())) or not all(
-            bool(each.isfinite().all()) for each in (knee, fill, least_range)
-        ):
+            raise ValueError(f"expected knee and fill of shapes {wanted}, got {shapes}")
+        if not bool((knee > 0).all() & knee.isfinite().all() & fill.isfinite().all()):
             raise ValueError("pooling constants must be finite and knees positive; fit again")
-        for label, value in (("knee", knee), ("fill", fill), ("least_range", least_range)):
-            self.register_buffer(label, value.double().clone())
+        self.register_buffer("knee", knee.double().clone())
+        self.register_buffer("fill", fill.double().clone())
         self._lay_out(by_kind)
 
     def _lay_out(self, by_kind: Mapping[str, tuple[int, ...]]) -> None:
         """Which inputs there are, and what is made of which."""
         singles = [name for name in self.names if not name.is_pooled]
-        ranges = {kind: [_range_name(self.hand, c) for c in by_kind[kind]] for kind in self.kinds}
         members = {
             family: [replace(family, channel=self.hand.names[c]) for c in by_kind[family.channel]]
             for family in self.families
         }
-        taken = [*singles, *(n for own in (*ranges.values(), *members.values()) for n in own)]
+        taken = [*singles, *(name for own in members.values() for name in own)]
         self.inputs = tuple(dict.fromkeys(taken))
         place = {name: index for index, name in enumerate(self.inputs)}
         groups, made = [], list(singles)
@@ -224,7 +207,6 @@ class ChannelPooling(nn.Module):
                     channels=by_kind[kind],
                     families=tuple(own),
                     columns=tuple(place[n] for i in own for n in members[self.families[i]]),
-                    ranges=tuple(place[name] for name in ranges[kind]),
                     statistics=tuple(statistics),
                 )
             )
@@ -246,6 +228,7 @@ class ChannelPooling(nn.Module):
         names: Sequence[FeatureName],
         features: Tensor,
         setting: str | Sequence[str],
+        is_lost: Tensor | None = None,
     ) -> ChannelPooling:
         """Pool all features of training bins; the columns are the pooled features alone.
 
@@ -254,48 +237,39 @@ class ChannelPooling(nn.Module):
             names: of the features, F; all channels of a kind have the same descriptors.
             features: of training bins.
             setting: ``"sorted"`` or statistics, as ``features.pooling`` has them.
+            is_lost: channels that are left out of their bins; default: none.
 
         Shape:
-            - features: ``[N, F]``, at least one bin, finite
+            - features: ``[N, F]``, at least one bin, finite; is_lost: ``[N, C]``, bool
 
         Raises:
-            ValueError: as ``statistics_of``; or if features do not tell the range of each channel.
+            ValueError: as ``statistics_of``.
         """
         pooled = pooled_names(hand, names, setting)
         place = {name: index for index, name in enumerate(names)}
-        least, in_use = [], {}
-        kinds = {name.channel for name in pooled}
-        for kind, channels in _channels_by_kind(hand).items():
-            if kind not in kinds:
-                continue
-            told_by = [_range_name(hand, channel) for channel in channels]
-            if untold := [name for name in told_by if name not in place]:
-                raise ValueError(f"pooling needs the feature {str(untold[0])!r}; leave it in")
-            ranges = features[:, [place[name] for name in told_by]].double()
-            quiet = ranges.sort(0).values[math.floor(QUIET_QUANTILE * (len(ranges) - 1))]
-            least.append(STUCK_FRACTION * float(quiet.median()))
-            in_use[kind] = ~(ranges < least[-1])
         layer = cls(
-            hand,
-            pooled,
-            torch.ones(len(set(map(_family, pooled)))),
-            torch.zeros(len(pooled)),
-            torch.tensor(least, dtype=torch.float64),
+            hand, pooled, torch.ones(len(set(map(_family, pooled)))), torch.zeros(len(pooled))
         )
         inputs = torch.tensor([place[name] for name in layer.inputs])
-        for kind, group in zip(layer.kinds, layer.groups, strict=True):
+        for group in layer.groups:
             values = features[:, inputs[list(group.columns)]].double().abs()
             values = values.unflatten(1, (-1, len(group.channels)))
-            values = values.masked_fill(~in_use[kind][:, None, :], torch.nan).transpose(0, 1)
-            layer.knee[list(group.families)] = _knees(values.flatten(1))
-        columns = [layer(part[:, inputs].double()) for part in features.split(CHUNK_BINS)]
+            if is_lost is not None:
+                lost = is_lost[:, None, list(group.channels)]
+                values = values.masked_fill(lost, torch.nan)
+            layer.knee[list(group.families)] = _knees(values.transpose(0, 1).flatten(1))
+        parts = torch.arange(len(features)).split(CHUNK_BINS)
+        columns = [
+            layer(features[part][:, inputs].double(), None if is_lost is None else is_lost[part])
+            for part in parts
+        ]
         layer.fill.copy_(torch.cat(columns).median(0).values)
         return layer
 
     def forward(
         self,
         features: Tensor,
-        is_missing: Tensor | None = None,
+        is_lost: Tensor | None = None,
         backend: native.BackendName = "auto",
     ) -> Tensor:
         """Columns of bins.
@@ -305,42 +279,41 @@ class ChannelPooling(nn.Module):
 
         Shape:
             - features: ``[*, M]``, of ``inputs``, float32 or float64
-            - is_missing: ``[*, C]``, bool, channels that are left out beside those that are stuck
+            - is_lost: ``[*, C]``, bool, channels that are left out; default: none
             - output: ``[*, K]``; NaN where a feature of a channel in use is NaN
         """
         if features.shape[-1] != len(self.inputs):
             raise ValueError(f"expected {len(self.inputs)} features, got {features.shape[-1]}")
-        given = [x for x in (features, is_missing, *self.buffers()) if x is not None]
+        given = [x for x in (features, is_lost, *self.buffers()) if x is not None]
         if all(map(is_concrete, given)) and native.backend_of(backend) == "native":
-            return self._by_native(features.detach(), is_missing)
+            return self._by_native(features.detach(), is_lost)
+        if is_lost is None:
+            is_lost = torch.zeros(len(self.hand), dtype=torch.bool, device=features.device)
+            is_lost = is_lost.expand(*features.shape[:-1], -1)
         parts, is_some = [features[..., list(self.singles)]], []
-        for index, group in enumerate(self.groups):
-            in_use = ~(features[..., list(group.ranges)] < self.least_range[index].to(features))
-            if is_missing is not None:
-                in_use = in_use & ~is_missing[..., list(group.channels)]
+        for group in self.groups:
+            in_use = ~is_lost[..., list(group.channels)]
             is_some.append(in_use.any(-1))
             num_channels = len(group.channels)
             values = features[..., list(group.columns)].unflatten(-1, (-1, num_channels))
-            knee = self.knee[list(group.families), None].to(features)
-            in_rows = in_use[..., None, :]
-            values = signed_log(values, knee)
-            parts += over_channels(values, in_rows, group.statistics, num_channels)
+            values = signed_log(values, self.knee[list(group.families), None].to(features))
+            parts += over_channels(values, in_use[..., None, :], group.statistics, num_channels)
         columns = torch.cat(parts, dim=-1)[..., list(self.order)]
         known = torch.stack([*is_some, torch.ones_like(is_some[0])], -1)[..., list(self.kind_of)]
         return torch.where(known, columns, self.fill.to(features))
 
-    def _by_native(self, features: Tensor, is_missing: Tensor | None) -> Tensor:
+    def _by_native(self, features: Tensor, is_lost: Tensor | None) -> Tensor:
         with torch.inference_mode(False), torch.no_grad():
-            buffers = [self.knee, self.fill, self.least_range]
+            buffers = [self.knee, self.fill]
             if self._engine is None or not are_unchanged(buffers, self._engine[1]):
                 self._engine = self.machine(), stamps_of(buffers)
             machine = self._engine[0]
             flat = features.reshape(-1, features.shape[-1]).contiguous().numpy()
             found = torch.empty(len(flat), len(self.names), dtype=features.dtype, device="cpu")
             masks = None
-            if is_missing is not None:
+            if is_lost is not None:
                 shape = (*features.shape[:-1], len(self.hand))
-                masks = is_missing.bool().expand(shape).reshape(-1, shape[-1]).numpy()
+                masks = is_lost.bool().expand(shape).reshape(-1, shape[-1]).numpy()
 
             def work(start: int) -> None:
                 some = slice(start, start + CHUNK_BINS)
@@ -354,13 +327,12 @@ class ChannelPooling(nn.Module):
         """The native engine of the layer and of what follows it, ``scaling`` and ``head``."""
         column = {made: index for index, made in enumerate(self.order)}
         pools, first = [], len(self.singles)
-        for index, group in enumerate(self.groups):
+        for group in self.groups:
             num, shape = len(group.channels), (len(group.statistics), len(group.families))
             own = range(first, first := first + shape[0] * shape[1])
             pools.append(
                 native.Pool(
                     channels=group.channels,
-                    ranges=group.ranges,
                     inputs=np.reshape(group.columns, (-1, num)),
                     statistics=[
                         _fraction(s, num) if s == "median" or _RANK.fullmatch(s) else s
@@ -368,14 +340,16 @@ class ChannelPooling(nn.Module):
                     ],
                     columns=np.reshape([column.get(made, -1) for made in own], shape),
                     knees=self.knee[list(group.families)].cpu().numpy(),
-                    least_range=float(self.least_range[index]),
                 )
             )
         return native.Machine(
             num_channels=len(self.hand),
             num_inputs=len(self.inputs),
             num_columns=len(self.names),
-            singles=[(place, column[made]) for made, place in enumerate(self.singles)],
+            singles=[
+                (place, column[made], self.hand.names.index(self.inputs[place].channel))
+                for made, place in enumerate(self.singles)
+            ],
             pools=pools,
             fill=self.fill.cpu().numpy(),
             **more,
@@ -400,8 +374,7 @@ class ChannelPooling(nn.Module):
         pooled = [name for name in names if name.is_pooled]
         kinds = [kind for kind in self.kinds if any(name.channel == kind for name in pooled)]
         families = [self.families.index(family) for family in _families(kinds, pooled)]
-        places = [self.kinds.index(kind) for kind in kinds]
-        return ChannelPooling(self.hand, names, self.knee[families], fill, self.least_range[places])
+        return ChannelPooling(self.hand, names, self.knee[families], fill)
 
     def to_dict(self) -> dict[str, Any]:
         """Names of the columns as JSON-able rows; ``from_dict`` takes them with the tensors."""
@@ -423,14 +396,12 @@ class PooledKind:
         channels: indices in the hand, m of them.
         families: places of its descriptors in ``ChannelPooling.families``, R of them.
         columns: of the inputs, ``R * m``: each descriptor of all channels, one after the other.
-        ranges: of the inputs, the range of each channel's bin.
         statistics: over the channels.
     """
 
     channels: tuple[int, ...]
     families: tuple[int, ...]
     columns: tuple[int, ...]
-    ranges: tuple[int, ...]
     statistics: tuple[str, ...]
 
 
@@ -447,13 +418,6 @@ def _families(kinds: Sequence[str], pooled: Sequence[FeatureName]) -> tuple[Feat
 def _family(name: FeatureName) -> FeatureName:
     """A descriptor of a kind, whatever the statistic."""
     return replace(name, statistic="")
-
-
-def _range_name(hand: HandLayout, channel: int) -> FeatureName:
-    """The feature that tells whether a channel moves at all."""
-    adapting = hand.channels[channel].adapting
-    assert adapting is not None  # of a made channel
-    return FeatureName(hand.names[channel], _RANGE_OF[adapting], "time", "range")
 
 
 def _knees(sizes: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ class TrainingStatistics:
         moments: of all bins.
         minimum: ``[F]``, float32, of all bins; +inf without any.
         maximum: ``[F]``, float32; -inf without any.
+        longest_run: most equal samples in a row of a channel that moves.
         sample: bins by group and class.
         seen_batches: recording names and digests of their bins.
     """
@@ -33,6 +34,7 @@ class TrainingStatistics:
         self.moments = ClassMoments(num_features)
         self.minimum = torch.full((num_features,), torch.inf)
         self.maximum = torch.full((num_features,), -torch.inf)
+        self.longest_run = 0
         self.sample = BinSample(sample_bins)
         self.seen_batches = SeenBatches()
 
@@ -41,8 +43,22 @@ class TrainingStatistics:
         """Length of a feature vector."""
         return len(self.minimum)
 
-    def update(self, recording: str, group: str, features: Tensor, is_slip: Tensor) -> None:
+    def update(
+        self,
+        recording: str,
+        group: str,
+        features: Tensor,
+        is_slip: Tensor,
+        longest_run: int = 0,
+    ) -> None:
         """Add the training bins of a recording: all of them or, on an error, none.
+
+        Args:
+            recording: its name.
+            group: that the sample draws from.
+            features: of its bins.
+            is_slip: which they are.
+            longest_run: most equal samples in a row of a channel of it that moves.
 
         Shape:
             - features: ``[N, F]``, float32, finite
@@ -61,6 +77,7 @@ class TrainingStatistics:
             self.seen_batches.remove(recording, digest)
             raise ValueError(f"recording {recording!r}: {error}") from None
         self.sample.update(recording, group, features, is_slip)
+        self.longest_run = max(self.longest_run, longest_run)
         if len(features):
             self._widen(features.amin(0), features.amax(0))
 
@@ -80,6 +97,7 @@ class TrainingStatistics:
         self.seen_batches.merge(other.seen_batches)
         self.moments.merge(other.moments)
         self.sample.merge(other.sample)
+        self.longest_run = max(self.longest_run, other.longest_run)
         self._widen(other.minimum, other.maximum)
 
     def _widen(self, minimum: Tensor, maximum: Tensor) -> None:

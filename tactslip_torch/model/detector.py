@@ -20,16 +20,24 @@ from tactslip_torch.features.ops import (
     full_precision,
     is_concrete,
     is_nowhere,
+    is_traced,
     saturating,
     stamps_of,
 )
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
+from tactslip_torch.features.sensing import (
+    FEWEST_SAMPLES,
+    LARGEST_SAMPLE,
+    Sensing,
+    is_alive,
+    is_enough,
+)
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Calibration, calibration_from_dict
 from tactslip_torch.model.calibration import probability as stated
 from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_from_dict
-from tactslip_torch.model.missing_channels import (
+from tactslip_torch.model.prediction import (
     ChannelMask,
     Nonfinite,
     Prediction,
@@ -38,7 +46,7 @@ from tactslip_torch.model.missing_channels import (
     without,
 )
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.native import BackendName, Filters, Machine, Scores, backend_of
+from tactslip_torch.native import BackendName, Channels, Filters, Machine, backend_of
 from tactslip_torch.own_files import DETECTOR as FORMAT
 from tactslip_torch.own_files import FORGED, load_table, save_table
 from tactslip_torch.runtime import PACKAGE
@@ -65,13 +73,15 @@ class SlipDetector(nn.Module):
         scaler: of the K columns.
         head: the machine on scaled features.
         info: JSON-able facts about the training, kept in the file.
-        imputation: scaled features in place of those of a missing channel, ``[K]``; default 0.
+        imputation: scaled columns in place of those of a lost channel, ``[K]``; default 0.
         pooling: from the features that are read to the columns; ``None``: they are the columns.
+        sensing: what training tells of channels that work, by which lost channels and decisions
+            that are not valid are told; may be set at any time. Default: ``Sensing.unknown``.
         backend: what features are made by where no gradient is asked for (``FeaturePool``).
 
     Shape:
         - bins: ``[*, C, n]``, filtered, in volts; ``n = pool.bin_samples``
-        - score: ``[*]``, dtype of ``bins``; at least 0 means slip
+        - score: ``[*]``, dtype of ``bins``; at least 0 means slip, NaN: not valid
         - inside: ``bins -> features [*, M] -> columns [*, K] -> scaled [*, K] -> score [*]``
         - raw samples, for ``score_raw`` and ``predict_raw``: ``[*, C, before + n + after]``, with
           ``context_before`` and ``context_after`` samples around the bin
@@ -83,6 +93,8 @@ class SlipDetector(nn.Module):
     imputation: Tensor
     channel_index: Tensor  # of each column; one past the last channel for a pooled one
     needed_index: Tensor  # of the channels in use
+    _is_used: Tensor
+    counted: Tensor  # [C], 1 for channels that count among those that must be alive
 
     def __init__(
         self,
@@ -95,6 +107,7 @@ class SlipDetector(nn.Module):
         imputation: Tensor | None = None,
         pooling: ChannelPooling | None = None,
         *,
+        sensing: Sensing | None = None,
         backend: BackendName = "auto",
     ) -> None:
         super().__init__()
@@ -113,6 +126,29 @@ class SlipDetector(nn.Module):
         indices = {"channel": channels, "needed": self.extractor.plan.channels}
         for name, index in indices.items():
             self.register_buffer(f"{name}_index", torch.tensor(index), persistent=False)
+        is_used = torch.zeros(len(pool.hand), dtype=torch.bool)
+        is_used[list(indices["needed"])] = True
+        self.register_buffer("_is_used", is_used, persistent=False)
+        counted = torch.zeros(len(pool.hand), dtype=torch.float64)
+        counted[counted_channels(pool.hand, indices["needed"], pooling is not None)] = 1.0
+        self.register_buffer("counted", counted, persistent=False)
+        if sensing is None:
+            num = int(counted.sum())
+            sensing = Sensing.unknown(len(pool.hand), num, pool.sample_rate_hz)
+        self.sensing = sensing
+
+    @property
+    def sensing(self) -> Sensing:
+        """What training tells of channels that work."""
+        return self._sensing
+
+    @sensing.setter
+    def sensing(self, sensing: Sensing) -> None:
+        if len(sensing.rest_span) != (num := len(self.pool.hand)):
+            raise ValueError(f"expected spans of {num} channels, got {len(sensing.rest_span)}")
+        if sensing.min_alive > (most := int(self.counted.sum())):
+            raise ValueError(f"min_alive is {sensing.min_alive}, of {most} channels that count")
+        self._sensing, self._engine = sensing, None
 
     def __repr__(self) -> str:
         pool, info, degree = self.pool, self.info, "kernel"
@@ -166,9 +202,7 @@ class SlipDetector(nn.Module):
         return max(self.channel_filter.reaches[i][1] for i in self.extractor.plan.channels)
 
     def forward(self, bins: Tensor) -> Tensor:
-        """Score filtered bins; at least 0 means slip, NaN where a needed value is not finite.
-
-        ``predict`` is for programs that must go on when a sensor fails.
+        """Scores of filtered bins, as ``predict`` has them: at least 0 is slip, NaN not valid.
 
         Shape:
             - bins: ``[*, C, n]``
@@ -177,11 +211,10 @@ class SlipDetector(nn.Module):
         Raises:
             ValueError: if the number of channels or samples is another.
         """
-        self.pool.check(bins)
-        return predict_in_parts(lambda part: self._score(part, False), bins)
+        return self.predict(bins).score
 
     def score_raw(self, samples: Tensor) -> Tensor:
-        """Filter and score raw bins that come with their context.
+        """Scores of raw bins that come with their context, as ``predict_raw`` has them.
 
         Shape:
             - samples: ``[*, C, context_before + n + context_after]``, volts
@@ -190,8 +223,7 @@ class SlipDetector(nn.Module):
         Raises:
             ValueError: if the number of channels or samples is another.
         """
-        self._check_raw(samples)
-        return predict_in_parts(lambda part: self._score(part, True), samples)
+        return self.predict_raw(samples).score
 
     def predict(
         self,
@@ -200,15 +232,15 @@ class SlipDetector(nn.Module):
         given: torch.dtype | None = None,
         masked_channels: ChannelMask | None = None,
     ) -> Prediction:
-        """Score filtered bins of a hand whose sensors may fail: a finite score, and its validity.
+        """Score filtered bins of a hand whose sensors may fail: a score, and whether it counts.
 
         Args:
             bins: in volts.
-            nonfinite: what to do about NaN and Inf. ``"mask"``: the channel counts as missing, its
-                columns take their imputation values, the score is not valid. ``"raise"``: refuse.
+            nonfinite: what to do about NaN and Inf. ``"mask"``: the channel counts as missing.
+                ``"raise"``: refuse.
             given: dtype of the samples that the bins were filtered from, float32 or float64, by
-                default theirs; that of the score, and what a sensor must resolve to be trusted
-                (``FeaturePool.validity``: the raw samples are not known here).
+                default theirs; that of the score, whose rounding a span must exceed (the raw
+                samples are not known here).
             masked_channels: channels that count as missing whatever they say.
 
         Shape:
@@ -231,7 +263,7 @@ class SlipDetector(nn.Module):
     ) -> Prediction:
         """``predict`` for raw bins with their context, where NaN and Inf count as filters reach it.
 
-        A channel is trusted where what its filter leaves stands above the rounding of the raw
+        A channel is alive only where what its filter leaves stands above the rounding of the raw
         samples in its frames (``features.pool.LEAST_SPAN``). A tone that the filter takes out
         wholly leaves nothing, however loud it is.
 
@@ -245,9 +277,9 @@ class SlipDetector(nn.Module):
         return self._predict_in_parts(samples, True, nonfinite, given, masked_channels)
 
     def probability(self, samples: Tensor | NDArray[Any]) -> Tensor:
-        """How probable slip is, by ``calibration``: of filtered bins, or of raw ones.
+        """How probable slip is, by ``calibration``: of filtered bins, or of raw ones; else NaN.
 
-        Channels with NaN are left out, as ``predict`` does.
+        It is NaN where the decision is not valid. Lost channels are left out, as ``predict`` does.
 
         Shape:
             - samples: ``[*, C, n]``, filtered, or ``[*, C, context_before + n + context_after]``
@@ -264,21 +296,13 @@ class SlipDetector(nn.Module):
         x = torch.as_tensor(samples)
         is_filtered = x.ndim > 0 and x.shape[-1] == self.pool.bin_samples
         found = self.predict(x) if is_filtered else self.predict_raw(x)
-        return stated(known[0].llr(found.score), known[1])
+        score = torch.where(found.is_valid, found.score, 0.0)
+        return stated(known[0].llr(score), known[1]).masked_fill(~found.is_valid, torch.nan)
 
     def predict_proba(self, samples: Tensor | NDArray[Any]) -> Tensor:
         """Probabilities of non-slip and slip, ``[*, 2]``; otherwise as ``probability``."""
         slip = self.probability(samples)
         return torch.stack([1 - slip, slip], -1)
-
-    def validity(self, bins: Tensor) -> Tensor:
-        """Whether every channel in use can be trusted (``FeaturePool.validity``), as ``predict``.
-
-        Shape:
-            - bins: ``[*, C, n]``, filtered
-            - output: ``[*]``, bool
-        """
-        return self._needed(self.pool.validity(bins))
 
     def score_features(self, features: Tensor) -> Tensor:
         """Score features that are neither pooled nor scaled.
@@ -291,24 +315,28 @@ class SlipDetector(nn.Module):
             score: Tensor = self.head(self.scaled(features))
         return score
 
-    def columns(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
+    def columns(self, features: Tensor, is_lost: Tensor | None = None) -> Tensor:
         """What the scaler takes: features, pooled over channels where the detector does that.
 
         Shape:
             - features: ``[*, M]`` in the order of ``selected``
-            - is_missing: ``[*, C]``, bool, channels to leave out of their pools
+            - is_lost: ``[*, C]``, bool, channels to leave out of their pools
             - output: ``[*, K]``
         """
         if self.pooling is None:
             return features
-        columns: Tensor = self.pooling(features, is_missing, self.extractor.backend)
+        columns: Tensor = self.pooling(features, is_lost, self.extractor.backend)
         return columns
 
-    def scaled(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
+    def scaled(self, features: Tensor, is_lost: Tensor | None = None) -> Tensor:
         """Scaled columns, which the head takes; shapes as ``columns`` has them."""
-        columns = self.columns(saturating(features, self.scaler.minimum.dtype), is_missing)
-        scaled: Tensor = self.scaler(columns)
-        return scaled.to(self.imputation.dtype)
+        columns = self.columns(saturating(features, self.scaler.minimum.dtype), is_lost)
+        scaled: Tensor = self.scaler(columns).to(self.imputation.dtype)
+        if is_lost is None:
+            return scaled
+        pooled = torch.zeros_like(is_lost[..., :1])  # a pooled column is of the other channels
+        is_filled = torch.cat([is_lost, pooled], -1).index_select(-1, self.channel_index)
+        return torch.where(is_filled, self.imputation, scaled)
 
     def _check_raw(self, samples: Tensor) -> None:
         check_samples(samples)
@@ -319,16 +347,6 @@ class SlipDetector(nn.Module):
                 f"expected bins of {wanted} samples, {before} of context before and {after} "
                 f"behind, got {samples.shape[-1]}"
             )
-
-    def _score(self, x: Tensor, is_raw: bool) -> Tensor:
-        """Scores of filtered bins, or of raw ones with their context."""
-        if (engine := self._engine_of(x)) is not None:
-            return engine.scores(x, is_raw)
-        return self._score_by_torch(x, is_raw)
-
-    def _score_by_torch(self, x: Tensor, is_raw: bool) -> Tensor:
-        features = self._features(self._filter(x) if is_raw else x)
-        return saturating(self.score_features(features), x.dtype)
 
     def _predict_in_parts(
         self,
@@ -349,33 +367,41 @@ class SlipDetector(nn.Module):
         return predict_in_parts(lambda part: self._predict(part, is_raw, dtype), x)
 
     def _predict(self, x: Tensor, is_raw: bool, given: torch.dtype) -> Prediction:
-        """The same, valid by the dtype they were given in, which is the score's."""
+        """The same, as they were given in a dtype, which is the score's."""
         if (engine := self._engine_of(x)) is not None:
             return engine.predict(x, is_raw, given)
         return self._predict_by_torch(x, is_raw, given)
 
     def _predict_by_torch(self, x: Tensor, is_raw: bool, given: torch.dtype) -> Prediction:
-        bins, raw_magnitude = x, None
-        if is_raw:
-            bins = self._filter(x)
-            raw_magnitude = self.channel_filter.raw_magnitude(x, self.extractor.plan.channels)
-        is_alive = self.pool.is_alive(bins, given, raw_magnitude)
+        used = self.extractor.plan.channels
+        bins = self._filter(x) if is_raw else x
+        high, low = bins.detach().amax(-1).double(), bins.detach().amin(-1).double()
+        largest = torch.maximum(high, -low)
+        loudest = self.channel_filter.raw_magnitude(x, used) if is_raw else largest
+        is_known = largest <= min(LARGEST_SAMPLE, torch.finfo(bins.dtype).max)
+        if is_traced():  # onnxruntime's maxima pass over NaN
+            is_known = bins.isfinite().all(-1) & is_known
+        span, alive = high - low, is_known
+        if self.pool.bin_samples >= FEWEST_SAMPLES:
+            inverse = self.pool.inverse_span(given, is_raw).to(span.device)
+            floor = torch.tensor(self.sensing.floor, dtype=torch.float64, device=span.device)
+            alive = is_alive(span, loudest, is_known, inverse, floor)
+        is_used = torch.zeros_like(is_known[..., :1]) | self._is_used
+        is_lost = ~alive & is_used
+        is_valid, in_range = is_enough(
+            alive & is_used, span, self.counted, self.sensing, range(len(self.pool.hand))
+        )
         bins = self.pool.widen(bins)
-        is_missing = self.pool.is_missing(bins)
-        is_whole = is_nowhere(is_missing)
+        is_whole = is_nowhere(~is_known)
         if not is_whole:
-            bins = torch.where(is_missing[..., None], 0.0, bins)
-        scaled = self.scaled(self._features(bins), None if is_whole else is_missing)
-        if not is_whole:
-            scaled = torch.where(self._is_lost(is_missing), self.imputation, scaled)
+            bins = torch.where(is_known[..., None], bins, 0.0)
+        features = self._features(bins)
+        scaled = self.scaled(features, None if is_whole and is_nowhere(is_lost) else is_lost)
         score = saturating(self.head(scaled), given)
-        is_valid = self._needed(is_alive & ~is_missing) & score.isfinite()
-        return Prediction(score, is_valid, is_missing)
-
-    def _is_lost(self, is_missing: Tensor) -> Tensor:
-        """Which columns ``[*, K]`` are of channels ``[*, C]`` that are missing."""
-        pooled = torch.zeros_like(is_missing[..., :1])  # never lost: it is of the other channels
-        return torch.cat([is_missing, pooled], -1).index_select(-1, self.channel_index)
+        is_valid = is_valid & score.isfinite()
+        score = torch.where(is_valid, score, torch.nan)
+        span = torch.where(is_known & is_used, span, torch.nan)
+        return Prediction(score, is_valid, in_range & is_valid, is_lost, span)
 
     def _engine_of(self, x: Tensor) -> _Engine | None:
         """The native engine of the whole detector, where only values are asked for."""
@@ -418,10 +444,6 @@ class SlipDetector(nn.Module):
             setattr(module, name, value.to(getattr(module, name).device))
         return self
 
-    def _needed(self, is_trusted: Tensor) -> Tensor:
-        """Whether all channels in use are trusted, ``[*, C] -> [*]``."""
-        return is_trusted.index_select(-1, self.needed_index).all(-1)
-
     def _check_parts(self, imputation: Tensor) -> None:
         """Refuse parts that disagree about the number of channels or features."""
         pool, pooling, num = self.pool, self.pooling, len(self.selected)
@@ -457,6 +479,7 @@ class SlipDetector(nn.Module):
             "selected": list(self.selected),
             "pooling": None if self.pooling is None else self.pooling.to_dict(),
             "kernel": self.head.kernel.to_dict() if isinstance(self.head, KernelSum) else None,
+            "sensing": self.sensing.to_dict(),
             "info": dict(self.info),
         }
         tensors = {name: value.cpu() for name, value in self.state_dict().items()}
@@ -534,6 +557,7 @@ class SlipDetector(nn.Module):
             metadata["info"],
             state["imputation"],
             pooling and ChannelPooling.from_dict(hand, pooling, part("pooling")),
+            sensing=Sensing.from_dict(metadata["sensing"]),
             backend=backend,
         )
 
@@ -562,51 +586,58 @@ class _Engine:
         if type(head) is QuadraticForm:
             quadratic, linear = head.quadratic.double(), head.linear.double()
             more["head"] = (quadratic.numpy(), linear.numpy(), float(head.constant))
+        more["imputation"] = detector.imputation.double().numpy()
+        hand, sensing = detector.pool.hand, detector.sensing
         if detector.pooling is not None:
             self._machine = detector.pooling.machine(**more)
         else:
-            num = len(detector.selected)
+            num, of_channel = len(detector.selected), detector.channel_index.tolist()
             self._machine = Machine(
-                num_channels=len(detector.pool.hand),
+                num_channels=len(hand),
                 num_inputs=num,
                 num_columns=num,
-                singles=[(i, i) for i in range(num)],
+                singles=[(i, i, of_channel[i]) for i in range(num)],
                 **more,
             )
-        channels = range(len(detector.pool.hand))
+        channels = range(len(hand))
         self._filters = Filters(
             [channel_filter.kernel(c).numpy() for c in channels],
             [channel_filter.context_before - channel_filter.reaches[c][0] for c in channels],
         )
+        self._unused = ~detector._is_used.numpy()
 
         # by dtypes of bins, and of samples they were filtered from
         self._engines = {dtype: detector.extractor.engine(dtype) for dtype in _DTYPES}
-        self._inverse = {
-            (dtype, is_raw): detector.pool.inverse_span(dtype, is_raw).numpy()
+        self._channels = {
+            (dtype, is_raw): Channels(
+                detector.pool.inverse_span(dtype, is_raw).numpy(),
+                sensing.floor,
+                sensing.bounds,
+                detector.counted.numpy(),
+                sensing.min_alive,
+            )
             for dtype in _DTYPES
             for is_raw in (False, True)
         }
 
-    def scores(self, x: Tensor, is_raw: bool) -> Tensor:
-        """As ``SlipDetector._score``."""
-        flat, found, score = self._run(x, is_raw, x.dtype, None)
-        for row in found.is_odd.nonzero()[0].tolist():  # torch has no limits
-            score[row] = self._of._score_by_torch(torch.from_numpy(flat[row : row + 1]), is_raw)[0]
-        return torch.from_numpy(score.reshape(x.shape[:-2]))
-
     def predict(self, x: Tensor, is_raw: bool, given: torch.dtype) -> Prediction:
-        """As ``SlipDetector._predict``."""
-        flat, found, score = self._run(x, is_raw, given, self._inverse[given, is_raw])
-        arrays = (score, found.is_valid & np.isfinite(score), found.is_missing)
+        """As ``SlipDetector._predict``, of bins ``[*, C, n]``."""
+        flat = x.detach().numpy().reshape(-1, *x.shape[-2:])
+        if flat.strides[-1] != flat.itemsize:
+            flat = np.ascontiguousarray(flat)
+        engine, filters = self._engines[x.dtype], self._filters if is_raw else None
+        channels = self._channels[given, is_raw]
+        found = engine.score(self._machine, flat, filters, _DTYPES[given], channels)
+        is_valid, score = found.is_valid, found.score
+        if score is None:
+            made = self._of.head(torch.from_numpy(found.scaled).to(self._of.imputation))
+            score = saturating(made, given).numpy()
+            score = np.where(is_valid, score, score.dtype.type(np.nan))
+        is_valid &= np.isfinite(score)
+        found.span[:, self._unused] = np.nan
+        arrays = (score, is_valid, found.in_range & is_valid, found.is_lost, found.span)
         parts = Prediction(*map(torch.from_numpy, arrays))
-        if found.is_missing.any():
-            is_lost = self._of._is_lost(parts.is_missing)
-            rows = is_lost.any(-1)
-            scaled = torch.from_numpy(found.scaled).to(self._of.imputation)[rows]
-            filled = torch.where(is_lost[rows], self._of.imputation, scaled)
-            parts.score[rows] = saturating(self._of.head(filled), given)
-            parts.is_valid.logical_and_(parts.score.isfinite())
-        for row in found.is_odd.nonzero()[0].tolist():
+        for row in found.is_odd.nonzero()[0].tolist():  # torch has no limits
             one = torch.from_numpy(flat[row : row + 1])
             own = self._of._predict_by_torch(one, is_raw, given)
             for whole, part in zip(parts, own, strict=True):
@@ -615,19 +646,14 @@ class _Engine:
             return parts
         return Prediction(*(each.reshape((*x.shape[:-2], *each.shape[1:])) for each in parts))
 
-    def _run(
-        self, x: Tensor, is_raw: bool, given: torch.dtype, inverse: Any
-    ) -> tuple[Any, Scores, Any]:
-        """Bins ``[M, C, n]`` whose samples lie side by side, what is found of them, and scores."""
-        flat = x.detach().numpy().reshape(-1, *x.shape[-2:])
-        if flat.strides[-1] != flat.itemsize:
-            flat = np.ascontiguousarray(flat)
-        engine, filters = self._engines[x.dtype], self._filters if is_raw else None
-        found = engine.score(self._machine, flat, filters, _DTYPES[given], inverse)
-        if found.score is not None:
-            return flat, found, found.score
-        score = self._of.head(torch.from_numpy(found.scaled).to(self._of.imputation))
-        return flat, found, saturating(score, given).numpy()
+
+def counted_channels(hand: HandLayout, used: Sequence[int], is_pooled: bool) -> list[int]:
+    """Channels in use that count among those that must be alive.
+
+    Of a detector that pools channels the fast ones, or the slow ones where none is fast; else all.
+    """
+    fast = [channel for channel in used if channel in hand.fast]
+    return fast if is_pooled and fast else list(used)
 
 
 _KNOWN_TO_ENGINE = (ChannelPooling, FeatureScaler, ChannelFilter, FeaturePool)

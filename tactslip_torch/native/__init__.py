@@ -43,10 +43,10 @@ class _Matrix(ctypes.Structure):
 class _Plan(ctypes.Structure):
     _numbers = (
         *("is_float", "num_channels", "num_samples", "num_lines", "num_branches"),
-        *("num_features", "num_coefficients", "num_slow", "num_fast", "num_unused"),
+        *("num_features", "num_coefficients", "num_slow", "num_fast"),
     )
     _pointers = (
-        *("slow", "fast", "unused", "first", "descriptor", "column", "need"),
+        *("slow", "fast", "first", "descriptor", "column", "need"),
         *("low", "high", "out", "lines", "ones", "frequency_hz", "gain_time", "gain_lines"),
     )
     _fields_ = tuple(
@@ -63,6 +63,13 @@ class _Filter(ctypes.Structure):
     )
 
 
+class _Sensing(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("inverse_span", "floor", "low", "high", "counted")),
+        ("min_alive", ctypes.c_int64),
+    )
+
+
 class _Bins(ctypes.Structure):
     _fields_ = (
         ("samples", ctypes.c_void_p),
@@ -71,8 +78,8 @@ class _Bins(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("filters", "features")),
         ("features_are_float", ctypes.c_int64),
         *((name, ctypes.c_void_p) for name in (
-            "is_odd", "scaled", "score", "is_missing", "is_valid", "inverse_span")),
-        ("given_as_float", ctypes.c_int64),
+            "is_odd", "scaled", "score", "sensing", "is_lost", "is_valid", "in_range", "span")),
+        ("score_as_float", ctypes.c_int64),
     )  # fmt: skip
 
 
@@ -80,8 +87,7 @@ class _Pool(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("num_channels", "num_families", "num_statistics")),
         *((name, ctypes.c_void_p) for name in (
-            "channels", "ranges", "inputs", "statistics", "columns", "fractions", "knees")),
-        ("least_range", ctypes.c_double),
+            "channels", "inputs", "statistics", "columns", "fractions", "knees")),
     )  # fmt: skip
 
 
@@ -91,8 +97,8 @@ class _Machine(ctypes.Structure):
             "num_channels", "num_inputs", "num_columns", "num_singles", "num_pools",
             "most_channels")),
         *((name, ctypes.c_void_p) for name in (
-            "single_inputs", "single_columns", "pools", "fill", "minimum", "maximum", "knee",
-            "quadratic", "linear")),
+            "single_inputs", "single_columns", "single_channels", "pools", "fill", "minimum",
+            "maximum", "knee", "imputation", "quadratic", "linear")),
         ("constant", ctypes.c_double),
     )  # fmt: skip
 
@@ -115,8 +121,10 @@ class _Onset(ctypes.Structure):
             "hop", "context", "memory", "step_length")),
         *((name, ctypes.c_void_p) for name in (
             "fast", "slow", "windows", "filters", "steps", "fast_knee", "slow_knee", "slope",
-            "offset", "quadratic", "linear")),
+            "offset", "quadratic", "linear", "silence")),
         ("constant", ctypes.c_double),
+        ("min_alive", ctypes.c_int64),
+        ("most_lost", ctypes.c_int64),
     )  # fmt: skip
 
 
@@ -124,8 +132,8 @@ class _OnsetHops(ctypes.Structure):
     _fields_ = (
         ("samples", ctypes.c_void_p),
         *((name, ctypes.c_int64) for name in (
-            "is_float", "channel_stride", "num_hops", "num_before")),
-        *((name, ctypes.c_void_p) for name in ("rows", "listened", "score")),
+            "is_float", "channel_stride", "num_hops", "num_rows", "num_lost")),
+        *((name, ctypes.c_void_p) for name in ("rows", "listened", "score", "is_lost")),
     )  # fmt: skip
 
 
@@ -158,6 +166,34 @@ class Filters(_Kept):
             to.weights, to.length, to.start = self._array(own, np.float64), len(own), start
         self._held.append(made)
         self.address = ctypes.addressof(made)
+
+
+class Channels(_Kept):
+    """What is known of channels that work (``features.sensing.Sensing``).
+
+    Args:
+        inverse_span: one over the least span above rounding, as a part of the loudest sample.
+        floor: span below which a channel is silent.
+        bounds: least and largest span in range.
+        counted: channels that count among those that must be alive.
+        min_alive: how many of them.
+
+    Shape:
+        - all but the last: ``[C]``
+    """
+
+    def __init__(
+        self,
+        inverse_span: Array,
+        floor: Sequence[float],
+        bounds: tuple[Sequence[float], Sequence[float]],
+        counted: Array,
+        min_alive: int,
+    ) -> None:
+        super().__init__()
+        spans = [self._array(each, np.float64) for each in (inverse_span, floor, *bounds)]
+        self.of = _Sensing(*spans, self._array(counted, np.uint8), min_alive)
+        self.address = ctypes.addressof(self.of)
 
 
 class FeatureEngine(_Kept):
@@ -205,7 +241,6 @@ class FeatureEngine(_Kept):
                 f"the native engine has {MAX_BRANCHES // 2} levels at most, got {num_branches // 2}"
                 '; use backend="torch"'
             )
-        unused = [c for c in range(num_channels) if c not in slow and c not in fast]
         self._num_rows = 2 * num_branches + 1
         bands = [self._matrices(group, 4, np.float64) for group in (low, high, out)]
         lines = [spectrum @ matrix for matrix in out]
@@ -225,10 +260,9 @@ class FeatureEngine(_Kept):
             num_branches,
             len(wanted),
             sum(len(matrix) + 8 for matrix in low) + 8,
-            *map(len, (slow, fast, unused)),
+            *map(len, (slow, fast)),
             self._array(slow, np.int64),
             self._array(fast, np.int64),
-            self._array(unused, np.int64),
             self._array(first, np.int64),
             self._array(descriptor, np.int64),
             self._array([w[3] for w in wanted], np.int64),
@@ -263,7 +297,7 @@ class FeatureEngine(_Kept):
         bins: Array,
         filters: Filters | None,
         given: Any,
-        inverse_span: Array | None = None,
+        channels: Channels,
     ) -> Scores:
         """Scores of bins, all in one call.
 
@@ -272,36 +306,33 @@ class FeatureEngine(_Kept):
             bins: with the context that the filters need.
             filters: of the channels; None: bins are filtered.
             given: dtype of the score.
-            inverse_span: one over the least filtered span of a channel that can be trusted, as a
-                part of the largest of its samples as they are given; channels with a NaN or Inf are
-                then left out (``Scores.is_missing``). Without, they make a score NaN.
+            channels: which of them are lost, and whether enough are alive.
 
         Shape:
             - bins: ``[M, C, n + context]``, float32 or float64; samples of a channel lie side by
-              side; inverse_span: ``[C]``, float64
+              side
         """
-        num, leaves_out = len(bins), inverse_span is not None
-        width = machine.num_columns if leaves_out or not machine.has_head else 0
-        ends = [*accumulate((8 * num, 8 * num * width, num, num, num * self.num_channels))]
+        num, width = len(bins), 0 if machine.has_head else machine.num_columns
+        each = self.num_channels
+        ends = [*accumulate((8 * num, 8 * num * each, 8 * num * width, num, num, num, num * each))]
         memory = np.zeros(ends[-1], np.uint8)  # of all that is found: one address to ask for
         start = memory.ctypes.data
         call = _Bins(
-            *_samples_of(bins), (filters or self._none).address, None, False, start + ends[1],
-            start + ends[0] if width else None, start if machine.has_head else None,
+            *_samples_of(bins), (filters or self._none).address, None, False, start + ends[2],
+            None if machine.has_head else start + ends[1], start if machine.has_head else None,
+            channels.address, start + ends[5], start + ends[3], start + ends[4], start + ends[0],
+            given == np.float32,
         )  # fmt: skip
-        call.given_as_float = given == np.float32
-        if inverse_span is not None:
-            call.is_valid, call.is_missing = start + ends[2], start + ends[3]
-            call.inverse_span = inverse_span.ctypes.data
         self._run(self._plan, machine.of, call)
-        flags = memory[ends[1] :].view(np.bool_)
-        score = memory[: ends[0]].view(np.float64)
+        flags = memory[ends[2] :].view(np.bool_)
         return Scores(
             flags[:num],
-            memory[ends[0] : ends[1]].view(np.float64).reshape(num, width),
-            score.astype(given) if machine.has_head else None,
+            memory[ends[1] : ends[2]].view(np.float64).reshape(num, width),
+            memory[: ends[0]].view(np.float64).astype(given) if machine.has_head else None,
             flags[num : 2 * num],
-            flags[2 * num :].reshape(num, self.num_channels),
+            flags[2 * num : 3 * num],
+            flags[3 * num :].reshape(num, each),
+            memory[ends[0] : ends[1]].view(np.float64).reshape(num, each),
         )
 
     def _matrices(self, matrices: Sequence[Array], rows: int, dtype: Any) -> int:
@@ -330,21 +361,17 @@ class Pool:
 
     Attributes:
         channels: in the hand, m of them.
-        ranges: inputs that tell whether a channel moves, ``[m]``.
         inputs: each descriptor of all channels, ``[R, m]``.
         statistics: mean, std, min, max, or the place of an order statistic, from 0 to 1.
         columns: that they are, ``[statistics, R]``; -1: not wanted.
         knees: of the descriptors, ``[R]``.
-        least_range: below which a channel counts as stuck.
     """
 
     channels: Sequence[int]
-    ranges: Sequence[int]
     inputs: Array
     statistics: Sequence[str | float]
     columns: Array
     knees: Array
-    least_range: float
 
 
 class Machine(_Kept):
@@ -353,9 +380,10 @@ class Machine(_Kept):
     Args:
         num_channels: of the hand.
         num_inputs: features that go in.
-        singles: input and column of what is not pooled.
+        singles: input, column and channel of what is not pooled.
         pools: what is; their columns and the singles' are all there are.
         fill: columns where no channel of their kind is in use.
+        imputation: scaled columns of lost channels; None: they stay as they are.
         scaling: minimum, maximum and, if columns are compressed, knee; None: nothing is scaled.
         head: quadratic part ``[K, K]`` (or empty), linear part and constant; None: no score.
     """
@@ -366,9 +394,10 @@ class Machine(_Kept):
         num_channels: int,
         num_inputs: int,
         num_columns: int,
-        singles: Sequence[tuple[int, int]],
+        singles: Sequence[tuple[int, int, int]],
         pools: Sequence[Pool] = (),
         fill: Array | None = None,
+        imputation: Array | None = None,
         scaling: tuple[Array, Array, Array | None] | None = None,
         head: tuple[Array, Array, float] | None = None,
     ) -> None:
@@ -380,10 +409,9 @@ class Machine(_Kept):
             codes = [kinds.index(s) if isinstance(s, str) else len(kinds) for s in pool.statistics]
             fractions = [0.0 if isinstance(s, str) else s for s in pool.statistics]
             to.num_channels, to.num_families = len(pool.channels), len(pool.knees)
-            to.num_statistics, to.least_range = len(codes), pool.least_range
+            to.num_statistics = len(codes)
             for name, values in (
                 ("channels", pool.channels),
-                ("ranges", pool.ranges),
                 ("inputs", pool.inputs),
                 ("statistics", codes),
                 ("columns", pool.columns),
@@ -392,15 +420,16 @@ class Machine(_Kept):
             to.fractions = self._array(fractions, np.float64)
             to.knees = self._array(pool.knees, np.float64)
         self._held.append(made)
-        pairs = np.array(singles, np.int64).reshape(-1, 2)
+        places = np.array(singles, np.int64).reshape(-1, 3)
         self.of = _Machine(
-            num_channels, num_inputs, num_columns, len(pairs), len(pools),
+            num_channels, num_inputs, num_columns, len(places), len(pools),
             max((len(pool.channels) for pool in pools), default=0),
-            self._array(pairs[:, 0], np.int64), self._array(pairs[:, 1], np.int64),
-            ctypes.addressof(made),
+            *(self._array(each, np.int64) for each in places.T), ctypes.addressof(made),
         )  # fmt: skip
         if fill is not None:
             self.of.fill = self._array(fill, np.float64)
+        if imputation is not None:
+            self.of.imputation = self._array(imputation, np.float64)
         for name, array in zip(("minimum", "maximum", "knee"), scaling or (), strict=False):
             setattr(self.of, name, None if array is None else self._array(array, np.float64))
         if head is not None:
@@ -413,19 +442,19 @@ class Machine(_Kept):
                 rows[:num_columns] = lower
                 self.of.quadratic = self._array(rows, np.float64)
 
-    def columns(self, inputs: Array, is_missing: Array | None = None) -> Array:
+    def columns(self, inputs: Array, is_lost: Array | None = None) -> Array:
         """Columns of bins, scaled if there is a scaling, ``[M, K]``.
 
         Shape:
             - inputs: ``[M, inputs]``, float32 or float64
-            - is_missing: ``[M, C]``, bool, channels that are left out of their pools
+            - is_lost: ``[M, C]``, bool, channels that are left out of their pools
         """
         found = np.empty((len(inputs), self.num_columns))
         inputs = np.asarray(inputs, np.float64)  # has a name, or it is gone before it is read
         call = _Bins(*_samples_of(inputs), scaled=found.ctypes.data)
-        if is_missing is not None:
-            is_missing = np.ascontiguousarray(is_missing)
-            call.is_missing = is_missing.ctypes.data
+        if is_lost is not None:
+            is_lost = np.ascontiguousarray(is_lost)
+            call.is_lost = is_lost.ctypes.data
         self._run(None, self.of, call)
         return found
 
@@ -435,17 +464,21 @@ class Scores(NamedTuple):
 
     Attributes:
         is_odd: magnitudes are out of range, and all else is of no meaning, ``[M]``.
-        scaled: columns, ``[M, K]``; K is 0 where there is a score and nothing is left out.
-        score: ``[M]``, finite or NaN; None without a head.
-        is_valid: every channel that is read can be trusted, ``[M]``.
-        is_missing: channels that were left out, ``[M, C]``.
+        scaled: columns, ``[M, K]``; K is 0 where there is a score.
+        score: ``[M]``, NaN where not valid; None without a head.
+        is_valid: enough channels are alive, ``[M]``.
+        in_range: so is the size of their signals, ``[M]``.
+        is_lost: channels that are missing or silent, ``[M, C]``.
+        span: of the filtered bin of each channel, NaN where missing, ``[M, C]``.
     """
 
     is_odd: Array
     scaled: Array
     score: Array | None
     is_valid: Array
-    is_missing: Array
+    in_range: Array
+    is_lost: Array
+    span: Array
 
 
 def _samples_of(array: Array) -> tuple[int, bool, int, int, int]:
@@ -475,9 +508,12 @@ class OnsetEngine(_Kept):
         knees: of the filters and of the steps.
         scaling: factor and offset of each column, which is then clipped to [-1, 1].
         head: quadratic part (or empty), linear part and constant.
+        silence: half the log power of a silent channel.
+        min_alive: fast channels that must be alive.
+        most_lost: lost blocks in a row, beyond which the memory begins anew.
 
     Shape:
-        - filters: ``[context + hop, B, hop]``; steps: ``[b, D]``
+        - filters: ``[context + hop, B, hop]``; steps: ``[b, D]``; silence: ``[F, B]``
         - quadratic: ``[K, K]``; linear: ``[K]``
 
     Raises:
@@ -496,37 +532,52 @@ class OnsetEngine(_Kept):
         knees: tuple[Sequence[float], Sequence[float]],
         scaling: tuple[Array, Array],
         head: tuple[Array, Array, float],
+        silence: Array,
+        min_alive: int,
+        most_lost: int,
     ) -> None:
         super().__init__()
         length, num_filters, hop = filters.shape
         quadratic, linear, constant = head
-        arrays = filters, steps, *knees, *scaling, quadratic, linear
+        arrays = filters, steps, *knees, *scaling, quadratic, linear, silence
         places = [self._array(each, np.float64) if len(each) else None for each in arrays]
         self._of = _Onset(
             len(fast), len(slow), num_filters, len(windows), steps.shape[1], len(linear),
             hop, length - hop, memory, len(steps),
             *(self._array(each, np.int64) for each in (fast, slow, windows)), *places, constant,
+            min_alive, most_lost,
         )  # fmt: skip
 
-    def __call__(self, samples: Array, rows: Array, listened: Array) -> Array:
-        """The scores of some hops, NaN without evidence; the last rows are written.
+    def __call__(
+        self, samples: Array, rows: Array, num_rows: int, num_lost: int, listened: Array
+    ) -> tuple[Array, Array, int, int]:
+        """The scores of some hops, NaN without evidence, and which of their blocks are lost.
+
+        Rows of the others are written behind those that are there, or, where the memory begins
+        anew, from the first place on.
+
+        Args:
+            samples: of the hops, with their context.
+            rows: memory of blocks.
+            num_rows: that are there.
+            num_lost: lost blocks behind them.
+            listened: channels that are not left out.
 
         Shape:
             - samples: ``[C, context + k * hop]``, float32 or float64
-            - rows: ``[blocks before + k, F * B + S]``, contiguous
-            - listened: ``[C]``, bool, channels that are not left out
-            - output: ``[k]``
+            - rows: ``[num_rows + k, F * B + S]``, contiguous; listened: ``[C]``, bool
+            - output: ``[k]`` twice, and both numbers behind these hops
         """
         address, is_float, _, stride, _ = _samples_of(samples[:, None])
         num = (samples.shape[1] - self._of.context) // self._of.hop
-        score = np.empty(num)
+        score, is_lost = np.empty(num), np.zeros(num, np.bool_)
         call = _OnsetHops(
-            address, is_float, stride, num, len(rows) - num,
-            rows.ctypes.data, listened.ctypes.data, score.ctypes.data,
+            address, is_float, stride, num, num_rows, num_lost,
+            rows.ctypes.data, listened.ctypes.data, score.ctypes.data, is_lost.ctypes.data,
         )  # fmt: skip
         if self._library.tactslip_onset(self._level, ctypes.byref(self._of), ctypes.byref(call)):
             raise MemoryError("the native engine found no memory to work in")
-        return score
+        return score, is_lost, call.num_rows, call.num_lost
 
 
 def carry_bristles(

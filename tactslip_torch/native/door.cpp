@@ -10,7 +10,7 @@
 
 typedef int Bristles(const BristleRun*);
 typedef int Features(const Plan*, const Machine*, const Bins*);
-typedef int OnsetScores(const Onset*, const OnsetHops*);
+typedef int OnsetScores(const Onset*, OnsetHops*);
 
 #if defined(__x86_64__)
 #include <cpuid.h>
@@ -48,6 +48,6 @@ EXPORT int tactslip_features(int level, const Plan* plan, const Machine* machine
   return OF_LEVEL(features)(plan, machine, bins);
 }
 EXPORT int tactslip_bristles(int level, const BristleRun* run) { return OF_LEVEL(bristles)(run); }
-EXPORT int tactslip_onset(int level, const Onset* onset, const OnsetHops* hops) {
+EXPORT int tactslip_onset(int level, const Onset* onset, OnsetHops* hops) {
   return OF_LEVEL(onset)(onset, hops);
 }

@@ -22,7 +22,7 @@ constexpr double CV_ZERO = 1e-12;       // part of it within which a mean has no
 constexpr double CROWDED = 2e-3;        // part of a row's span; float rounds to 3e-8 of it
 constexpr double LEVELS = 255;          // of entropy's histogram, less one
 constexpr double SMALLEST_USUAL = 0x1p-320, LARGEST_USUAL = 0x1p448;  // squares are in range
-constexpr double LARGEST_SAMPLE = 0x1.fffffffffffffp1017;  // volts; beyond it a channel is missing
+constexpr int FEWEST_SAMPLES = 16;  // of a bin that may be silent
 constexpr double LARGEST = 0x1.fffffffffffffp1023, LARGEST_FLOAT = 0x1.fffffep127;
 constexpr int USUAL = 100;              // values of a row whose sort is straight-line code
 constexpr int CHUNK = 32;               // bins whose features are made before they are scored
@@ -384,7 +384,7 @@ template <class T> struct Group : Describe<T> {
       first[h] = y[h][0];
       for (int64_t i = 0; i < n; ++i) y[h][i] -= first[h];
     }
-    if (bins.is_missing) note_channels();
+    if (bins.sensing) note_channels();
   }
 
   // The size of what was read; lanes that are broken or odd become zeros.
@@ -406,7 +406,7 @@ template <class T> struct Group : Describe<T> {
       loudest[lane] = most[k];
       bins.is_odd[bin[lane]] |= !is_broken[lane] && !is_usual[k];
     }
-    unknown[h] = bins.is_missing ? D{} : finite > 0 ? D{} : D{} + (double)NAN;
+    unknown[h] = bins.sensing ? D{} : finite > 0 ? D{} : D{} + (double)NAN;
   }
 
   void convolve(const D* x, const D* weight, D* out, int64_t taps) {
@@ -420,13 +420,15 @@ template <class T> struct Group : Describe<T> {
     }
   }
 
-  // Which channels are missing; bins with one, or with one whose span cannot be trusted, are not
-  // valid.
+  // Which channels are lost (features/sensing.py: is_alive).
   void note_channels() {
+    const Sensing& sensing = *bins.sensing;
     for (int k = 0; k < num; ++k) {
-      bool is_alive = ((double*)span)[k] * bins.inverse_span[channel[k]] > loudest[k];
-      bins.is_missing[bin[k] * plan.num_channels + channel[k]] = is_broken[k];
-      bins.is_valid[bin[k]] &= is_alive && !is_broken[k];
+      int64_t c = channel[k], at = bin[k] * plan.num_channels + c;
+      double own = ((double*)span)[k];
+      bool moves = own * sensing.inverse_span[c] > loudest[k] && own >= sensing.floor[c];
+      bins.is_lost[at] = is_broken[k] || (n >= FEWEST_SAMPLES && !moves);
+      bins.span[at] = is_broken[k] ? NAN : own;
     }
   }
 
@@ -723,7 +725,7 @@ struct Judge {
   D *x, *z, *values, *sorted, *in_use;  // [inputs], [columns], three times [channels]
   int64_t at;  // the first of a few bins
   int few;
-  const uint8_t* is_missing;  // of these bins
+  const uint8_t* is_lost;  // of these bins
 
   explicit Judge(const Machine& machine) : machine(machine) {}
 
@@ -743,27 +745,32 @@ struct Judge {
     for (int64_t b = 0; b < num; b += DL) {
       at = start + b;
       few = (int)(num - b < DL ? num - b : DL);
-      is_missing = bins.is_missing ? bins.is_missing + at * m.num_channels : nullptr;
+      is_lost = bins.is_lost ? bins.is_lost + at * m.num_channels : nullptr;
       for (int64_t i = 0; i < m.num_inputs; ++i)
         for (int k = 0; k < DL; ++k) x[i][k] = inputs[(b + (k < few ? k : 0)) * stride + i];
       for (int64_t i = 0; i < m.num_singles; ++i) z[m.single_columns[i]] = x[m.single_inputs[i]];
       for (int64_t p = 0; p < m.num_pools; ++p) pool(m.pools[p]);
       for (int64_t i = 0; m.minimum && i < m.num_columns; ++i) z[i] = scale(i, z[i]);
+      for (int64_t i = 0; m.imputation && is_lost && i < m.num_singles; ++i)
+        for (int k = 0; k < few; ++k)
+          if (is_lost[k * m.num_channels + m.single_channels[i]])
+            z[m.single_columns[i]][k] = m.imputation[m.single_columns[i]];
       for (int k = 0; bins.scaled && k < few; ++k)
         for (int64_t i = 0; i < m.num_columns; ++i)
           bins.scaled[(at + k) * m.num_columns + i] = z[i][k];
       if (!bins.score) continue;
-      D score = clamped(head(), bins.given_as_float ? LARGEST_FLOAT : LARGEST);
-      for (int k = 0; k < few; ++k) bins.score[at + k] = score[k];
+      D score = clamped(head(), bins.score_as_float ? LARGEST_FLOAT : LARGEST);
+      for (int k = 0; k < few; ++k)
+        bins.score[at + k] = bins.is_valid && !bins.is_valid[at + k] ? NAN : score[k];
     }
   }
 
   void pool(const Pool& p) {
     D count = {};
     for (int64_t c = 0; c < p.num_channels; ++c) {
-      in_use[c] = x[p.ranges[c]] < p.least_range ? D{} : D{} + 1;  // a NaN is in use
-      for (int k = 0; is_missing && k < few; ++k)
-        if (is_missing[k * machine.num_channels + p.channels[c]]) in_use[c][k] = 0;
+      in_use[c] = D{} + 1;
+      for (int k = 0; is_lost && k < few; ++k)
+        if (is_lost[k * machine.num_channels + p.channels[c]]) in_use[c][k] = 0;
       count += in_use[c];
     }
     for (int64_t r = 0; r < p.num_families; ++r) {
@@ -830,6 +837,21 @@ struct Judge {
   }
 };
 
+// Which bins are valid, and which in range (features/sensing.py: is_enough).
+void judge_channels(const Plan& plan, const Bins& bins, int64_t start, int64_t num_bins) {
+  const Sensing& sensing = *bins.sensing;
+  for (int64_t b = start; b < start + num_bins; ++b) {
+    int64_t num_alive = 0, num_fit = 0;
+    for (int64_t c = 0, at = b * plan.num_channels; c < plan.num_channels; ++c, ++at) {
+      bool counts = sensing.counted[c] && !bins.is_lost[at];
+      num_alive += counts;
+      num_fit += counts && bins.span[at] >= sensing.low[c] && bins.span[at] <= sensing.high[c];
+    }
+    bins.is_valid[b] = num_alive >= sensing.min_alive;
+    bins.in_range[b] = bins.is_valid[b] && 2 * num_fit >= num_alive;
+  }
+}
+
 // -- What the door calls -----------------------------------------------------------------------------
 
 template <class T> int run(const Plan& plan, const Machine* machine, const Bins& bins) {
@@ -875,24 +897,11 @@ template <class T> int run(const Plan& plan, const Machine* machine, const Bins&
     }
     int64_t stride = plan.num_features ? plan.num_features : bins.bin_stride;
     const double* given = (const double*)bins.samples + start * stride;
+    if (bins.sensing) judge_channels(plan, bins, start, num_bins);
     if (machine) judge.judge(plan.num_features ? features : given, stride, start, num_bins, bins);
   }
   free(memory);
   return 0;
-}
-
-// Which channels that are not described are missing.
-template <class X> void note_unused(const Plan& plan, const Bins& bins) {
-  for (int64_t b = 0; b < bins.num_bins; ++b)
-    for (int64_t u = 0; u < plan.num_unused; ++u) {
-      int64_t c = plan.unused[u];
-      const X* from = (const X*)bins.samples + b * bins.bin_stride + c * bins.channel_stride +
-                      bins.filters[c].start;
-      bool is_there = true;
-      for (int64_t i = 0; i < plan.num_samples + bins.filters[c].length - 1; ++i)
-        is_there &= fabs((double)from[i]) <= LARGEST_SAMPLE;
-      bins.is_missing[b * plan.num_channels + c] = !is_there;
-    }
 }
 
 }  // namespace
@@ -901,12 +910,5 @@ template <class X> void note_unused(const Plan& plan, const Bins& bins) {
 extern "C" int FEATURES_ENTRY(const Plan* plan, const Machine* machine, const Bins* bins) {
   const Plan nothing = {};
   if (!plan) return run<double>(nothing, machine, *bins);
-  if (bins->is_missing) {
-    memset(bins->is_valid, 1, bins->num_bins);
-    if (bins->is_float)
-      note_unused<float>(*plan, *bins);
-    else
-      note_unused<double>(*plan, *bins);
-  }
   return plan->is_float ? run<float>(*plan, machine, *bins) : run<double>(*plan, machine, *bins);
 }

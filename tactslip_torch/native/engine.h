@@ -18,8 +18,8 @@ struct Matrix {
 struct Plan {
   int64_t is_float;  // statistics in float, of rows scaled to order one
   int64_t num_channels, num_samples, num_lines, num_branches;
-  int64_t num_features, num_coefficients, num_slow, num_fast, num_unused;
-  const int64_t *slow, *fast, *unused;  // channels that are read, and the others
+  int64_t num_features, num_coefficients, num_slow, num_fast;
+  const int64_t *slow, *fast;  // channels that are read
   // of each channel and row: where its part of descriptor and column starts, and which bits it has
   const int64_t *first, *descriptor, *column;
   const uint32_t* need;
@@ -35,6 +35,14 @@ struct Filter {
   int64_t length, start;
 };
 
+// What is known of channels that work: Sensing, one number a channel.
+struct Sensing {
+  const double* inverse_span;  // one over the least span above rounding, as a part of the loudest sample
+  const double *floor, *low, *high;  // span of silence; least and largest span in range
+  const uint8_t* counted;            // whether it counts among those that must be alive
+  int64_t min_alive;
+};
+
 // Bins to be described, and where what is found is written; a null pointer: it is not wanted.
 struct Bins {
   const void* samples;  // those of a channel lie side by side; without a plan: inputs of a machine, double
@@ -45,9 +53,10 @@ struct Bins {
   uint8_t* is_odd;  // [M] a magnitude is out of range: what is found is of no meaning
   // for a machine
   double *scaled, *score;  // [M, columns], [M]
-  uint8_t *is_missing, *is_valid;  // [M, C], [M]; if given, channels with a NaN or Inf are left out
-  const double* inverse_span;  // [C] one over the least span that can be trusted, by the loudest sample
-  int64_t given_as_float;      // so is a score bounded
+  const Sensing* sensing;  // null: what is missing makes a score NaN
+  uint8_t *is_lost, *is_valid, *in_range;  // [M, C], [M], [M]; without a plan is_lost is given
+  double* span;                            // [M, C], NaN where missing
+  int64_t score_as_float;                  // so is it bounded
 };
 
 enum Statistic { POOLED_MEAN, POOLED_STD, POOLED_MIN, POOLED_MAX, POOLED_ORDER };
@@ -55,19 +64,18 @@ enum Statistic { POOLED_MEAN, POOLED_STD, POOLED_MIN, POOLED_MAX, POOLED_ORDER }
 // Descriptors of the channels of one kind, whose statistics over these channels are columns.
 struct Pool {
   int64_t num_channels, num_families, num_statistics;
-  const int64_t *channels, *ranges;  // in the hand; inputs that tell whether a channel moves
-  const int64_t* inputs;             // [families, channels]
+  const int64_t *channels, *inputs;  // in the hand; [families, channels]
   const int64_t *statistics, *columns;  // [statistics]; [statistics, families], -1: not wanted
   const double *fractions, *knees;  // of orders among ascending values, from 0 to 1; [families]
-  double least_range;
 };
 
 // From inputs (features) to columns, to scaled columns, and to a score.
 struct Machine {
   int64_t num_channels, num_inputs, num_columns, num_singles, num_pools, most_channels;
-  const int64_t *single_inputs, *single_columns;  // inputs that are columns as they are
+  const int64_t *single_inputs, *single_columns, *single_channels;  // columns that are not pooled
   const Pool* pools;
   const double *fill, *minimum, *maximum, *knee;  // [columns]; null: not pooled, scaled, compressed
+  const double* imputation;  // [columns], scaled, of a lost channel; null: columns stay as they are
   const double *quadratic, *linear;  // lower triangle, off its diagonal twice; null: none
   double constant;
 };
@@ -89,14 +97,18 @@ struct Onset {
   const int64_t *fast, *slow, *windows;       // channels; blocks, ascending
   const double *filters, *steps;  // [context + hop, filters, hop], [step_length, steps]
   const double *fast_knee, *slow_knee, *slope, *offset, *quadratic, *linear;  // quadratic may be null
+  const double* silence;  // [fast, filters], half the log power of a silent channel
   double constant;
+  int64_t min_alive, most_lost;  // fast channels; lost blocks in a row until all begins anew
 };
 
-// Hops to be scored, and the memory of blocks, to which theirs are written.
+// Hops to be scored, and the memory of blocks, to which theirs are written, but for lost ones.
 struct OnsetHops {
   const void* samples;  // from `context` before the first hop; those of a channel lie side by side
-  int64_t is_float, channel_stride, num_hops, num_before;  // blocks that are there
-  double* rows;             // [before + hops, fast * filters + slow]
+  int64_t is_float, channel_stride, num_hops;
+  int64_t num_rows, num_lost;  // of the memory, and lost blocks behind them; both are updated
+  double* rows;             // [rows + hops, fast * filters + slow]
   const uint8_t* listened;  // [channels]
   double* score;            // [hops], NaN without evidence
+  uint8_t* is_lost;         // [hops]
 };

@@ -10,8 +10,6 @@
 
 namespace {
 
-constexpr double LEAST_RISE = 1e-6;  // of a floor over that of silence; below, a channel is stuck
-
 struct Hop {
   const Onset& own;
   const OnsetHops& run;
@@ -45,6 +43,17 @@ struct Hop {
       for (int64_t i = own.context; i < length; ++i) sum += sample(own.slow[s], start + i);
       row[num_logs + s] = sum / (double)own.hop;
     }
+  }
+
+  // Whether too few fast channels of a block are known.
+  bool is_lost(const double* row) {
+    int64_t num_known = 0;
+    for (int64_t f = 0; f < own.num_fast; ++f) {
+      double sum = 0.0;
+      for (int64_t b = 0; b < num_filters; ++b) sum += row[f * num_filters + b];
+      num_known += run.listened[own.fast[f]] && isfinite(sum);
+    }
+    return num_known < own.min_alive;
   }
 
   // Mean, largest and smallest of rows of values over channels, 0 without any: `_over_channels`.
@@ -83,18 +92,18 @@ struct Hop {
       for (int64_t i = 0; i < num_logs; ++i)
         level[w * num_logs + i] = 0.5 * log(power[i] / (double)own.windows[w]) - floor[i];
     }
-    bool is_any = false;
+    int64_t num_alive = 0;
     for (int64_t f = 0; f < own.num_fast; ++f) {
       double rise = -INFINITY, sum = 0.0;
       for (int64_t b = 0; b < num_filters; ++b) {
-        double over = floor[f * num_filters + b] - log(own.fast_knee[b]);
+        double over = floor[f * num_filters + b] - own.silence[f * num_filters + b];
         rise = over > rise ? over : rise;
         for (int64_t w = 0; w < own.num_windows; ++w) sum += level[w * num_logs + f * num_filters + b];
       }
-      in_use[f] = run.listened[own.fast[f]] && rise > LEAST_RISE && isfinite(sum);
-      is_any |= in_use[f];
+      in_use[f] = run.listened[own.fast[f]] && rise > 0.0 && isfinite(sum);
+      num_alive += in_use[f];
     }
-    if (!is_any) return NAN;
+    if (num_alive < own.min_alive) return NAN;
     double* to = columns;
     // rows of a window and a filter; their statistics lie in the order of `pooled`
     int64_t num_rows = own.num_windows * num_filters, kinds = own.num_fast > 1 ? 3 : 1;
@@ -146,7 +155,7 @@ struct Hop {
 
 }  // namespace
 
-extern "C" int ONSET_ENTRY(const Onset* own, const OnsetHops* run) {
+extern "C" int ONSET_ENTRY(const Onset* own, OnsetHops* run) {
   int64_t num_logs = own->num_fast * own->num_filters, num_heard = own->num_filters * own->hop;
   int64_t sizes[] = {own->context + own->hop,
                      num_logs > num_heard ? num_logs : num_heard,
@@ -164,10 +173,18 @@ extern "C" int ONSET_ENTRY(const Onset* own, const OnsetHops* run) {
          **parts[] = {&of.frame, &of.heard, &of.floor, &of.level, &of.steps, &of.columns, &of.pull};
   for (int i = 0; i < 7; next += sizes[i++]) *parts[i] = next;
   for (int64_t k = 0; k < run->num_hops; ++k) {
-    double* row = run->rows + (run->num_before + k) * of.width;
+    double* row = run->rows + run->num_rows * of.width;
     of.block(k * own->hop, row);
-    bool is_known = run->num_before + k + 1 >= own->memory;
-    run->score[k] = is_known ? of.score(row, (bool*)next) : NAN;
+    run->score[k] = NAN;
+    run->is_lost[k] = of.is_lost(row);
+    run->num_lost += run->is_lost[k];
+    if (run->is_lost[k]) continue;
+    if (run->num_lost > own->most_lost) {  // as at the beginning of a stream
+      memmove(run->rows, row, of.width * sizeof(double));
+      run->num_rows = 0;
+    }
+    run->num_lost = 0;
+    if (++run->num_rows >= own->memory) run->score[k] = of.score(row, (bool*)next);
   }
   free(memory);
   return 0;

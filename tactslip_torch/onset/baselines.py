@@ -18,10 +18,11 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.ops import is_nowhere, power_of_two_below
+from tactslip_torch.features.ops import power_of_two_below
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.sensing import LARGEST_SAMPLE, Sensing, is_alive
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.missing_channels import Prediction
+from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.wavelet import (
@@ -131,16 +132,15 @@ class BaselineDetector:
     def predict_raw(self, samples: Tensor, *, given: torch.dtype | None = None) -> Prediction:
         """Filter and score raw bins that come with their context.
 
-        A film that is missing counts as silent, and the score as not valid. Other channels are not
-        looked at, and never missing.
+        A film that is missing counts as silent. With fewer than half of the films alive the score
+        is NaN and not valid. Other channels are not looked at, and never lost.
 
         Args:
             samples: in volts.
             given: dtype in which they were measured, and of the score; by default theirs.
 
         Shape:
-            - samples: ``[*, C, context_before + n + context_after]``; score and validity ``[*]``,
-              missing channels ``[*, C]``
+            - samples: ``[*, C, context_before + n + context_after]``
 
         Raises:
             ValueError: if the number of channels or samples is another.
@@ -152,19 +152,29 @@ class BaselineDetector:
         raw = samples[..., films, first : first + rest]
         bins = own.valid(raw)
         pool.check(bins)
-        is_silent = pool.is_missing(bins)
-        is_alive = pool.is_alive(bins, given, own.raw_magnitude(raw))
-        bins = bins.to(given)
-        if not is_nowhere(is_silent):
-            bins = torch.where(is_silent[..., None], 0.0, bins)
+        high, low = bins.detach().amax(-1).double(), bins.detach().amin(-1).double()
+        is_known = torch.maximum(high, -low) <= min(LARGEST_SAMPLE, torch.finfo(bins.dtype).max)
+        inverse = pool.inverse_span(given, is_raw=True).to(high.device)
+        none = torch.zeros(len(films), dtype=torch.float64, device=high.device)
+        alive = is_alive(high - low, own.raw_magnitude(raw), is_known, inverse, none)
+        bins = torch.where(is_known[..., None], bins.to(given), 0.0)
         if self.name == "film_band_power":
             score = film_band_power(bins, pool.hand.fast, pool.sample_rate_hz)
         else:
             score = largest_detail(bins, pool.hand.fast, pool.wavelet, pool.level)
-        is_missing = is_silent.new_zeros(samples.shape[:-1])
-        is_missing[..., films] = is_silent
-        is_valid = (is_alive & ~is_silent).all(-1)
-        return Prediction(score, is_valid, is_missing)
+        is_valid = alive.sum(-1) >= self.sensing.min_alive
+        is_lost = is_known.new_zeros(samples.shape[:-1])
+        is_lost[..., films] = ~alive
+        span = torch.full_like(is_lost, torch.nan, dtype=torch.float64)
+        span[..., films] = torch.where(is_known, high - low, torch.nan)
+        score = torch.where(is_valid, score, torch.nan)
+        return Prediction(score, is_valid, is_valid, is_lost, span)
+
+    @cached_property
+    def sensing(self) -> Sensing:
+        """Without training: half of the films must be alive."""
+        pool = self.pool
+        return Sensing.unknown(len(pool.hand), len(pool.hand.fast), pool.sample_rate_hz)
 
     @cached_property
     def _of_films(self) -> tuple[FeaturePool, ChannelFilter]:

@@ -9,7 +9,7 @@ from raw volts to the statistic.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -19,19 +19,26 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.sensing import Sensing, without_stuck
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.calibration import (
-    Calibration,
-    calibration_from_dict,
-    probability,
-)
+from tactslip_torch.model.calibration import Calibration, calibration_from_dict, probability
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import Prediction
+from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.onset.evidence import OnsetClassifier
-from tactslip_torch.onset.rules import NEUTRAL, NOTHING_YET, Latch, Rule, latch, rule_from_dict
+from tactslip_torch.onset.rules import (
+    HOLD_S,
+    NOTHING_YET,
+    Latch,
+    Rule,
+    latch,
+    most_lost,
+    rule_from_dict,
+)
 from tactslip_torch.runtime import check_number
 from tactslip_torch.signals.filtering import ChannelFilter, extended
 
+LARGEST = 1e30
+"""Size of a log likelihood ratio, at most."""
 KEY = "alarm"
 """Under which ``SlipDetector.info`` keeps the settings."""
 
@@ -53,6 +60,7 @@ class AlarmSettings:
         slip_share: how much of a stream is slip; the balance that probabilities are stated for.
         rearm_s: how long the statistic must stay low before the next alarm.
         refractory_s: shortest time between two alarms.
+        hold_s: lost samples in a row, in seconds, up to which rules keep their state.
         lead_s: from an onset to the first decision that speaks for slip, in the middle; the
             estimate of an onset goes back by it.
         metadata: on what the threshold was set, JSON-able: recordings, hours, achieved rate.
@@ -73,6 +81,7 @@ class AlarmSettings:
     rearm_s: float = 0.1
     refractory_s: float = 0.2
     lead_s: float = 0.0
+    hold_s: float = HOLD_S
     metadata: Mapping[str, Any] = field(default_factory=dict)
     onset: OnsetClassifier | None = None
 
@@ -87,7 +96,7 @@ class AlarmSettings:
                 f"threshold {self.threshold:g} lies above {self.rule.ceiling:g}, the most that the "
                 f"statistic of {self.rule.name} can be: no alarm would ever come; lower it"
             )
-        for name in ("rearm_s", "refractory_s"):
+        for name in ("rearm_s", "refractory_s", "hold_s"):
             check_number(name, getattr(self, name), least=0)
 
     def __repr__(self) -> str:
@@ -186,6 +195,10 @@ class Scorer(Protocol):
         """The frames of all channels."""
 
     @property
+    def sensing(self) -> Sensing:
+        """When a channel counts as stuck."""
+
+    @property
     def needed_index(self) -> Tensor:
         """Channels in use, ascending; the others are not filtered."""
 
@@ -202,8 +215,9 @@ def score_stream(
 ) -> Prediction:
     """Predict every bin of a recording that begins a whole number of hops from its start.
 
-    Before and behind it lies what its filter takes to lie there (``extended``). A NaN makes the
-    bins within its frame's reach not valid. A recording shorter than a bin or a frame has no bins.
+    Before and behind it lies what its filter takes to lie there (``extended``). A channel is lost
+    in the bins whose frames reach a NaN of it, or that it is stuck in. A recording shorter than a
+    bin or a frame has no bins.
 
     Args:
         detector: that predicts.
@@ -229,8 +243,9 @@ def score_stream(
     with torch.no_grad():
         samples = samples.detach()
         if samples.shape[-1] < max(length, *(lengths[channel] for channel in used)):
-            empty, none = samples.new_empty(0), samples.new_empty(0, len(samples)).bool()
-            return Prediction(empty, none[:, 0], none)
+            empty, none = samples.new_empty(0), samples.new_empty(0, len(samples))
+            return Prediction(empty, empty.bool(), empty.bool(), none.bool(), none.double())
+        samples = without_stuck(samples, detector.sensing.stuck_samples)
         whole = extended(detector.pool.widen(samples), detector.channel_filter, used)
         bins = whole.unfold(-1, length + 2 * detector.channel_filter.context, hop_samples)
         parts = [
@@ -247,9 +262,12 @@ class Alarm:
         alarm_s: when it could be raised: the end of the deciding bin and the look-ahead.
         onset_s: when the slip is thought to have begun, no later than that.
         score: of the deciding bin.
-        probability: that the deciding bin is slip.
+        probability: that the deciding bin is slip; NaN, as the two others, where the onset
+            classifier decided alone.
         statistic: of the rule.
-        is_valid: whether every channel in use could be trusted.
+        is_valid: always: a decision that is not valid raises no alarm.
+        in_range: whether the channels moved about as much as in training.
+        channels_lost: names of the channels that were left out.
         raised_by: ``"onset"``, the classifier of fast evidence, or ``"status"``, that of bins.
     """
 
@@ -259,6 +277,8 @@ class Alarm:
     probability: float
     statistic: float
     is_valid: bool
+    in_range: bool
+    channels_lost: tuple[str, ...] = ()
     raised_by: str = "status"
 
 
@@ -266,21 +286,25 @@ class Decisions(NamedTuple):
     """One entry per decision, in order; of several streams at once, one row each.
 
     With an onset classifier there is one every hop of its own, and what is said of bins is that of
-    the last bin known by then: score 0 and no probability of its own before the first, not valid.
+    the last bin known by then; before the first bin none is valid. Such a decision is valid where
+    the bin is, or where there is fast evidence.
 
     Attributes:
         number: of the decision in its stream, from 0, ``[m]``, int64.
-        available_s: when it can be made, ``[m]``, float64.
-        onset_s: when the slip began that it speaks of, as far as it can tell, ``[*, m]``, float64.
-        score: at least 0 is slip, ``[*, m]``.
-        llr: log likelihood ratio; ``NEUTRAL`` where the score tells nothing, ``[*, m]``.
-        probability: of slip, by the bin alone, ``[*, m]``.
-        statistic: of the rule, ``[*, m]``.
-        is_valid: whether every channel in use could be trusted, ``[*, m]``.
+        available_s: when it could be made: the end of its bin and the look-ahead, ``[m]``, float64.
+        onset_s: when the slip is thought to have begun, if this is one, ``[*, m]``, float64.
+        score: at least 0 is slip, NaN where the bin is not valid, ``[*, m]``.
+        llr: log likelihood ratio, NaN likewise, ``[*, m]``.
+        probability: of slip, by the bin alone, NaN likewise, ``[*, m]``.
+        statistic: of the rule, NaN likewise, ``[*, m]``.
+        is_valid: whether the decision counts, ``[*, m]``; one that does not raises no alarm.
+        in_range: whether the channels move about as much as in training, ``[*, m]``.
+        channels_lost: channels in use that were left out, ``[*, m, C]``.
         is_alarm: whether it raises an alarm, ``[*, m]``.
         is_on: whether an alarm stands after it: the contact's status, ``[*, m]``.
         onset_score: of fast evidence, ``NOTHING_YET`` where there is none, ``[*, m]``, float64.
         by_onset: whether fast evidence reaches its threshold, ``[*, m]``.
+        channels: names of ``C`` channels, empty where they are not told.
     """
 
     number: Tensor
@@ -291,10 +315,13 @@ class Decisions(NamedTuple):
     probability: Tensor
     statistic: Tensor
     is_valid: Tensor
+    in_range: Tensor
+    channels_lost: Tensor
     is_alarm: Tensor
     is_on: Tensor
     onset_score: Tensor
     by_onset: Tensor
+    channels: tuple[str, ...] = ()
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
@@ -307,14 +334,52 @@ class Decisions(NamedTuple):
                 probability=float(self.probability[i]),
                 statistic=float(self.statistic[i]),
                 is_valid=bool(self.is_valid[i]),
+                in_range=bool(self.in_range[i]),
+                channels_lost=self.names_lost(i),
                 raised_by="onset" if self.by_onset[i] else "status",
             )
             for i in self.is_alarm.nonzero().flatten().tolist()
         )
 
+    def names_lost(self, index: int) -> tuple[str, ...]:
+        """Names of the channels that a decision of one stream was made without."""
+        flags = self.channels_lost[index].tolist()
+        return tuple(name for name, lost in zip(self.channels, flags, strict=True) if lost)
 
-_OF_BINS = ("onset_s", "score", "llr", "probability", "statistic", "is_valid")
-"""What decisions with an onset classifier say of the last bin; float64 holds all of it exactly."""
+    def row(self, index: int) -> Decisions:
+        """Those of one of several streams."""
+        parts: Any = [x[index] if x.ndim > 1 else x for x in self[:-1]]
+        return Decisions._make([*parts, self.channels])
+
+
+def joined_decisions(parts: Sequence[Decisions]) -> Decisions:
+    """Decisions of one stream, one behind the other."""
+    if len(parts) == 1:
+        return parts[0]
+    columns: list[Any] = list(zip(*(part[:-1] for part in parts), strict=True))
+    return Decisions._make([*map(torch.cat, columns), parts[0].channels])
+
+
+_OF_BINS = ("onset_s", "score", "llr", "probability", "statistic", "is_valid", "in_range")
+"""What decisions with an onset classifier say of the last bin; float64 holds all of it exactly.
+Channels that are lost come behind."""
+
+
+@dataclass
+class _Row:
+    """What is remembered of one stream between two decisions.
+
+    Attributes:
+        rule: memory of the rule.
+        latch: of its alarm.
+        run: number of the decision with which the unbroken run of positive ratios began.
+        lost: decisions in a row that are not valid.
+    """
+
+    rule: list[float]
+    latch: Latch = Latch()  # noqa: RUF009  # a tuple: armed, with no alarm before
+    run: int = 0
+    lost: int = 0
 
 
 class Decider:
@@ -325,12 +390,17 @@ class Decider:
     stands until both have been low for ``rearm_s``. So bins confirm what fast evidence raised, or
     clear it.
 
+    Decisions that are not valid move nothing. After ``settings.hold_s`` of lost samples an alarm
+    that stands ends, and the rule begins anew.
+
     Args:
         settings: calibration, rule, threshold.
         sample_rate_hz: of the stream.
         bin_samples: length of a bin.
         look_ahead: samples behind its bin that a decision waits for.
         frame_samples: that must have come before any decision on a bin.
+        context_before: samples before its bin that a decision rests on; default: ``look_ahead``.
+        channels: names of the channels, if ``decide`` is told which are lost.
         end_s: when so many samples had come, ``[m]``; by default by the sample rate.
 
     Example:
@@ -351,74 +421,80 @@ class Decider:
         look_ahead: int,
         frame_samples: int = 0,
         *,
+        context_before: int | None = None,
+        channels: Sequence[str] = (),
         end_s: Callable[[Array], Array] | None = None,
     ) -> None:
         self.settings = settings
-        self._rate = sample_rate_hz
+        self._rate, self._channels = sample_rate_hz, tuple(channels)
         self._end_s = end_s or (lambda samples: samples / sample_rate_hz)
         self._first, self._frame = bin_samples + look_ahead, frame_samples
         self._latch_times = settings.latch_times(sample_rate_hz)
+        window = self._first + (look_ahead if context_before is None else context_before)
+        self._window = window
         self.reset()
 
     def reset(self) -> None:
         """Forget everything; the next decision is number 0 of a stream that begins at 0."""
         self._number = 0  # Python's integers do not end
-        # of the rule (of one stream plain numbers); of the latch, one a stream; where the run began
-        self._state: tuple[Any, list[Latch], Array] | None = None
+        self._rows: list[_Row] | None = None
         self._hop = 0  # of the next onset score
         self._known: Array | None = None  # of bins, those that count from the next hop on
         self._first_known = -1  # number of the first of them
-        self._latches: list[Latch] = []
+        self._alarm_rows: list[_Row] = []
 
     def decide(
         self,
         score: Tensor,
         is_valid: Tensor,
-        is_usable: Tensor | None = None,
+        in_range: Tensor | None = None,
+        channels_lost: Tensor | None = None,
     ) -> Decisions:
         """The next decisions.
 
         Args:
             score: of bins, in order.
-            is_valid: whether every channel in use could be trusted; handed on.
-            is_usable: whether the score tells anything (``is_usable``); where not, the evidence is
-                ``NEUTRAL``. By default ``is_valid``.
+            is_valid: whether they count.
+            in_range: handed on; default: as ``is_valid``.
+            channels_lost: handed on; default: of no channel.
 
         Shape:
-            - all: ``[*, m]``; m may be 0, the streams ``*`` are always the same
+            - score, is_valid, in_range: ``[*, m]``; m may be 0, the streams ``*`` are always the
+              same; channels_lost: ``[*, m, C]``
         """
         settings = self.settings
-        if self._state is None:
-            like = score.new_zeros(score.shape[:-1])
-            start: Any = settings.rule.start(like)
-            of_rule, none = start if like.ndim else start.tolist(), np.zeros(like.shape, np.int64)
-            self._state = of_rule, [Latch()] * like.numel(), none
-        of_rule, latches, run = self._state
-        llr = settings.calibration.llr(score)
-        tells = is_valid if is_usable is None else is_usable
-        ratios = llr.detach().numpy()
-        ratios = np.where(tells.numpy() & np.isfinite(ratios), ratios, ratios.dtype.type(NEUTRAL))
+        valid = is_valid & score.isfinite()
+        llr = settings.calibration.llr(torch.where(valid, score, 0.0)).clamp(-LARGEST, LARGEST)
+        score, llr = (x.masked_fill(~valid, torch.nan) for x in (score.detach(), llr.detach()))
+        num = score.shape[-1]
+        ratios = llr.numpy().reshape(math.prod(score.shape[:-1]), num)
         one = ratios.dtype.type
-        llr = torch.from_numpy(ratios)
-        if score.ndim == 1:
-            row, of_rule = settings.rule.scan_row(ratios.tolist(), of_rule, one)
-            statistic, rows = torch.from_numpy(np.array(row, one)), [row]
-        else:
-            statistic, of_rule = settings.rule.scan(llr, of_rule)
-            rows = statistic.flatten(0, -2).tolist()
-        is_alarm, is_on, latches = self._latched(rows, float(one(settings.threshold)), latches)
-        number = np.arange(self._number, self._number + score.shape[-1])
-        # where the unbroken run of positive ratios up to each decision began: behind one that is
-        # not positive the next one would begin it
-        runs = np.where(ratios > 0, run[..., None], number + 1)
-        runs = np.maximum.accumulate(runs, -1)
-        self._state = of_rule, latches, runs[..., -1] if len(number) else run
-        self._number += len(number)
+        if self._rows is None:
+            start = settings.rule.start(llr.new_zeros(())).tolist()
+            self._rows = [_Row(list(start)) for _ in ratios]
+        most = most_lost(self._window, self._hold, settings.hop_samples)
+        threshold = float(one(settings.threshold))
+        walked = [
+            _walk(row, of_row, settings, self._latch_times, threshold, self._number, most, one)
+            for row, of_row in zip(ratios, self._rows, strict=True)
+        ]
+        statistic: Array
+        alarms: Array
+        standing: Array
+        runs: Array
+        statistic, alarms, standing, runs = (
+            np.array([of[part] for of in walked], kind).reshape(score.shape)
+            for part, kind in enumerate((one, bool, bool, np.int64))
+        )
+        number = np.arange(self._number, self._number + num)
+        self._number += num
         samples = number * settings.hop_samples + self._first
         if settings.onset is None:  # else ``join`` says when
             samples = samples.clip(min=self._frame)
         available_s = self._end_s(samples)
         lasted_s = (number - np.minimum(runs, number)) * settings.hop_samples / self._rate
+        if channels_lost is None:
+            channels_lost = valid.new_zeros((*valid.shape, len(self._channels)))
         return Decisions(
             torch.from_numpy(number),
             torch.from_numpy(available_s),
@@ -426,12 +502,15 @@ class Decider:
             score,
             llr,
             probability(llr, settings.slip_share),
-            statistic,
-            is_valid,
-            is_alarm.reshape(score.shape),
-            is_on.reshape(score.shape),
+            torch.from_numpy(statistic),
+            valid,
+            valid if in_range is None else in_range & valid,
+            channels_lost,
+            torch.from_numpy(alarms),
+            torch.from_numpy(standing),
             torch.full(score.shape, NOTHING_YET, dtype=torch.float64),
             torch.zeros(score.shape, dtype=torch.bool),
+            self._channels,
         )
 
     def join(self, bins: Decisions, onset_score: Tensor) -> Decisions:
@@ -448,12 +527,14 @@ class Decider:
         assert onset is not None
         scores, known = onset_score.numpy(), self._known
         if known is None:  # before all bins, number -1
-            says_nothing = (math.inf, 0.0, 0.0, settings.slip_share, NOTHING_YET, 0.0)
+            says_nothing = [math.inf, *[math.nan] * 4, 0.0, 0.0, *[0.0] * len(self._channels)]
             known = np.multiply.outer(says_nothing, np.ones((*scores.shape[:-1], 1)))
-            self._first_known, self._latches = -1, [Latch()] * int(np.prod(scores.shape[:-1]))
+            num_streams = int(np.prod(scores.shape[:-1]))
+            self._first_known, self._alarm_rows = -1, [_Row([]) for _ in range(num_streams)]
         if bins.score.shape[-1]:
-            made = np.stack([getattr(bins, name).numpy() for name in _OF_BINS])
-            known = np.concatenate([known, made], -1)
+            lost = bins.channels_lost.movedim(-1, 0).numpy()
+            made = [*(getattr(bins, name).numpy() for name in _OF_BINS), *lost]
+            known = np.concatenate([known, np.stack(made)], -1)
         number = np.arange(self._hop, self._hop + scores.shape[-1])
         samples = (number + 1) * onset.evidence.hop_samples
         last = (samples - self._first) // settings.hop_samples
@@ -466,9 +547,19 @@ class Decider:
         began_s, of_bin = said[0], said[1:5].astype(bins.score.numpy().dtype)
         score, llr, stated, statistic = torch.from_numpy(of_bin).unbind()
         by_onset = scores >= onset.threshold
-        is_high = by_onset | (of_bin[3] >= of_bin.dtype.type(settings.threshold))
-        rows = is_high.reshape(len(self._latches), len(number)).tolist()
-        is_alarm, is_on, self._latches = self._latched(rows, 1.0, self._latches)
+        with np.errstate(invalid="ignore"):  # NaN is not high
+            is_high = by_onset | (of_bin[3] >= of_bin.dtype.type(settings.threshold))
+        is_valid = (said[5] > 0) | (scores > NOTHING_YET)
+        rows = np.where(is_valid, is_high * 1.0, np.nan)
+        rows = rows.reshape(len(self._alarm_rows), len(number))
+        most = most_lost(self._window, self._hold, onset.evidence.hop_samples)
+        walked = [
+            _walk(row, of_row, None, self._latch_times, 1.0, 0, most, float)
+            for row, of_row in zip(rows, self._alarm_rows, strict=True)
+        ]
+        alarms, standing = (
+            np.array([of[part] for of in walked], bool).reshape(scores.shape) for part in (1, 2)
+        )
         available_s = self._end_s(samples)
         onset_s = np.where(by_onset, available_s - onset.lead_s, began_s)
         return Decisions(
@@ -479,39 +570,82 @@ class Decider:
             llr,
             stated,
             statistic,
-            torch.from_numpy(said[5] > 0),
-            is_alarm.reshape(scores.shape),
-            is_on.reshape(scores.shape),
+            torch.from_numpy(is_valid),
+            torch.from_numpy(said[6] > 0),
+            torch.from_numpy(said[7:] > 0).movedim(0, -1),
+            torch.from_numpy(alarms),
+            torch.from_numpy(standing),
             onset_score,
             torch.from_numpy(by_onset),
+            self._channels,
         )
 
-    def _latched(
-        self, rows: list[list[float]], threshold: float, latches: list[Latch]
-    ) -> tuple[Tensor, Tensor, list[Latch]]:
-        """Alarms of every stream, whether one stands, and the latches after them."""
-        made = [
-            latch(row, threshold, **self._latch_times, state=state)
-            for row, state in zip(rows, latches, strict=True)
-        ]
-        alarms, standing = (
-            torch.from_numpy(np.array([of_row[part] for of_row in made], bool)) for part in (0, 1)
-        )
-        return alarms, standing, [state for _, _, state in made]
+    @property
+    def _hold(self) -> int:
+        """Lost samples in a row up to which rules keep their state."""
+        return round(self.settings.hold_s * self._rate)
 
 
-def is_usable(score: Tensor, is_missing: Tensor, needed_index: Tensor) -> Tensor:
-    """Whether a score tells anything: it is finite, and some channel in use was there.
+def _walk(
+    ratios: Array,
+    state: _Row,
+    settings: AlarmSettings | None,
+    latch_times: Mapping[str, int],
+    threshold: float,
+    number: int,
+    most: int,
+    one: Any,
+) -> tuple[list[float], list[bool], list[bool], list[int]]:
+    """Statistics, alarms, whether one stands, and where runs began, of one stream.
 
-    A hand that lost a sensor goes on feeling with the others: the decision is flagged as not valid
-    and still counts. One that lost them all feels nothing.
-
-    Shape:
-        - score, output: ``[*]``
-        - is_missing: ``[*, C]``
-        - needed_index: ``[channels in use]``
+    Args:
+        ratios: of the next decisions, NaN where not valid.
+        state: updated.
+        settings: with the rule; None: ratios are statistics.
+        latch_times: of the latch.
+        threshold: of the statistic.
+        number: of the first decision.
+        most: decisions in a row that may be lost until all begins anew.
+        one: dtype of the ratios.
     """
-    return score.isfinite() & ~is_missing.index_select(-1, needed_index).all(-1)
+    lost = np.isnan(ratios)
+    edges = np.flatnonzero(lost[1:] != lost[:-1]) + 1
+    found: tuple[list[Any], list[Any], list[Any], list[Any]] = [], [], [], []
+    for part in np.split(np.arange(len(ratios)), edges) if len(ratios) else ():
+        own = ratios[part].tolist()
+        if lost[part[0]]:
+            statistic = own
+            kept = max(most - state.lost, 0)  # decisions that change nothing
+            alarms, standing, state.latch = latch(
+                own[:kept], threshold, **latch_times, state=state.latch
+            )
+            runs = [state.run] * len(alarms)
+            state.lost += len(own)
+            if num := len(own) - len(alarms):
+                state.latch = state.latch._replace(is_on=False, below=0)
+                more, off, state.latch = latch(
+                    own[kept:], threshold, **latch_times, state=state.latch
+                )
+                alarms, standing = alarms + more, standing + off
+                runs += (number + part[-num:] + 1).tolist()
+                state.run = runs[-1]
+        else:
+            if state.lost > most and settings is not None:
+                state.rule = settings.rule.start(torch.zeros(())).tolist()
+            state.lost, statistic = 0, own
+            if settings is not None:
+                statistic, state.rule = settings.rule.scan_row(own, state.rule, one)
+            alarms, standing, state.latch = latch(
+                statistic, threshold, **latch_times, state=state.latch
+            )
+            numbers = number + part
+            began = np.where(ratios[part] > 0, state.run, numbers + 1)
+            runs = np.maximum.accumulate(began).tolist()
+            state.run = runs[-1]
+        made: tuple[list[Any], ...] = statistic, alarms, standing, runs
+        for whole, more_of in zip(found, made, strict=True):
+            whole.extend(more_of)
+    return found
 
 
 class StreamStatistic(NamedTuple):
@@ -519,9 +653,11 @@ class StreamStatistic(NamedTuple):
 
     Attributes:
         score: at least 0 is slip.
-        llr: log likelihood ratio; ``NEUTRAL``, without gradient, where the score tells nothing.
+        llr: log likelihood ratio.
         probability: of slip, by the bin alone.
         statistic: of the rule; an alarm is raised where it reaches ``settings.threshold``.
+
+    All are NaN, without gradient, where a decision is not valid.
     """
 
     score: Tensor
@@ -536,14 +672,14 @@ def stream_statistic(
     """Every decision on whole recordings, differentiable in the raw samples.
 
     Gradients are those of the values: 0 through a feature that is clipped, through a channel that
-    counts as missing and through entropy; one-sided at ties. All
-    features of the pool are made on the way: a few seconds of stream at once, not hours.
+    is lost and through entropy; one-sided at ties. All features of the pool are made on the way: a
+    few seconds of stream at once, not hours. The rule keeps its state over lost stretches of any
+    length.
 
     Args:
         detector: fitted on this hand.
         settings: hop, calibration and rule; ``AlarmSettings.of(detector)`` are those in its file.
-        samples: recordings in volts; a channel with a NaN or Inf in a bin's reach is left out
-            of that bin.
+        samples: recordings in volts; a channel that is lost in a bin is left out of it.
 
     Shape:
         - samples: ``[*, C, T]``, float32 or float64, ``T`` at least a bin and the longest frame
@@ -571,15 +707,23 @@ def stream_statistic(
             f"expected at least {shortest} samples, a bin and the longest frame in use, "
             f"got {samples.shape[-1]}; give a longer recording"
         )
+    samples = without_stuck(samples, detector.sensing.stuck_samples)
     whole = extended(detector.pool.widen(samples), detector.channel_filter, used)
     bins = whole.unfold(-1, length + 2 * detector.channel_filter.context, settings.hop_samples)
     is_used = torch.zeros(len(detector.pool.hand), 1, dtype=torch.bool, device=bins.device)
     is_used[used] = True
     bins = bins.movedim(-3, -2)  # [*, m, C, n + context]
     bins = torch.where(is_used | bins.isfinite(), bins, 0.0)  # or 0 times NaN comes back
-    score, _, is_missing = detector.predict_raw(bins, given=samples.dtype)
-    llr = settings.calibration.llr(score)
-    tells = is_usable(score, is_missing, detector.needed_index) & llr.isfinite()
-    llr = torch.where(tells, llr, NEUTRAL)
-    statistic, _ = settings.rule.scan(llr, settings.rule.start(llr[..., 0]))
-    return StreamStatistic(score, llr, probability(llr, settings.slip_share), statistic)
+    found = detector.predict_raw(bins, given=samples.dtype)
+    llr = settings.calibration.llr(torch.where(found.is_valid, found.score, 0.0))
+    rows = []
+    for own, valid in zip(
+        llr.flatten(0, -2) if llr.ndim > 1 else llr[None],
+        found.is_valid.reshape(-1, llr.shape[-1]),
+        strict=True,
+    ):
+        known, _ = settings.rule.scan(own[valid], settings.rule.start(own.new_zeros(())))
+        rows.append(torch.full_like(own, torch.nan).masked_scatter(valid, known))
+    statistic = torch.stack(rows).reshape(llr.shape)
+    llr = torch.where(found.is_valid, llr, torch.nan)
+    return StreamStatistic(found.score, llr, probability(llr, settings.slip_share), statistic)

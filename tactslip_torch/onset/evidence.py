@@ -29,11 +29,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tactslip_torch.features.sensing import least_alive
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName, OnsetEngine, backend_of
-from tactslip_torch.onset.rules import NOTHING_YET
+from tactslip_torch.onset.rules import HOLD_S, NOTHING_YET, most_lost
 
 Array = NDArray[Any]
 
@@ -55,7 +56,7 @@ MEAN_HOPS = 3
 """Over which the score is averaged: a knock is over sooner than a slip begins."""
 _NUMBERS: Mapping[str, Any] = {"hop_samples": int, "mains_hz": float, "comb_periods": int}
 _KNEES = ("fast_knee", "slow_knee")
-_LEAST_RISE = 1e-6  # of a floor over that of silence; below, a channel is stuck
+_LEAST_RISE = 1e-6  # of a floor over that of silence, in half the log power
 
 
 class Blocks(NamedTuple):
@@ -82,6 +83,9 @@ class OnsetEvidence:
         slow_knee: step that counts as none, of each of ``STEPS_S``, ``[D]``.
         mains_hz: whose period the comb has.
         comb_periods: over how many it takes the mean.
+        least_rms: root mean square of each fast channel and filter, ``[F, B]``, below which the
+            channel is silent; empty: below rounding.
+        min_alive: fast channels that must be alive for evidence; ``None``: half of them.
 
     Raises:
         ValueError: if the hand has no fast channel, a hop is longer than 5 ms, or a knee is not
@@ -95,6 +99,8 @@ class OnsetEvidence:
     slow_knee: tuple[float, ...] = (1e-30,) * len(STEPS_S)
     mains_hz: float = 50.0
     comb_periods: int = 1
+    least_rms: tuple[tuple[float, ...], ...] = ()
+    min_alive: int | None = None
 
     def __post_init__(self) -> None:
         if not self.hand.fast:
@@ -111,10 +117,23 @@ class OnsetEvidence:
         num_knees = len(WIDTHS_S) + 1 + len(STEPS_S)
         if len(knees) != num_knees or not all(0 < knee < float("inf") for knee in knees):
             raise ValueError(f"expected {num_knees} positive and finite knees, got {knees}")
+        shape = (len(self.hand.fast), len(self.fast_knee))
+        least = np.array(self.least_rms or np.zeros(shape), np.float64)
+        if least.shape != shape or not (np.isfinite(least) & (least >= 0)).all():
+            raise ValueError(f"least_rms must be finite, at least 0 and {list(shape)}")
+        if self.min_alive is None:
+            object.__setattr__(self, "min_alive", least_alive(shape[0]))
 
     def blocks_in(self, seconds: float) -> int:
         """A length of time in blocks, rounded up."""
         return max(1, -(-round(seconds * self.sample_rate_hz) // self.hop_samples))
+
+    @cached_property
+    def silence(self) -> Tensor:
+        """Half the log power of a silent channel, ``[B, F]``, float64."""
+        knee = np.array(self.fast_knee)
+        least = np.array(self.least_rms or np.zeros((len(self.hand.fast), len(knee))))
+        return torch.from_numpy(np.log(np.hypot(knee, least)).T + _LEAST_RISE)
 
     @cached_property
     def context(self) -> int:
@@ -207,10 +226,11 @@ class OnsetEvidence:
         return self.blocks(samples[:, start:])
 
     def columns(self, blocks: Blocks, masked: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """The evidence of each hop, and whether any fast channel gave it some.
+        """The evidence of each hop, and whether enough fast channels gave it.
 
         A channel that is masked, that had a NaN or an Inf in the last second, or that has been
-        silent for all of it, is left out of the pools.
+        silent for all of it, is left out of the pools. With fewer than ``min_alive`` fast ones
+        there is no evidence.
 
         Args:
             blocks: of ``memory - 1`` hops before the first and of k more.
@@ -253,11 +273,10 @@ class OnsetEvidence:
             - fast: ``[F]``, slow: ``[S]``, bool
             - output: ``[k, K]`` and ``[k]``, bool
         """
-        silence = torch.tensor(self.fast_knee, dtype=torch.float64).log()[:, None]
         loudness = level.log() * 0.5
         rises = loudness - floor.unsqueeze(1)
         is_finite = rises.sum(1).sum(1).isfinite()
-        in_use = ((floor - silence).amax(1) > _LEAST_RISE) & is_finite & fast  # [k, F]
+        in_use = ((floor - self.silence).amax(1) > 0.0) & is_finite & fast  # [k, F]
         columns = _over_channels(rises, in_use, len(self.hand.fast))
         columns = [torch.cat(columns, 1).flatten(-2)]
         if num_slow := len(self.hand.slow):
@@ -267,11 +286,13 @@ class OnsetEvidence:
             both = torch.cat([size.unsqueeze(1), way.unsqueeze(1)], 1)  # [k, 2, D, S]
             pools = _over_channels(both, size.sum(1).isfinite() & slow, num_slow)
             columns.append(torch.cat(pools, -1).flatten(-2))
-        return torch.cat(columns, -1), in_use.any(-1)
+        num_alive = in_use.type_as(level).sum(-1)
+        return torch.cat(columns, -1), num_alive >= float(self.min_alive or 1)
 
     def to_dict(self) -> dict[str, Any]:
         """All but the hand and the sample rate, which are the detector's."""
-        plain = {name: getattr(self, name) for name in _NUMBERS}
+        plain = {name: getattr(self, name) for name in (*_NUMBERS, "min_alive")}
+        plain["least_rms"] = [list(row) for row in self.least_rms]
         return plain | {name: list(getattr(self, name)) for name in _KNEES}
 
 
@@ -294,7 +315,7 @@ class OnsetClassifier:
     lead_s: float = 0.0
 
     def score(self, blocks: Blocks, masked: Tensor | None = None) -> Tensor:
-        """Of every hop alone, float64; NaN where no fast channel can be listened to.
+        """Of every hop alone, float64; NaN where too few fast channels are alive.
 
         Shape:
             - blocks, masked: as ``OnsetEvidence.columns`` takes them
@@ -342,6 +363,8 @@ class OnsetClassifier:
 
         numbers = {name: kind(plain[name]) for name, kind in _NUMBERS.items()}
         numbers |= {name: tuple(map(float, plain[name])) for name in _KNEES}
+        numbers["least_rms"] = tuple(tuple(map(float, row)) for row in plain["least_rms"])
+        numbers["min_alive"] = int(plain["min_alive"])
         evidence, num = OnsetEvidence(hand, sample_rate_hz, **numbers), len(plain["linear"])
         quadratic = tensor("quadratic") if plain["quadratic"] else torch.zeros(0, 0).double()
         head = QuadraticForm(quadratic, tensor("linear"), tensor("constant"))
@@ -354,18 +377,33 @@ class OnsetClassifier:
 class OnsetStream:
     """Onset scores of a stream as its samples come; its memory has a fixed size.
 
+    A block in which too few fast channels are known (``OnsetEvidence.min_alive``) is lost. It has
+    no score and leaves the memory as it is. Beyond ``most_lost_samples`` of lost samples the memory
+    begins anew, as at the beginning of a stream.
+
     Args:
         classifier: that scores.
+        most_lost_samples: in a row.
         backend: ``"auto"`` takes the native engine where it can be used.
 
     Raises:
         ValueError: for an unknown backend, or one that cannot be used here.
     """
 
-    def __init__(self, classifier: OnsetClassifier, backend: BackendName = "auto") -> None:
+    def __init__(
+        self,
+        classifier: OnsetClassifier,
+        most_lost_samples: int | None = None,
+        backend: BackendName = "auto",
+    ) -> None:
         evidence = classifier.evidence
+        if most_lost_samples is None:
+            most_lost_samples = round(HOLD_S * evidence.sample_rate_hz)
         self._classifier = classifier
-        self._engine = _engine_of(classifier) if backend_of(backend) == "native" else None
+        window = evidence.context + evidence.hop_samples
+        self._most_lost = most_lost(window, most_lost_samples, evidence.hop_samples)
+        is_native = backend_of(backend) == "native"
+        self._engine = _engine_of(classifier, self._most_lost) if is_native else None
         self._hop = 0  # of the next score
         self._skipped = 0  # samples before those that are held
         self._held: Array | None = None
@@ -373,7 +411,8 @@ class OnsetStream:
         # half the log powers of blocks, and behind them the means
         width = len(evidence.hand.fast) * len(evidence.fast_knee) + len(evidence.hand.slow)
         self._rows, self._num_rows = np.empty((4 * evidence.memory, width)), 0
-        self._scores = np.full(MEAN_HOPS - 1, math.nan)
+        self._num_lost = 0
+        self._scores = np.full(MEAN_HOPS - 1, math.nan)  # of the last blocks that are not lost
 
     @property
     def state_bytes(self) -> int:
@@ -392,47 +431,73 @@ class OnsetStream:
         hop, context, memory = evidence.hop_samples, evidence.context, evidence.memory
         held = x if self._held is None else np.concatenate([self._held, x], -1)
         num = (self._skipped + held.shape[-1]) // hop
-        score = np.full(MEAN_HOPS - 1 + num - self._hop, math.nan)
-        score[: MEAN_HOPS - 1] = self._scores
+        mean = np.full(num - self._hop, NOTHING_YET)
         first = max(self._hop, -(-context // hop))  # block that has its context
         for start in range(first, num, memory):
             stop = min(start + memory, num)
             begin = start * hop - context - self._skipped
-            made = self._score(held[:, begin : stop * hop - self._skipped], stop - start, masked)
-            score[MEAN_HOPS - 1 + start - self._hop :][: len(made)] = made
+            made, is_lost = self._score(held[:, begin : stop * hop - self._skipped], masked)
+            known = np.concatenate([self._scores, made[~is_lost]])
+            mean[start - self._hop : stop - self._hop][~is_lost] = _mean_of_hops(known)
+            self._scores = known[1 - MEAN_HOPS :]
         first = max(first, num)
         self._hop, surplus = num, max(first * hop - context - self._skipped, 0)
         self._held = held[:, surplus:].copy()
         self._skipped += min(surplus, held.shape[-1])
-        self._scores = score[1 - MEAN_HOPS :]
-        return torch.from_numpy(_mean_of_hops(score))
+        return torch.from_numpy(mean)
 
-    def _score(self, x: Array, num: int, masked: Tensor | None) -> Array:
-        """Scores of the next hops, at most ``memory``, NaN without evidence; from their samples."""
+    def _score(self, x: Array, masked: Tensor | None) -> tuple[Array, Array]:
+        """Scores of the next hops, at most ``memory``, NaN without evidence; which are lost."""
         evidence, memory = self._classifier.evidence, self._classifier.evidence.memory
+        num = (x.shape[-1] - evidence.context) // evidence.hop_samples
         if self._num_rows + num > len(self._rows):
             kept = memory - 1
             self._rows[:kept] = self._rows[self._num_rows - kept : self._num_rows].copy()
             self._num_rows = kept
-        rows = self._rows[max(self._num_rows + 1 - memory, 0) : self._num_rows + num]
-        self._num_rows += num
-        if self._engine is not None:
-            listened = self._all if masked is None else ~masked.numpy()
-            return self._engine(x, rows, listened)
-        with torch.no_grad():
-            made, num_filters = evidence.blocks(torch.from_numpy(x)), len(evidence.fast_knee)
-            logs = (made.power.log() * 0.5).flatten(0, 1)
-            known = torch.from_numpy(rows)
-            known[-num:] = torch.cat([logs, made.mean]).T
-            score = torch.full((num,), math.nan, dtype=torch.float64)
-            if (silent := memory - 1 - (len(rows) - num)) < num:
-                logs, means = known.T.split([len(logs), len(made.mean)])
-                power = (2.0 * logs).exp().unflatten(0, (-1, num_filters))
-                score[max(silent, 0) :] = self._classifier.score(Blocks(power, means), masked)
-            return score.numpy()
+        start = max(self._num_rows + 1 - memory, 0)
+        listened = self._all if masked is None else ~masked.numpy()
+        call = self._by_torch if self._engine is None else self._engine
+        given = self._rows[start : self._num_rows + num], self._num_rows - start, self._num_lost
+        score, is_lost, num_rows, self._num_lost = call(x, *given, listened)
+        self._num_rows = start + num_rows
+        return score, is_lost
+
+    def _by_torch(
+        self, x: Array, rows: Array, num_rows: int, num_lost: int, listened: Array
+    ) -> tuple[Array, Array, int, int]:
+        """As ``native.OnsetEngine``."""
+        evidence, num_filters = self._classifier.evidence, len(self._classifier.evidence.fast_knee)
+        made = evidence.blocks(torch.from_numpy(x))
+        logs = (made.power.log() * 0.5).transpose(1, 2)  # [F, k, B]
+        fast = listened[list(evidence.hand.fast)]
+        num_known = logs.sum(-1).isfinite().numpy()[fast].sum(0)
+        is_lost = num_known < (evidence.min_alive or 1)
+        made_rows = torch.cat([logs.transpose(1, 2).flatten(0, 1), made.mean]).T.numpy()
+        score, segments = np.full(len(made_rows), math.nan), list[tuple[bool, list[int]]]()
+        for hop in range(len(made_rows)):
+            num_lost += int(is_lost[hop])
+            if is_lost[hop]:
+                continue
+            if begins_anew := num_lost > self._most_lost:
+                segments.append((begins_anew, []))
+            elif not segments:
+                segments.append((False, []))
+            segments[-1][1].append(hop)
+            num_lost = 0
+        for begins_anew, hops in segments:
+            first = 0 if begins_anew else num_rows
+            num_rows = first + len(hops)
+            rows[first:num_rows] = made_rows[hops]
+            known = torch.from_numpy(rows[max(first + 1 - evidence.memory, 0) : num_rows].T)
+            if (num := known.shape[-1] - evidence.memory + 1) > 0:
+                own, means = known.split([len(known) - len(made.mean), len(made.mean)])
+                power = (2.0 * own).exp().unflatten(0, (-1, num_filters))
+                found = self._classifier.score(Blocks(power, means), torch.from_numpy(~listened))
+                score[hops[-num:]] = found.numpy()
+        return score, is_lost, num_rows, num_lost
 
 
-def _engine_of(classifier: OnsetClassifier) -> OnsetEngine:
+def _engine_of(classifier: OnsetClassifier, most_lost: int) -> OnsetEngine:
     evidence, scaler, head = classifier.evidence, classifier.scaler, classifier.head
     width = (scaler.maximum - scaler.minimum).numpy()
     slope = np.divide(2.0, width, out=np.zeros_like(width), where=width > 0)
@@ -448,6 +513,9 @@ def _engine_of(classifier: OnsetClassifier) -> OnsetEngine:
         knees=(evidence.fast_knee, evidence.slow_knee),
         scaling=(slope, offset),
         head=(quadratic, head.linear.numpy(), float(head.constant)),
+        silence=evidence.silence.T.numpy(),
+        min_alive=evidence.min_alive or 1,
+        most_lost=most_lost,
     )
 
 

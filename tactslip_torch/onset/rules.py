@@ -20,8 +20,8 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-NEUTRAL = 0.0
-"""The log likelihood ratio of a decision that says nothing; it stands for invalid ones."""
+HOLD_S = 0.25
+"""Lost samples in a row up to which a rule keeps its state; beyond, it begins anew."""
 
 NOTHING_YET = -1e30
 """What ``KOfN`` takes for decisions before the first; finite, and below every real one."""
@@ -56,8 +56,8 @@ class KOfN:
     def scan(self, llr: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """The k-th largest of each decision and the ``n - 1`` before it, and the state after them.
 
-        Finite ratios up to 1e30 of either sign give finite statistics and gradients; whatever is
-        not valid, or not finite, the caller makes ``NEUTRAL``. Differentiable in both arguments.
+        Finite ratios up to 1e30 of either sign give finite statistics and gradients; what
+        is not valid the caller leaves out. Differentiable in both arguments.
 
         Shape:
             - llr, statistic: ``[*, T]``, ``T`` may be 0
@@ -205,8 +205,8 @@ def latch(
 
     An alarm is raised where the latch is armed, the statistic is at or above the threshold and the
     last alarm is at least ``refractory`` decisions back. It stands until ``rearm`` decisions in a
-    row, at least one, lie below the threshold; from that decision on the latch is armed again. A
-    statistic that is NaN is neither above nor below. In plain numbers, quicker than small tensors.
+    row, at least one, lie below the threshold; from that decision on the latch is armed again.
+    Where the statistic is NaN all stays as it is. In plain numbers, quicker than small tensors.
 
     Args:
         statistic: what a rule made of the decisions.
@@ -218,16 +218,31 @@ def latch(
     is_on, below, since = state
     alarms, standing = [], []
     for x in statistic:
+        since += 1
+        if x != x:
+            alarms.append(False)
+            standing.append(is_on)
+            continue
         below = below + 1 if x < threshold else 0
         if below >= max(rearm, 1):
             is_on = False
-        since += 1
         is_alarm = not is_on and x >= threshold and since >= refractory
         if is_alarm:
             is_on, since = True, 0
         alarms.append(is_alarm)
         standing.append(is_on)
     return alarms, standing, Latch(is_on, below, since)
+
+
+def most_lost(window_samples: int, hold_samples: int, hop_samples: int) -> int:
+    """Decisions in a row that so many lost samples make invalid, at most.
+
+    Args:
+        window_samples: that a decision rests on.
+        hold_samples: lost samples in a row.
+        hop_samples: distance of two decisions.
+    """
+    return -(-(window_samples + hold_samples) // hop_samples)
 
 
 def _check_state(llr: Tensor, state: Tensor, size: int) -> None:

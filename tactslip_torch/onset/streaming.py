@@ -8,24 +8,41 @@ to the scores it is one call of the native engine, where that can be used.
 from __future__ import annotations
 
 import logging
-import math
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from tactslip_torch.features.sensing import StuckChannels, level_ratio, told_of_levels
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import ChannelMask, masked_names
-from tactslip_torch.onset.decisions import AlarmSettings, Decider, Decisions, is_usable
+from tactslip_torch.model.prediction import ChannelMask, Prediction, masked_names
+from tactslip_torch.onset.decisions import AlarmSettings, Decider, Decisions, joined_decisions
 from tactslip_torch.onset.evidence import OnsetStream
 from tactslip_torch.signals.filtering import past_of
 
 _LOG = logging.getLogger(__name__)
 _NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 Array = NDArray[Any]
+
+
+_LEVELS_S = 2.0  # of stream, from which levels at rest are taken
+_MOST_NAMES = 6  # in an event
+
+
+class StreamEvent(NamedTuple):
+    """Something that happened to a hand.
+
+    Attributes:
+        time_s: when it was known.
+        text: one line for people.
+    """
+
+    time_s: float
+    text: str
 
 
 class StreamingDetector:
@@ -36,18 +53,17 @@ class StreamingDetector:
     decision uses no sample behind its bin's ``look_ahead`` and is returned by the push that brings
     the last one. Not for several threads at once.
 
-    **Missing samples** are NaN; so are the samples of a gap of at most ``max_gap_s`` that the times
-    of samples show. A decision that one of them reaches is flagged as not valid. It still counts
-    as long as a channel in use is left (``is_usable``), else it says nothing to the rule. A longer
-    gap ends the stream as ``flush`` does and begins another, from decision number 0; ``num_gaps``
-    counts, and the log warns.
+    **Missing samples** are NaN; so are the samples of a gap of at most ``settings.hold_s`` that the
+    times of samples show, and those of a channel that keeps one value for too long. Decisions that
+    they reach are made without the channel; with too few channels they are not valid, and move no
+    rule (``features.sensing``). A longer gap ends the stream as ``flush`` does and begins another,
+    from decision number 0; ``num_gaps`` counts, and the log warns.
 
     Args:
         detector: fitted on this hand.
         settings: hop, calibration, rule and threshold; by default those in the detector's file.
         dtype: of the samples, float32 or float64, and of the scores; what is pushed is converted.
         masked_channels: names of channels to leave out.
-        max_gap_s: longest gap that is filled.
 
     Attributes:
         num_gaps: longer gaps since it was made or reset.
@@ -55,8 +71,8 @@ class StreamingDetector:
             hand; may be set at any time, for all decisions that are still to be made.
 
     Raises:
-        ValueError: if the detector has no settings, the gap is negative, the dtype another or the
-            hand has no such channel.
+        ValueError: if the detector has no settings, the dtype is another or the hand has no such
+            channel.
 
     Example:
         >>> stream = StreamingDetector(SlipDetector.load("detector.pt"))  # doctest: +SKIP
@@ -72,28 +88,35 @@ class StreamingDetector:
         *,
         dtype: torch.dtype = torch.float32,
         masked_channels: ChannelMask = (),
-        max_gap_s: float = 0.05,
     ) -> None:
         if dtype not in _NUMPY:
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
-        if not 0 <= max_gap_s < math.inf:
-            raise ValueError(f"max_gap_s must be finite and not negative, got {max_gap_s}")
         pool = detector.pool
         self.detector = detector
         self.settings = AlarmSettings.of(detector) if settings is None else settings
         self.dtype = dtype
         self.num_gaps = 0
+        self._events: list[StreamEvent] = []
         self.masked_channels = masked_names(masked_channels, pool.hand.names)
         self._clock = SampleClock(pool.sample_rate_hz)
-        self._max_gap = round(max_gap_s * pool.sample_rate_hz)
+        self._max_gap = round(self.settings.hold_s * pool.sample_rate_hz)
         self._wide = pool.widen(torch.empty(0, dtype=dtype)).dtype
         lengths = detector.channel_filter.window_lengths
         self._frame = max(lengths[channel] for channel in detector.needed_index.tolist())
         self._before = detector.context_before
         self._whole = self._before + pool.bin_samples + detector.context_after
         self._first = pool.bin_samples + detector.look_ahead
-        parts = (pool.sample_rate_hz, pool.bin_samples, detector.look_ahead, self._frame)
-        self._decider = Decider(self.settings, *parts, end_s=self._clock.end_s)
+        reaches = detector.channel_filter.reaches
+        self._decider = Decider(
+            self.settings,
+            pool.sample_rate_hz,
+            pool.bin_samples,
+            detector.look_ahead,
+            self._frame,
+            context_before=max(reaches[c][0] for c in detector.needed_index.tolist()),
+            channels=pool.hand.names,
+            end_s=self._clock.end_s,
+        )
         self._start()
 
     def __repr__(self) -> str:
@@ -169,7 +192,7 @@ class StreamingDetector:
                 parts.append(self._begin_anew(times_s[start]))
             last = stop if stop < len(missing) else x.shape[-1]
             parts.append(self._fill(x[:, start:last], missing[start:stop], times_s[start:stop]))
-        return _joined(parts)
+        return joined_decisions(parts)
 
     def flush(self) -> Decisions:
         """The decisions still waiting for their look-ahead, as at the end of a recording.
@@ -188,6 +211,15 @@ class StreamingDetector:
         self._start()
         return decisions
 
+    def take_events(self) -> list[StreamEvent]:
+        """What happened to the hand since the last call, for people to read.
+
+        Decisions that are no longer valid, and valid again; channels that are lost for longer than
+        ``settings.hold_s``, and back; levels that are far from those of training.
+        """
+        events, self._events[:] = list(self._events), []
+        return events
+
     def reset(self) -> None:
         """Forget the stream; the next sample is the first of another, at 0 unless it has a time."""
         self.num_gaps = 0
@@ -197,10 +229,12 @@ class StreamingDetector:
         self._clock.reset()
         self._decider.reset()
         self._held = np.empty((len(self.detector.pool.hand), 0), _NUMPY[self._wide])
+        self._stuck = StuckChannels(self.detector.sensing.stuck_samples)
+        self._watch = _Watch(self.detector, self.settings, self._events)
         self._start_of_held = 0  # its first sample's place in the stream
         self._number = 0  # of the next decision on a bin
         onset, backend = self.settings.onset, self.detector.extractor.backend
-        self._onset = None if onset is None else OnsetStream(onset, backend)
+        self._onset = None if onset is None else OnsetStream(onset, self._max_gap, backend)
         self._no_bins = self._nothing = self._decide(-1)
         if self._onset is not None:
             self._nothing = self._decider.join(self._no_bins, torch.empty(0, dtype=torch.float64))
@@ -241,6 +275,7 @@ class StreamingDetector:
 
     def _take(self, x: Array, places: Array, times_s: Array) -> Decisions:
         """Filter and decide, once the next decision has all its samples."""
+        x = self._stuck(x)
         self._clock.take(x.shape[-1], places, times_s)
         self._append(x)
         num_samples, start = self._clock.num_samples, self._number * self.settings.hop_samples
@@ -273,7 +308,8 @@ class StreamingDetector:
         count = last_start // hop + 1 - self._number
         if count <= 0:
             none = torch.empty(0, dtype=self.dtype)
-            return self._decider.decide(none, none.bool())
+            lost = none.new_zeros(0, len(detector.pool.hand)).bool()
+            return self._decider.decide(none, none.bool(), none.bool(), lost)
         with torch.no_grad():
             if self._number == 0 and self._start_of_held == 0:
                 first = torch.from_numpy(self._held)
@@ -286,13 +322,11 @@ class StreamingDetector:
             padded = np.zeros((len(held), stop - start), held.dtype)
             padded[:, : held.shape[-1]] = held  # behind it no channel in use looks
             windows = torch.from_numpy(padded).unfold(-1, whole, hop).transpose(0, 1)
-            scores = detector.predict_raw(
+            found = detector.predict_raw(
                 windows, given=self.dtype, masked_channels=self._masked_channels or None
             )
-            tells = scores.is_valid
-            if not tells.numpy().all():
-                tells = is_usable(scores.score, scores.is_missing, detector.needed_index)
-            decisions = self._decider.decide(scores.score, scores.is_valid, tells)
+            decisions = self._decider.decide(*found[:-1])
+            self._watch.take(found, decisions)
         self._number += count
         self._drop()
         return decisions
@@ -387,7 +421,60 @@ def _times(time_s: ArrayLike | Tensor | None, num: int) -> Array:
     return stamps.reshape(-1)[:num].astype(np.float64)
 
 
-def _joined(parts: list[Decisions]) -> Decisions:
-    if len(parts) == 1:
-        return parts[0]
-    return Decisions(*(torch.cat(entries) for entries in zip(*parts, strict=True)))
+class _Watch:
+    """Tells what happens to the channels of a stream (``StreamingDetector.take_events``)."""
+
+    def __init__(
+        self, detector: SlipDetector, settings: AlarmSettings, events: list[StreamEvent]
+    ) -> None:
+        rate_hz, hop = detector.pool.sample_rate_hz, settings.hop_samples
+        self._detector, self._events = detector, events
+        self._hold = max(round(settings.hold_s * rate_hz) // hop, 1)  # decisions
+        self._spans: list[Tensor] | None = []
+        self._num_spans = max(round(_LEVELS_S * rate_hz) // hop, 1)
+        self._is_valid = True
+        self._changed = np.zeros(len(detector.pool.hand), np.int64)  # decisions in a row
+        self._lost = np.zeros(len(detector.pool.hand), bool)  # as it was told
+
+    def take(self, found: Prediction, decisions: Decisions) -> None:
+        """What is found of the next bins."""
+        time_s = decisions.available_s.tolist()
+        if self._spans is not None:
+            self._spans.append(found.span)
+            if sum(map(len, self._spans)) >= self._num_spans:
+                info = self._detector.info
+                ratio = level_ratio(torch.cat(self._spans), self._detector.sensing)
+                self._tell(time_s[-1], told_of_levels(ratio, info.get("units", "V")))
+                self._spans = None
+        valid, lost = found.is_valid.tolist(), found.channels_lost.numpy()
+        if all(valid) and self._is_valid and not lost.any() and not self._lost.any():
+            self._changed[:] = 0
+            return
+        names = self._detector.pool.hand.names
+        for own_s, is_valid, own in zip(time_s, valid, lost, strict=True):
+            if is_valid != self._is_valid:
+                what = "valid again" if is_valid else f"not valid: {_listed(names, own)} lost"
+                self._tell(own_s, f"decisions are {what}")
+                self._is_valid = is_valid
+            self._changed = np.where(own != self._lost, self._changed + 1, 0)
+            is_told = self._changed > self._hold
+            if not is_told.any():
+                continue
+            for lost_now, what in ((True, "lost"), (False, "back")):
+                if (which := is_told & (own == lost_now)).any():
+                    self._tell(own_s, f"channels {what}: {_listed(names, which)}")
+            self._lost = np.where(is_told, own, self._lost)
+            self._changed[is_told] = 0
+
+    def _tell(self, time_s: float, text: str) -> None:
+        if text:
+            self._events.append(StreamEvent(time_s, text))
+
+
+def _listed(names: Sequence[str], which: Array) -> str:
+    """Names of channels, not too many: ``"A, B and 5 more"``."""
+    own = [name for name, is_one in zip(names, which, strict=True) if is_one]
+    if len(own) == len(names):
+        return f"all {len(names)} channels"
+    rest = f" and {len(own) - _MOST_NAMES} more" if len(own) > _MOST_NAMES else ""
+    return ", ".join(own[:_MOST_NAMES]) + rest

@@ -29,7 +29,7 @@ Segments = Sequence[tuple[float, float]]
 REST, SLIP = style.BLUE, style.ORANGE
 COLUMNS = (
     *("file", "alarm_s", "onset_s", "end_s", "score", "probability", "statistic", "is_valid"),
-    "raised_by",
+    *("in_range", "channels_lost", "raised_by"),
     *("outcome", "true_onset_s", "delay_s", "simulated"),
 )
 """Of ``onsets.csv``."""
@@ -170,7 +170,7 @@ class DecisionCounts:
 
     Attributes:
         num_decisions: so far.
-        num_invalid: of them, those that cannot be relied on.
+        num_invalid: of them, those that do not count: too few channels are alive.
         first_positive_s: of each onset, the first decision from it on that speaks for slip; NaN.
     """
 
@@ -304,8 +304,8 @@ def onsets_table(content: Mapping[str, Any]) -> str:
     for row in rows[:_MOST_ROWS]:
         cells: dict[str, object] = {"file": row["file"], "alarm s": _seconds(row["alarm_s"])}
         cells |= {"onset s": _seconds(row["onset_s"]), "P(slip)": _seconds(row["probability"], 2)}
-        is_valid = "NO" if row["is_valid"] is False else row["is_valid"]
-        cells |= {"by": row["raised_by"], "valid": is_valid}
+        in_range = "NO" if row["in_range"] is False else row["in_range"]
+        cells |= {"by": row["raised_by"], "in range": in_range}
         cells |= {"true onset s": _seconds(row["true_onset_s"])}
         cells |= {"delay s": _seconds(row["delay_s"]), "outcome": row["outcome"]}
         shown.append(cells)
@@ -333,8 +333,8 @@ def onsets_summary(content: Mapping[str, Any], seconds: float) -> str:
     ]
     if invalid:
         lines.append(
-            f"NOTE: {100 * invalid / number:.1f} % of the decisions are not valid: a channel in "
-            "use is missing or dead; they count as long as another is left"
+            f"NOTE: {100 * invalid / number:.1f} % of the decisions are not valid: too few "
+            "channels are alive; such decisions raise no alarm"
         )
     if events := content["events"]:
         delay = events["delay_ms"]

@@ -47,7 +47,6 @@ from tactslip_torch.onset.decisions import (
     Decisions,
     Scorer,
     calibration_of,
-    is_usable,
     score_stream,
 )
 from tactslip_torch.onset.events import (
@@ -95,7 +94,7 @@ LEAST, MOST = 0.1, 1000.0
 
 _CEILING = 1.5  # largest sum of Cusum in thresholds: what lies above only takes time to come down
 _STEP = 1.01  # by which a threshold is raised that a capped sum does not keep
-_ABOVE_NEUTRAL = 1e-30  # a score of slip, and no decision that tells nothing
+_LEAST_THRESHOLD = 1e-30  # at 0 a sum would stand for ever
 _NUM_POINTS = 25  # of a threshold curve, at most
 _NUM_TRIED = 100
 _TOGETHER = 256  # streams decided at once
@@ -114,9 +113,8 @@ class Stream(NamedTuple):
     Attributes:
         recording: which.
         times: when things happen in it.
-        score: ``[N]``, float32.
-        is_valid: whether every channel in use could be trusted, ``[N]``.
-        is_usable: whether the score tells anything: some channel in use was there, ``[N]``.
+        score: ``[N]``, float32, NaN where not valid.
+        is_valid: which decisions count, ``[N]``.
         onset_score: of every hop of the onset classifier, ``[k]``; of others than the detector [0].
     """
 
@@ -124,7 +122,6 @@ class Stream(NamedTuple):
     times: Timeline
     score: Tensor
     is_valid: Tensor
-    is_usable: Tensor
     onset_score: Tensor
 
 
@@ -193,10 +190,9 @@ def _scored(
     streams = dict[str, list[NDArray[Any]]]()
     for name, scorer in scorers.items():
         found = score_stream(scorer, samples, hops[name])
-        usable = is_usable(found.score, found.is_missing, scorer.needed_index)
         is_ours = onset is not None and name == OURS
         hopwise = onset.score_recording(samples) if is_ours and onset else torch.empty(0).double()
-        entries = (found.score.float(), found.is_valid, usable, hopwise)
+        entries = (found.score.float(), found.is_valid, hopwise)
         streams[name] = [x.numpy() for x in entries]
     return streams
 
@@ -241,12 +237,11 @@ def decide(
             made = decider.decide(
                 torch.stack([stream.score[::step] for stream in part]),
                 torch.stack([stream.is_valid[::step] for stream in part]),
-                torch.stack([stream.is_usable[::step] for stream in part]),
             )
             if settings.onset is not None:
                 made = decider.join(made, torch.stack([stream.onset_score for stream in part]))
             for row, stream in enumerate(part):
-                yield stream, Decisions(*(x[row] if x.ndim > 1 else x for x in made))
+                yield stream, made.row(row)
 
 
 def _length(stream: Stream) -> tuple[int, int]:
@@ -666,7 +661,7 @@ class CalibratedAlarm:
         methods[rule.name] = OURS, alone
         if timing.bin_samples % timing.hop_samples == 0:
             settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timing.bin_samples)
-            settings = replace(settings, threshold=_ABOVE_NEUTRAL, rearm_s=0, refractory_s=0)
+            settings = replace(settings, threshold=_LEAST_THRESHOLD, rearm_s=0, refractory_s=0)
             methods[FIRST_TRANSITION] = OURS, settings
         for name in streams:
             if name != OURS:
@@ -697,7 +692,7 @@ class CalibratedAlarm:
         settings = replace(self._settings(rule, calibration, timing.hop_samples), onset=onset)
         scored = self._scored(streams, settings, timing, budgets)
         value = self._lowest(scored, settings, "statistic", of_allowed=_OF_BINS if onset else 1.0)
-        value = max(value, _ABOVE_NEUTRAL)  # at 0 a sum would stand for ever
+        value = max(value, _LEAST_THRESHOLD)
         while True:
             value, made = value if value <= rule.ceiling else math.inf, rule
             if isinstance(rule, Cusum) and rule.ceiling == math.inf:

@@ -30,6 +30,7 @@ from tactslip_torch.data.recording import Recording, RecordingId, RecordingSourc
 from tactslip_torch.data.splits import ROLES, Split
 from tactslip_torch.features.cache import FeatureCache, cache_key, source_digest
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.sensing import longest_runs
 from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import num_processes
 from tactslip_torch.signals.filtering import ChannelFilter, bins_at, extended
@@ -50,6 +51,7 @@ class RecordingFeatures(NamedTuple):
           ``LabelledBins`` has them
         - ends_s: ``[N]``, float64, when the last sample of each bin is in
         - roles: role to ``[N]``, bool
+        - longest_run: most equal samples in a row of a channel that moves
     """
 
     recording: RecordingId
@@ -63,6 +65,7 @@ class RecordingFeatures(NamedTuple):
     hop_s: float
     roles: dict[str, Tensor]
     seconds: dict[str, float]
+    longest_run: int = 0
 
     def of(self, mask: Tensor) -> RecordingFeatures:
         """Some of its bins, by a mask ``[N]``."""
@@ -142,7 +145,7 @@ class FeatureMaker:
         times = self.source.timeline(recording)
         bins = self.lay_bins(times)
         seconds: dict[str, float] = {}
-        features = self._features(recording, times, bins, seconds)
+        features, longest_run = self._features(recording, times, bins, seconds)
         is_slip = bins.is_slip
         if self.rule.shuffle_seed is not None:
             place = self.source.ids.index(recording)
@@ -160,6 +163,7 @@ class FeatureMaker:
             (self.rule.bin_ms if self.rule.hop_ms is None else self.rule.hop_ms) / 1000,
             split.bin_roles(recording, len(is_slip)),
             seconds,
+            longest_run,
         )
 
     def key(self, recording: RecordingId) -> str:
@@ -222,11 +226,11 @@ class FeatureMaker:
         times: Timeline,
         bins: LabelledBins,
         seconds: dict[str, float],
-    ) -> Tensor:
+    ) -> tuple[Tensor, int]:
         started = time.perf_counter()
         key = self._key(recording, bins)
         cached = None if self.cache is None else self.cache.load(key)
-        if cached is not None and cached.shape == (len(bins.starts), len(self.pool.names)):
+        if cached is not None and cached[0].shape == (len(bins.starts), len(self.pool.names)):
             seconds["read_cache"] = time.perf_counter() - started
             return cached
         loaded = self._load(recording, times, bins)
@@ -235,11 +239,12 @@ class FeatureMaker:
         seconds["filter"] = _lap(started, seconds)
         with torch.no_grad():
             features: Tensor = self.extractor(filtered).float()
+        longest_run = int(longest_runs(loaded.samples).max())
         seconds["features"] = _lap(started, seconds)
         if self.cache is not None:
-            self.cache.store(key, features)
+            self.cache.store(key, features, longest_run)
         seconds["write_cache"] = _lap(started, seconds)
-        return features
+        return features, longest_run
 
     def _load(self, recording: RecordingId, times: Timeline, bins: LabelledBins) -> Recording:
         context = self.channel_filter.context_before  # never fewer than behind

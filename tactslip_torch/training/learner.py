@@ -297,7 +297,9 @@ class SlipLearner(L.LightningModule):
         features, is_slip = batch.features[mask], batch.is_slip[mask]
         if self._second is None or self._is_resumed:
             stratum = self.recipe.stratum(batch.recording)
-            self._statistics.update(str(batch.recording), stratum, features, is_slip)
+            self._statistics.update(
+                str(batch.recording), stratum, features, is_slip, batch.longest_run
+            )
         if self._second is not None:
             self._second.update(str(batch.recording), features, is_slip, batch.recording.scene)
 

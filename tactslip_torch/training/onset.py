@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
+from tactslip_torch.features.sensing import SILENT_FRACTION
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
@@ -93,11 +94,13 @@ class OnsetTraining:
         )
         usual, some = partial(_knees, source, evidence), _some(recordings, _KNEE_RECORDINGS)
         knees = in_processes(usual, some, "onsets, scales", "recording", num_workers)
+        *usual_of, rms = zip(*knees, strict=True)
         fast, slow = (
-            tuple(np.maximum(np.median(np.stack(of), 0), _LEAST_KNEE).tolist())
-            for of in zip(*knees, strict=True)
+            tuple(np.maximum(np.median(np.stack(of), 0), _LEAST_KNEE).tolist()) for of in usual_of
         )
+        least = SILENT_FRACTION * np.min(np.stack(rms), 0)
         evidence, first = replace(evidence, fast_knee=fast, slow_knee=slow), None
+        evidence = replace(evidence, least_rms=tuple(map(tuple, least.tolist())))
         for own in (_some(recordings, _FIRST_RECORDINGS), recordings):
             read = partial(_hops, source, evidence, first)
             made = list(in_processes(read, own, "onsets, evidence", "recording", num_workers))
@@ -135,15 +138,17 @@ def _some(recordings: Sequence[RecordingId], number: int) -> Sequence[RecordingI
 
 def _knees(
     source: RecordingSource, evidence: OnsetEvidence, recording: RecordingId
-) -> tuple[Array, Array]:
-    """A tenth of the usual root power of each filter, and the usual step."""
+) -> tuple[Array, Array, Array]:
+    """A tenth of the usual root power of each filter, the usual step, each channel's own power."""
     blocks = evidence.blocks_of_recording(source.load(recording).samples)
-    fast = blocks.power.sqrt().transpose(0, 1).flatten(1).nanmedian(-1).values
+    rms = blocks.power.sqrt()  # [F, B, k]
+    fast = rms.transpose(0, 1).flatten(1).nanmedian(-1).values
     steps = torch.zeros(1, 1, len(evidence.slow_knee))
     if source.hand.slow:
         steps = blocks.mean.unfold(-1, len(evidence.step_matrix), 1) @ evidence.step_matrix
     slow = steps.abs().flatten(0, 1).nanmedian(0).values
-    return _FAST_KNEE * fast.numpy(), _SLOW_KNEE * slow.numpy()
+    usual = rms.nanmedian(-1).values.nan_to_num(0.0)
+    return _FAST_KNEE * fast.numpy(), _SLOW_KNEE * slow.numpy(), usual.numpy()
 
 
 def _hops(

@@ -37,9 +37,15 @@ from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
+from tactslip_torch.features.sensing import (
+    Sensing,
+    SpanFeatures,
+    least_alive,
+    most_stuck_samples,
+)
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.calibration import fit_platt
-from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Head, Kernel, Polynomial, kernel_from_dict
 from tactslip_torch.model.moments import SufficientStats
@@ -335,8 +341,12 @@ def fitted_selection(
     index = {name: place for place, name in enumerate(_names_of(pool, sample))}
     selected = [index[name] for name in inputs]
     x = sample.features[:, selected].double()
-    scaler = FeatureScaler.fit(x if layer is None else layer(x), **bins.scaling)
-    return FeatureSelection(tuple(selected), scaler, layer)
+    is_lost, silence = None, None
+    if layer is not None and bins.spans is not None:
+        is_lost, sensing = columns.is_lost, columns.sensing
+        silence = bins.span_features, sensing
+    scaler = FeatureScaler.fit(x if layer is None else layer(x, is_lost), **bins.scaling)
+    return FeatureSelection(tuple(selected), scaler, layer, silence)
 
 
 def group_scores(columns: Tensor, is_slip: Tensor, groups: Tensor) -> Tensor:
@@ -382,6 +392,10 @@ class _Bins:
         self.groups, self.names = sample_groups(sample)
         allowed = recipe.allowed(pool) if allowed is None and pool is not None else allowed
         names = _names_of(pool, sample)
+        self.spans: Tensor | None = None
+        if pool is not None:
+            self.span_features = SpanFeatures(pool.hand, pool.names, pool.bin_samples)
+            self.spans = self.span_features(sample.features)
         places = torch.arange(len(names)) if allowed is None else allowed.nonzero().flatten()
         self.feature_names = [names[place] for place in places.tolist()]
         self.features = sample.features[:, places]
@@ -461,7 +475,12 @@ class _Columns:
         z: the columns, ``[n, K]``, those of channels before pooled ones.
         names: of the columns.
         pooling: that made the pooled ones.
+        sensing: of the training bins, for pooled columns.
+        is_lost: silent channels of the bins, ``[n, C]``, left out of the pools.
     """
+
+    sensing: Sensing
+    is_lost: Tensor
 
     def __init__(self, bins: _Bins, rows: Tensor, train: Tensor, parts: Sequence[str]) -> None:
         self.train = train[rows]
@@ -475,10 +494,15 @@ class _Columns:
                 setting = bins.recipe.pooling
                 assert setting is not None  # recipe
                 assert bins.hand is not None  # plan_detector
-                own = features[self.train]
-                layer = self.pooling = ChannelPooling.fit(bins.hand, names, own, setting)
+                assert bins.spans is not None
+                spans, own = bins.spans[rows], features[self.train]
+                self.sensing = Sensing.fit(spans[self.train], 1, 1)
+                self.is_lost = bins.span_features.is_silent(spans, self.sensing)
+                lost = self.is_lost[self.train]
+                layer = self.pooling = ChannelPooling.fit(bins.hand, names, own, setting, lost)
                 place = {name: index for index, name in enumerate(names)}
-                x = layer(features[:, [place[name] for name in layer.inputs]].double())
+                inputs = [place[name] for name in layer.inputs]
+                x = layer(features[:, inputs].double(), self.is_lost)
                 names = list(layer.names)
             x = x.double()
             scaler = FeatureScaler.fit(x[self.train], **bins.scaling)
@@ -624,8 +648,8 @@ class Plan:
         fractions: the part of non-slip and slip bins that is trained on.
         bin_weight: of each of those, as one of several of which it alone is kept.
         num_bins: how many bins are trained on; about, where fractions are below 1.
-        imputation: mean of the scaled features, both classes counting alike; for channels that are
-            missing.
+        imputation: mean of the scaled columns, both classes counting alike; for lost channels.
+        sensing: what the training bins tell of channels that work; ``None`` without a pool.
         validation: one row per choice: what was chosen from, the balanced accuracy of each
             held-out group; of the one that was taken also ``chosen``, and the calibration of its
             held-out scores.
@@ -645,6 +669,7 @@ class Plan:
     bin_weight: float
     num_bins: int
     imputation: Tensor
+    sensing: Sensing | None = None
     validation: list[dict[str, Any]] = field(default_factory=list)
     nested: dict[str, Any] | None = None
     feature_filter: dict[str, Any] | None = None
@@ -704,6 +729,7 @@ class Plan:
             info,
             self.imputation,
             selection.pooling,
+            sensing=self.sensing,
             backend=backend or pool.backend,
         )
 
@@ -716,6 +742,7 @@ class Plan:
             "scaler": dict(self.selection.scaler.state_dict()),
             "pooling": pooling and (pooling.to_dict(), dict(pooling.state_dict())),
             "kernel": self.kernel.to_dict(),
+            "sensing": self.sensing and self.sensing.to_dict(),
         }
 
     @classmethod
@@ -726,7 +753,12 @@ class Plan:
         pooling = values.pop("pooling")
         pooling = pooling and ChannelPooling.from_dict(pool.hand, *pooling)
         values["kernel"] = kernel_from_dict(values["kernel"])
-        return cls(recipe, FeatureSelection(tuple(selected), scaler, pooling), **values)
+        silence = None
+        if values["sensing"] is not None:
+            values["sensing"] = Sensing.from_dict(values["sensing"])
+            spans = SpanFeatures(pool.hand, pool.names, pool.bin_samples)
+            silence = spans, values["sensing"]
+        return cls(recipe, FeatureSelection(tuple(selected), scaler, pooling, silence), **values)
 
 
 def plan_detector(
@@ -815,10 +847,33 @@ def plan_detector(
         bin_weight=bin_weight,
         num_bins=num_bins,
         imputation=(means[0] + means[1]) / 2,
+        sensing=None if pool is None else _sensing(recipe, pool, statistics, sample, selection),
         validation=rows,
         nested=nested,
         feature_filter=feature_filter,
         scene_weights=scene_weights(recipe, sample) if recipe.scene_weights else {},
+    )
+
+
+def _sensing(
+    recipe: Recipe,
+    pool: FeaturePool,
+    statistics: TrainingStatistics | SampledBins,
+    sample: SampledBins,
+    selection: FeatureSelection,
+) -> Sensing:
+    """What the training bins tell of channels that work, for the machine of a selection."""
+    place = {name: index for index, name in enumerate(pool.hand.names)}
+    used = sorted({place[pool.names[index].channel] for index in selection.selected})
+    is_pooled = selection.pooling is not None
+    num_counted = len(counted_channels(pool.hand, used, is_pooled))
+    fraction = 1 - recipe.drop_channels if is_pooled and recipe.drop_channels else 0.5
+    run = statistics.longest_run if isinstance(statistics, TrainingStatistics) else None
+    spans = SpanFeatures(pool.hand, pool.names, pool.bin_samples)(sample.features)
+    return Sensing.fit(
+        spans,
+        recipe.min_alive or least_alive(num_counted, fraction),
+        most_stuck_samples(pool.sample_rate_hz, run),
     )
 
 
@@ -867,8 +922,8 @@ class TrainingPass:
         of_class = torch.tensor(plan.scene_weights.get(scene, (1.0, 1.0)), dtype=torch.float64)
         weights = plan.bin_weight * of_class[is_slip.long()]
         if plan.recipe.drop_channels > 0 and pooling is not None:
-            is_missing = _dropped(recording, len(pooling.hand), plan.recipe.drop_channels)
-            fewer = plan.selection(features, is_missing.expand(len(z), -1))
+            is_lost = _dropped(recording, len(pooling.hand), plan.recipe.drop_channels)
+            fewer = plan.selection(features, is_lost.expand(len(z), -1))
             z, is_slip, weights = torch.cat([z, fewer]), is_slip.repeat(2), weights.repeat(2) / 2
         if self.stats is not None:
             self.stats.update(recording, z, is_slip, weights)

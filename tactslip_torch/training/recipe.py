@@ -23,9 +23,11 @@ from tactslip_torch.features.groups import checked_attributes, matching
 from tactslip_torch.features.pool import FeaturePool, is_rounding
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.selection import ScoreVariance, rank_distinct, t_scores
+from tactslip_torch.features.sensing import Sensing, SpanFeatures
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.kernels import Kernel, Polynomial, RadialBasis
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.runtime import check_number
 
 Balance = Literal["undersample", "weights"]
 GroupBy = Literal["material", "cycle"]
@@ -100,6 +102,9 @@ class Recipe:
             count bin by bin. For ``"nested"``.
         drop_channels: of every recording a second copy is trained on, from which up to this part
             of the channels is left out at random. For pooled features.
+        min_alive: channels that must be alive for a valid decision, of the fast ones in use (of all
+            in use, where nothing is pooled). ``None``: as many as the second copies have at least;
+            half where nothing is pooled.
 
     Raises:
         ValueError: for an unknown name or a number that is not positive.
@@ -128,6 +133,7 @@ class Recipe:
     tolerance: float = 0.0
     scene_weights: Mapping[str, float] = field(default_factory=dict)
     drop_channels: float = 0.0
+    min_alive: int | None = None
 
     def __post_init__(self) -> None:
         for name in _LISTS:
@@ -143,6 +149,8 @@ class Recipe:
                 "feature_filter",
                 checked_attributes("recipe.feature_filter", self.feature_filter),
             )
+        if self.min_alive is not None:
+            check_number("recipe.min_alive", self.min_alive, whole=True)
         if problem := next(self._problems(), None):
             raise ValueError(f"recipe{problem}")
         _ = self.kernels  # their own checks
@@ -295,22 +303,29 @@ class FeatureSelection:
         selected: pool indices of the features that are read, best first.
         scaler: of the columns.
         pooling: from those features to the columns; ``None``: they are the columns.
+        silence: what tells which channels are silent, and what is known of them; they are left out
+            of their pools. ``None``: none is.
     """
 
     selected: tuple[int, ...]
     scaler: FeatureScaler
     pooling: ChannelPooling | None = None
+    silence: tuple[SpanFeatures, Sensing] | None = None
 
     @property
     def size(self) -> int:
         """Number of columns, K."""
         return len(self.scaler.minimum)
 
-    def __call__(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
+    def __call__(self, features: Tensor, is_lost: Tensor | None = None) -> Tensor:
         """Scaled columns in float64, ``[N, F] -> [N, K]``, without channels ``[N, C]`` or with."""
         columns = features[:, list(self.selected)].double()
         if self.pooling is not None:
-            columns = self.pooling(columns, is_missing)
+            if self.silence is not None:
+                spans, sensing = self.silence
+                silent = spans.is_silent(spans(features), sensing)
+                is_lost = silent if is_lost is None else silent | is_lost
+            columns = self.pooling(columns, is_lost)
         scaled: Tensor = self.scaler(columns)
         return scaled
 
@@ -323,7 +338,8 @@ class FeatureSelection:
             return FeatureSelection(self.selected[:num], scaler)
         place = dict(zip(self.pooling.inputs, self.selected, strict=True))
         layer = self.pooling.select(range(min(num, self.size)))
-        return FeatureSelection(tuple(place[name] for name in layer.inputs), scaler, layer)
+        selected = tuple(place[name] for name in layer.inputs)
+        return FeatureSelection(selected, scaler, layer, self.silence)
 
 
 def select_features(

@@ -1,21 +1,14 @@
-"""What a detector says of bins, and of those whose channels are missing.
-
-A column of a missing channel takes its imputation value, the mean over training bins, both classes
-counting alike; columns that are pooled over channels leave the channel out.
-"""
+"""What a detector says of bins, and which channels it is not to listen to."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Literal, NamedTuple, TypeVar, get_args
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.ops import (
-    full_precision,
-    is_concrete,
-)
+from tactslip_torch.features.ops import full_precision, is_concrete
 from tactslip_torch.runtime import in_parts
 from tactslip_torch.signals.filtering import refuse_nonfinite
 
@@ -29,30 +22,31 @@ _PART_BINS = 256  # that stay in a cache
 
 
 class Prediction(NamedTuple):
-    """Scores, and whether they can be relied on.
+    """Scores, whether they count, and what was left out (``features.sensing``).
 
     Attributes:
-        score: ``[*]``, at least 0 means slip; finite, unless the head overflows its dtype.
-        is_valid: ``[*]``, bool: every channel that the score depends on can be trusted, and the
-            score is finite.
-        is_missing: ``[*, C]``, bool: the channel holds a NaN or Inf, or was said to be dead, and
-            was left out.
+        score: ``[*]``, at least 0 means slip; NaN where not valid.
+        is_valid: ``[*]``, bool: enough channels are alive, and the score is finite.
+        in_range: ``[*]``, bool: valid, and the channels move about as much as in training.
+        channels_lost: ``[*, C]``, bool: channels in use that are missing or silent, and were left
+            out.
+        span: ``[*, C]``, float64, largest less smallest filtered sample; NaN of a channel that is
+            missing or not in use.
     """
 
     score: Tensor
     is_valid: Tensor
-    is_missing: Tensor
+    in_range: Tensor
+    channels_lost: Tensor
+    span: Tensor
 
     def __repr__(self) -> str:
         num, slip = self.score.numel(), int((self.score >= 0).sum())
-        lost = int(self.is_missing.any(-1).sum())
+        lost, valid = int(self.channels_lost.any(-1).sum()), int(self.is_valid.sum())
         return (
-            f"Prediction({num} bins: {slip} slip, {num - slip} non-slip; "
-            f"{int(self.is_valid.sum())} valid, {lost} with missing channels)"
+            f"Prediction({num} bins: {slip} slip, {valid - slip} non-slip, "
+            f"{num - valid} not valid; {lost} with lost channels)"
         )
-
-
-Said = TypeVar("Said", Tensor, Prediction)
 
 
 def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
@@ -67,23 +61,14 @@ def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
         refuse_nonfinite(samples, names, "repair the samples, or take nonfinite='mask'")
 
 
-def predict_in_parts(predict: Callable[[Tensor], Said], x: Tensor) -> Said:
+def predict_in_parts(predict: Callable[[Tensor], Prediction], x: Tensor) -> Prediction:
     """What ``predict`` says of bins ``[*, C, n]``: of many in parts that stay in a cache."""
-
-    def joined(parts: Sequence[Tensor]) -> Tensor:
-        whole: Tensor = torch.cat(list(parts)).unflatten(0, x.shape[:-2])
-        return whole
-
     with full_precision(x):
         if x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS or not is_concrete(x):
             return predict(x)
         found = in_parts(predict, x.flatten(0, -3).split(_PART_BINS))
-    if isinstance(found[0], Prediction):
-        return Prediction(*map(joined, zip(*found, strict=True)))
-    return joined(found)
-
-
-# Missing channels ------------------------------------------------------------------------------
+    whole = (torch.cat(parts).unflatten(0, x.shape[:-2]) for parts in zip(*found, strict=True))
+    return Prediction(*whole)
 
 
 def channel_mask(masked: ChannelMask, names: Sequence[str]) -> Tensor:
