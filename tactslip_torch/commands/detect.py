@@ -59,7 +59,7 @@ from tactslip_torch.report.onset import (
 from tactslip_torch.report.style import csv_writer
 from tactslip_torch.runtime import plain, steps
 
-log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 FORMAT = "tactslip_torch onsets 1"
 _PIECE_S = 1.0
@@ -210,7 +210,7 @@ def _detect_in(
     entry["decisions"] = {"number": counts.num_decisions, "invalid": counts.num_invalid}
     entry["alarms"], entry["truth"], entry["events"], known = counts.alarms, None, events, None
     for event in events:
-        log.warning("%s, %.3f s: %s", name, event["time_s"], event["text"])
+        _LOG.warning("%s, %.3f s: %s", name, event["time_s"], event["text"])
     if archived and archived.recording.has_truth:
         entry, known = _with_truth(entry, archived.recording, counts, stream)
     if config.figure:
