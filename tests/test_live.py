@@ -361,8 +361,12 @@ def test_a_stream_is_decided_on_and_recovers_when_the_cable_is_pulled(
     whole, volts = b"".join(written(numbers, BINARY)), numbers / 2.0**12
     counts, lines = Counts(), []
     to_lines = JsonLines(lines.append, every=True, sample_rate_hz=RATE)
-    with watched(device.source(detector), detector, to_lines, counts=counts) as kept:
+    source = device.source(detector)
+    if kind == "serial":  # a port that is not there at first is a mistake
         device.plug()
+    with watched(source, detector, to_lines, counts=counts) as kept:
+        if kind != "serial":
+            device.plug()
         kept.until(lambda: kept.told("connected"))
         first = b"\x01\x02" * 4 if kind == "serial" else b""  # the end of a frame
         device.send(first + whole)
