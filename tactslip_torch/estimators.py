@@ -392,9 +392,9 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
             y: any two labels.
             groups: of each row, such as its material, recording or day: a choice is evaluated on
                 groups that it was not fitted to. ``None`` and NaN are a group too. Groups of one
-                label are put together, so that each part that is left out has both. In ``cross_val_score`` they come by
-                ``params={"groups": groups}``; with metadata routing after
-                ``set_fit_request(groups=True)``.
+                label are put together, so that each part that is left out has both. In
+                ``cross_val_score`` they come by ``params={"groups": groups}``; with metadata
+                routing after ``set_fit_request(groups=True)``.
 
         Shape:
             - X: ``[N, F]`` or ``[N, C, T]``; y, groups: ``[N]``

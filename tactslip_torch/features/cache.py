@@ -55,7 +55,8 @@ def source_digest(package: Path = PACKAGE, parts: Sequence[str] = (".",)) -> str
     digest = hashlib.sha256()
     roots = [package / part for part in parts]
     paths = {path for root in roots for path in (root, *root.rglob("*"))}
-    for path in sorted(path for path in paths if path.suffix in (".py", ".cpp", ".h")):
+    sources = [p for p in paths if p.suffix in (".py", ".cpp", ".h") and p.is_file()]
+    for path in sorted(sources):
         digest.update(path.relative_to(package).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
@@ -103,7 +104,7 @@ class FeatureCache:
         except FileNotFoundError:
             return None
         except OSError as error:
-            self._warn(f"cannot be read: {error.strerror or error}", path)
+            self._warn(f"cannot be read: {_cause(error)}", path)
             return None
         except Exception:  # zipfile, zlib and NumPy raise many of damaged bytes
             self._warn("are damaged", path)
@@ -118,7 +119,7 @@ class FeatureCache:
             with whole_file(self._path(key)) as temporary, temporary.open("wb") as file:
                 np.savez(file, features=features.numpy().astype("<f4", order="C"))
         except OSError as error:
-            self._warn(f"cannot be stored: {error.strerror or error}", self._path(key))
+            self._warn(f"cannot be stored: {_cause(error)}", self._path(key))
 
     def prune(self) -> None:
         """Delete the least recently used files until the folder holds at most ``most_bytes``."""
@@ -142,3 +143,7 @@ class FeatureCache:
 
     def _path(self, key: str) -> Path:
         return self.folder / key[:2] / f"{key}.npz"
+
+
+def _cause(error: OSError) -> str:
+    return os.strerror(error.errno) if error.errno else str(error)

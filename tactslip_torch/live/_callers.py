@@ -36,7 +36,8 @@ class Caller(ServerConnection):
         parts = self.protocol.data_to_send()
         if self.transport.is_closing():
             return
-        self.transport.write(b"".join(parts))
+        if content := b"".join(parts):
+            self.transport.write(content)
         if b"" in parts:  # the end
             with suppress(OSError, RuntimeError):
                 self.transport.write_eof()

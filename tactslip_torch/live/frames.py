@@ -10,7 +10,7 @@ import binascii
 import re
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
@@ -37,8 +37,8 @@ _MOST_LINE = 1 << 16  # bytes of a line; what is longer is none
 _MOST_MISSING_S = 10.0  # by a counter; what lacks more is another stream
 _BETWEEN = re.compile(r"[ \t]{0,99}[,;][ \t]{0,99}| *\t *| +")
 """Between the values of a line; what is empty between two of them is missing."""
-_BETWEEN_NAMES = re.compile(r"[,;\t]| +(?![(\[])")
-"""The same of names, whose units may stand behind a blank."""
+_MARKS = re.compile(r"[,;\t]")
+"""Between names, which may have blanks within where there are such marks."""
 
 
 @dataclass(frozen=True)
@@ -297,7 +297,8 @@ class _LineReader(FrameReader):
 
     def _is_header(self, line: str) -> bool:
         """Whether a line names the columns; then they are as it says, if nobody else did."""
-        cells = [part.strip("\"'") for part in self._parts(line, _BETWEEN_NAMES)]
+        parts = self._parts(line, _MARKS if _MARKS.search(line) else _BETWEEN)
+        cells = [part.strip("\"'") for part in parts]
         places = [place_of(name, cells) for name in self._frames.columns or self._channels]
         if None in places or len(set(cells)) < len(cells):
             return False

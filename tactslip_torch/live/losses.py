@@ -87,9 +87,9 @@ class Losses:
             stop = max(stop for (_, stop), _ in several)
             num = sum(stop - start for (start, stop), _ in several)
             channels = self._named(sorted({one for _, each in several for one in each}))
-            where = f"from {self._time(start)} on"
-            if len(several) > 1:
-                where = f"in {len(several)} stretches from {self._time(start)} to {self._time(stop)}"
+            where, num_parts = f"from {self._time(start)} on", len(several)
+            if num_parts > 1:
+                where = f"in {num_parts} stretches from {self._time(start)} to {self._time(stop)}"
             yield Event("missing", f"{counted(num, 'sample')} of {channels} {where}")
             for key, _ in several:
                 del self._ended[key]
