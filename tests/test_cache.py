@@ -19,6 +19,7 @@ from tactslip_torch.features.cache import (
     source_digest,
 )
 from tactslip_torch.runtime import PACKAGE
+from tactslip_torch.training.experiment import feature_cache
 
 KEY = cache_key({"what": "a recording"})
 
@@ -133,6 +134,13 @@ def test_a_file_that_nobody_may_touch_is_still_read(cache, monkeypatch, caplog):
     monkeypatch.setattr(os, "utime", lambda path: (_ for _ in ()).throw(PermissionError("no")))
     assert torch.equal(cache.load(KEY), features())
     assert not caplog.records
+
+
+def test_a_folder_that_cannot_be_made_does_not_end_a_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(CAUSES["read-only"]))
+    with feature_cache(str(tmp_path / "new")) as cache:
+        cache.store(KEY, features())
+        assert cache.load(KEY) is None
 
 
 PRUNED = [

@@ -34,6 +34,7 @@ _CHECKSUMS: Mapping[str, tuple[int, Callable[[bytes], int]]] = {
     "crc32": (4, zlib.crc32),
 }
 _MOST_LINE = 1 << 16  # bytes of a line; what is longer is none
+_MOST_OTHERS = 64  # columns of a header beside the channels
 _MOST_MISSING_S = 10.0  # by a counter; what lacks more is another stream
 _BETWEEN = re.compile(r"[ \t]{0,99}[,;][ \t]{0,99}| *\t *| +")
 """Between the values of a line; what is empty between two of them is missing."""
@@ -298,6 +299,8 @@ class _LineReader(FrameReader):
     def _is_header(self, line: str) -> bool:
         """Whether a line names the columns; then they are as it says, if nobody else did."""
         parts = self._parts(line, _MARKS if _MARKS.search(line) else _BETWEEN)
+        if len(parts) > 4 * len(self._channels) + _MOST_OTHERS:  # which would take long
+            return False
         cells = [part.strip("\"'") for part in parts]
         places = [place_of(name, cells) for name in self._frames.columns or self._channels]
         if None in places or len(set(cells)) < len(cells):

@@ -46,13 +46,14 @@ class Losses:
         if first > self._next > 0:
             self._start[self._start < 0] = self._next
         is_in = self._start >= 0
+        self._next = first + len(is_lost)
         if is_in.any() or is_lost.any():
             changes = np.diff(np.vstack([is_in, is_lost]), axis=0)
             for row, channel in np.argwhere(changes).tolist():
                 self._change(first + row, channel)
-        self._next = first + len(is_lost)
-        yield from self._long()
-        yield from self._told()
+            yield from self._long()
+        if self._ended:
+            yield from self._told()
 
     def end(self) -> Iterator[Event]:
         """What is left at the end of the stream; another may begin."""
@@ -60,7 +61,7 @@ class Losses:
             self._change(self._next, channel)
         self._room += 1
         yield from self._told()
-        self._next = 0
+        self._next = 0  # and nothing lies between
 
     def _change(self, place: int, channel: int) -> None:
         start, self._is_told[channel] = int(self._start[channel]), False
