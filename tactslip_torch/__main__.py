@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,9 +34,19 @@ OF_THEIR_OWN = ("demo", "hosts")
 def main() -> None:
     """Run the command that the first argument names; the others are its own.
 
+    Where nobody reads what it prints, as behind ``| head``, it ends without a word.
+
     Raises:
         SystemExit: with status 2 if there is no such command.
     """
+    try:
+        _main()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _main() -> None:
     given, *rest = sys.argv[1:] or ["--help"]
     if given in ("-h", "--help"):
         print("usage: tactslip COMMAND [KEY=VALUE ...]\n")

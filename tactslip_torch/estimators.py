@@ -8,6 +8,7 @@ Both take and return NumPy arrays (torch tensors are taken too) and work in ``Pi
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -30,7 +31,7 @@ from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import calibration_of
-from tactslip_torch.own_files import FORGED, load_table, save_table
+from tactslip_torch.own_files import FORGED, MOST_BIN_SAMPLES, load_table, save_table
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.wavelet import SpectrumMethod
 from tactslip_torch.training.plan import Plan, TrainingPass, plan_detector, solve_metadata
@@ -132,6 +133,12 @@ class _OfWindows(BaseEstimator):  # type: ignore[misc]  # scikit-learn has no an
                 f"windows of {shape[2]} samples leave nothing, as the filter takes {before} before "
                 f"and {after} behind; give longer ones, filtered ones with filtered=True, or "
                 "frames={} for no filter"
+            )
+        if num > MOST_BIN_SAMPLES:
+            raise ValueError(
+                f"windows leave {num} samples behind the filter, at most {MOST_BIN_SAMPLES} can be "
+                "described; cut shorter windows [N, C, T], or resample them to a lower "
+                "sample_rate_hz"
             )
         pool = FeaturePool(
             hand,
@@ -322,8 +329,9 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         tolerance: as above.
         drop_channels: of windows, with pooled columns: a second copy of every window is trained on,
             without up to this part of its channels, so that a broken one does little harm.
-        slip_label: the label of ``y`` that is slip, for ``to_detector``. ``None``: ``"slip"`` if
-            that is one, else the larger.
+        slip_label: the label of ``y`` that is slip. ``None``: ``True``, 1 of 0 and 1 or of -1 and
+            1, or the one whose name says slip (``"Slip"``, of ``"slip"`` and ``"non-slip"`` the
+            first); of other labels it must be said.
 
     Attributes:
         classes_: the two labels, ascending.
@@ -383,15 +391,17 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
             X: features or windows.
             y: any two labels.
             groups: of each row, such as its material, recording or day: a choice is evaluated on
-                groups that it was not fitted to. In ``cross_val_score`` they come by
-                ``params={"groups": groups}``; with metadata routing after
-                ``set_fit_request(groups=True)``.
+                groups that it was not fitted to. ``None`` and NaN are a group too. Groups of one
+                label are put together, so that each part that is left out has both. In
+                ``cross_val_score`` they come by ``params={"groups": groups}``; with metadata
+                routing after ``set_fit_request(groups=True)``.
 
         Shape:
             - X: ``[N, F]`` or ``[N, C, T]``; y, groups: ``[N]``
 
         Raises:
-            ValueError: for other shapes, NaN, or another number of classes than two.
+            ValueError: for other shapes, NaN, another number of classes than two, labels that do
+                not say which is slip, or groups of which no two parts with both labels can be made.
         """
         if y is None:
             raise ValueError("requires y to be passed, but the target y is None; give labels [N]")
@@ -403,13 +413,7 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
                 f"Only binary classification is supported: y must have two classes, got "
                 f"{len(self.classes_)} class{'es' * (len(self.classes_) != 1)}; relabel it"
             )
-        labels, wanted = self.classes_.tolist(), self.slip_label
-        if wanted is not None and wanted not in labels:
-            raise ValueError(
-                f"slip_label={wanted!r} is none of the labels in y, {labels}; give one of them"
-            )
-        wanted = "slip" if wanted is None and labels[0] == "slip" else wanted
-        self.slip_label_ = self.classes_[1 if wanted is None else labels.index(wanted)]
+        self.slip_label_ = self.classes_[_place_of_slip(self.classes_.tolist(), self.slip_label)]
         is_slip = torch.from_numpy(np.asarray(y == self.slip_label_))
         pool, recipe, features = None, self._recipe(x.ndim == 3), _tensor(x).double()
         if x.ndim == 3:
@@ -673,22 +677,80 @@ def _tensor(x: Array) -> Tensor:
     return torch.from_numpy(np.require(x, requirements=("C", "W")))
 
 
-def _groups(y: Array, groups: Any) -> tuple[Tensor, tuple[str, ...]]:
-    """Which validation group each row is of, ``[N]``, from 0, and names of the groups."""
-    if groups is not None:
-        groups = np.asarray(groups)
-        if groups.shape != y.shape:
+_MISSING = ("None", "nan", "<NA>", "NaT")
+_SLIP = re.compile(r"(?<![a-z])slip(s|ped|ping|page)?(?![a-z])")
+_NO_SLIP = re.compile(r"(?<![a-z])(no|non|not|without|un)[^a-z]*slip")
+
+
+def _place_of_slip(labels: list[Any], said: Any) -> int:
+    """Which of two labels, ascending, is slip.
+
+    Raises:
+        ValueError: if ``said`` is neither, or is ``None`` and the labels do not tell.
+    """
+    if said is not None:
+        if said not in labels:
             raise ValueError(
-                f"groups must be one for each of the {len(y)} rows, got shape {groups.shape}"
+                f"slip_label={said!r} is none of the labels in y, {labels}; give one of them"
             )
-        values, index = np.unique(groups, return_inverse=True)
-        names = tuple(str(value).replace("|", "/") for value in values)
-        return torch.from_numpy(index), names
-    index = np.zeros(len(y), dtype=np.int64)
-    _, of_class, counts = np.unique(y, return_inverse=True, return_counts=True)
-    for label, count in enumerate(counts):
-        index[of_class == label] = np.arange(count) * min(_FOLDS, *counts) // count
-    return torch.from_numpy(index), tuple(f"rows {i}" for i in range(int(index.max()) + 1))
+        return labels.index(said)
+    if labels in ([0, 1], [-1, 1]):  # also False and True
+        return 1
+    words = [str(label).lower() for label in labels]
+    say = [bool(_SLIP.search(word)) and not _NO_SLIP.search(word) for word in words]
+    if sum(say) != 1:
+        raise ValueError(
+            f"y has the labels {labels[0]!r} and {labels[1]!r}, which do not say which one is "
+            f"slip; give it, such as slip_label={labels[1]!r}"
+        )
+    return say.index(True)
+
+
+def _groups(y: Array, groups: Any) -> tuple[Tensor, tuple[str, ...]]:
+    """Which validation group each row is of, ``[N]``, from 0, and names of the groups.
+
+    Raises:
+        ValueError: if there are other numbers of rows, or no two groups with both labels.
+    """
+    of_class = np.unique(y, return_inverse=True)[1]
+    if groups is None:
+        index = np.zeros(len(y), dtype=np.int64)
+        counts = np.bincount(of_class)
+        for label, count in enumerate(counts):
+            index[of_class == label] = np.arange(count) * min(_FOLDS, *counts) // count
+        return torch.from_numpy(index), tuple(f"rows {i}" for i in range(int(index.max()) + 1))
+    groups = np.asarray(groups)
+    if groups.shape != y.shape:
+        raise ValueError(
+            f"groups must be one for each of the {len(y)} rows, got shape {groups.shape}"
+        )
+    if groups.dtype == object:  # None, NaN and words have no order
+        groups = np.array(["none" if str(each) in _MISSING else str(each) for each in groups])
+    values, index = np.unique(groups, return_inverse=True)
+    names = [str(value).replace("|", "/") for value in values]
+    has = np.zeros((len(values), 2), bool)
+    has[index, of_class] = True
+    of_one = [np.flatnonzero(has[:, label] & ~has[:, 1 - label]) for label in (0, 1)]
+    num_joined = min(_FOLDS, *map(len, of_one))
+    num_whole = int(has.all(1).sum())
+    if len(values) > 1 and num_whole + num_joined < 2:
+        raise ValueError(
+            "validation leaves out groups and needs two parts that have both labels; of the "
+            f"{len(values)} groups {num_whole} have both, {len(of_one[0])} only the smaller label, "
+            f"{len(of_one[1])} only the larger; give groups that have both, or groups=None for "
+            "blocks of rows"
+        )
+    if num_joined:
+        parts: list[list[int]] = [[] for _ in range(num_joined)]
+        for some in of_one:
+            for part, block in zip(parts, np.array_split(some, num_joined), strict=True):
+                part += block.tolist()
+        for part in parts:
+            index[np.isin(index, part)] = part[0]
+            names[part[0]] += f" and {len(part) - 1} more"
+        kept, index = np.unique(index, return_inverse=True)
+        names = [names[place] for place in kept]
+    return torch.from_numpy(index), tuple(names)
 
 
 def _solved(

@@ -1,7 +1,13 @@
 """Cached features: what is stored comes back, damage is noticed, and the folder stays small."""
 
+import ast
+import errno
 import os
+import shutil
+import zipfile
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -9,8 +15,11 @@ from tactslip_torch.features.cache import (
     FeatureCache,
     cache_key,
     default_cache_folder,
+    features_digest,
     source_digest,
 )
+from tactslip_torch.runtime import PACKAGE
+from tactslip_torch.training.experiment import feature_cache
 
 KEY = cache_key({"what": "a recording"})
 
@@ -75,6 +84,65 @@ def test_a_damaged_file_is_absent_with_a_warning_and_is_written_again(cache, cap
     assert torch.equal(cache.load(KEY), features())
 
 
+def test_a_mutated_file_is_absent_or_right(cache, rng):
+    cache.store(KEY, features())
+    (path,) = files(cache)
+    whole, num_right = path.read_bytes(), 0
+    for _ in range(int(os.environ.get("TACTSLIP_HOSTILE_FILES", 400))):
+        content = bytearray(whole)
+        ends = (len(content), 60, 200)
+        place = int(rng.integers(rng.choice(ends))) * int(rng.choice([1, -1]))
+        content[place] = int(rng.integers(256))
+        path.write_bytes(content)
+        found = cache.load(KEY)
+        assert found is None or torch.equal(found, features())
+        num_right += found is not None
+    assert num_right  # dates are not looked at
+
+
+CAUSES = {
+    "full": OSError(errno.ENOSPC, "No space left on device"),
+    "read-only": OSError(errno.EROFS, "Read-only file system"),
+    "in use": PermissionError(errno.EACCES, "Permission denied"),
+}
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_what_cannot_be_written_or_read_is_one_warning_and_no_end(
+    cause, cache, caplog, monkeypatch
+):
+    def refuse(*args, **options):
+        raise CAUSES[cause]
+
+    cache.store(KEY, features())
+    monkeypatch.setattr(np, "savez", refuse)
+    for number in range(3):
+        cache.store(cache_key({"number": number}), features())
+    monkeypatch.setattr(Path, "unlink", refuse)
+    cache.most_bytes = 0
+    cache.prune()
+    assert torch.equal(cache.load(KEY), features())
+    monkeypatch.setattr(zipfile, "ZipFile", refuse)
+    for _ in range(3):
+        assert cache.load(KEY) is None
+    for record, words in zip(caplog.records, ("cannot be stored", "cannot be read"), strict=True):
+        assert all(word in record.getMessage() for word in (words, CAUSES[cause].strerror))
+
+
+def test_a_file_that_nobody_may_touch_is_still_read(cache, monkeypatch, caplog):
+    cache.store(KEY, features())
+    monkeypatch.setattr(os, "utime", lambda path: (_ for _ in ()).throw(PermissionError("no")))
+    assert torch.equal(cache.load(KEY), features())
+    assert not caplog.records
+
+
+def test_a_folder_that_cannot_be_made_does_not_end_a_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(CAUSES["read-only"]))
+    with feature_cache(str(tmp_path / "new")) as cache:
+        cache.store(KEY, features())
+        assert cache.load(KEY) is None
+
+
 PRUNED = [
     (3, 0, None, [2, 3, 4]),
     (2, 0, 0, [0, 4]),  # reading counts as use
@@ -124,6 +192,47 @@ def test_the_digest_follows_names_and_content_wherever_the_package_lies(tmp_path
         change()
         digests.append(source_digest(one))
     assert len(set(digests)) == 5
+
+
+def test_only_what_makes_features_changes_their_digest(tmp_path):
+    counts = ("hand.py", "signals/filtering.py", "features/pool.py", "native/engine.cpp")
+    counts += ("data/clock.py", "training/datamodule.py")
+    others = ("commands/train.py", "live/pump.py", "export/host.py", "report/a.py", "conf/a.yaml")
+    samples = "simulation/simulate.py"
+    for name in (*counts, *others, samples):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("1")
+
+    def digests():
+        return [features_digest(tmp_path, simulated=each) for each in (False, True)]
+
+    for name in (*counts, *others, samples):
+        before = digests()
+        (tmp_path / name).write_text("2")
+        changed = [now != then for now, then in zip(digests(), before, strict=True)]
+        assert changed == [name in counts, name in (*counts, samples)], name
+
+
+def test_all_that_makes_features_is_in_their_digest(tmp_path):
+    """Each module that is imported on the way from samples to features, and by these again."""
+    modules, seen = ["training.datamodule", "data.file_recordings", "simulation.simulate"], set()
+    copy = tmp_path / "tactslip_torch"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    while modules:
+        path = copy / modules.pop().replace(".", "/")
+        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        if path in seen or not path.exists():
+            continue
+        seen.add(path)
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(PACKAGE.name):
+                name = node.module.removeprefix(PACKAGE.name).lstrip(".")
+                modules += [name, *(f"{name}.{each.name}" for each in node.names)] if name else []
+    assert len(seen) > 20
+    for path in sorted(seen):
+        before = features_digest(copy, simulated=True)
+        path.write_text(path.read_text() + "\n")
+        assert features_digest(copy, simulated=True) != before, path
 
 
 def test_the_users_cache_folder(monkeypatch, tmp_path):

@@ -25,7 +25,15 @@ RATE_HZ = 2000.0
 Array = NDArray[Any]
 
 
-@parametrize_with_checks([SlipClassifier()])
+ASKS = "labels such as 1 and 2 do not say which one is slip: it asks for slip_label"
+OF_ANY_LABELS = """estimators_dtypes classifier_data_not_an_array classifiers_classes
+fit2d_1feature"""
+
+
+@parametrize_with_checks(
+    [SlipClassifier()],
+    expected_failed_checks=lambda _: {f"check_{name}": ASKS for name in OF_ANY_LABELS.split()},
+)
 def test_scikit_learns_checks(estimator: Any, check: Any) -> None:
     check(estimator)
 
@@ -174,3 +182,67 @@ def test_parameters_are_checked_in_the_fit(data: Any, options: Any, message: str
         SlipClassifier(**({"sample_rate_hz": RATE_HZ, "hand": SMALL_HAND} | options)).fit(*data)
     with pytest.raises(ValueError, match="one for each of the 72 rows"):
         SlipClassifier(RATE_HZ).fit(*data[:2], groups=[1, 2])
+
+
+SAY: list[tuple[Any, Any, int]] = [
+    ("Slip", "Stick", 0),
+    ("slip", "non-slip", 0),
+    ("no slip", "slipping", 1),
+    ("gross_slip", "hold", 0),
+    (False, True, 1),
+    (0, 1, 1),
+    (-1.0, 1.0, 1),
+]
+"""Two labels, and the place of slip."""
+SAY_NOT = [("grip", "slide"), (1, 2), ("slip_1", "slip_2"), ("non-slip", "other"), ("slipper", "a")]
+
+
+@pytest.mark.parametrize("labels", [*SAY, *SAY_NOT], ids=str)
+def test_which_label_is_slip_is_told_by_its_name_or_asked_for(labels: tuple[Any, ...]) -> None:
+    (first, second, *place), is_second = labels, np.arange(40) % 2
+    y = np.array([first, second])[is_second]
+    X = np.random.default_rng(0).standard_normal((40, 3)) + is_second[:, None]
+    if place:
+        assert SlipClassifier().fit(X, y).slip_label_ == labels[place[0]]
+    else:
+        with pytest.raises(ValueError, match="do not say which one is slip; give it, such as"):
+            SlipClassifier().fit(X, y)
+    assert SlipClassifier(slip_label=first).fit(X, y).slip_label_ == first
+
+
+GROUPS = {
+    "one row each": (np.arange(80), 5),
+    "one label each": (np.arange(80) // 4 * 2 + np.arange(80) % 2, 5),
+    "some of one label": (np.where(np.arange(80) < 40, "both", np.arange(80) % 6), 4),
+    "none": (np.array([None] * 8 + ["m1"] * 32 + ["m2"] * 40, object), 3),
+    "nan": (np.array([np.nan] * 8 + [1.0] * 72), 2),
+}
+
+
+@pytest.mark.parametrize("given", ["features", "windows"])
+@pytest.mark.parametrize("kind", GROUPS)
+def test_groups_are_put_together_until_both_labels_are_left_out(kind: str, given: str) -> None:
+    (groups, num), y = GROUPS[kind], np.arange(80) % 2
+    X = np.random.default_rng(0).standard_normal((80, 3, 60)) * (1 + y)[:, None, None]
+    X = X.std(-1) if given == "features" else X
+    model = SlipClassifier(RATE_HZ, use="pooled", num_features=None, degree=1)
+    parts = {
+        name for row in model.fit(X, y, groups).validation_ for name in row["balanced_accuracy"]
+    }
+    assert len(parts) == num
+    assert model.score(X, y) > 0.8
+
+
+@pytest.mark.parametrize("kind", ["a group a label", "slip in one group"])
+def test_groups_that_cannot_be_put_together_are_refused_in_a_line_of_this_class(kind: str) -> None:
+    row, y = np.arange(80), np.arange(80) % 2
+    groups = y if kind == "a group a label" else np.where(y, 1000, row)
+    with pytest.raises(ValueError, match="two parts that have both labels") as caught:
+        SlipClassifier().fit(np.random.default_rng(0).standard_normal((80, 3)), y, groups)
+    assert "recipe" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+def test_windows_that_are_too_long_are_refused_in_words_of_this_class() -> None:
+    with pytest.raises(ValueError, match="at most 1024 can be described; cut shorter windows"):
+        SlipClassifier(RATE_HZ).fit(np.zeros((8, 2, 1025)), np.arange(8) % 2)

@@ -106,6 +106,8 @@ def errors_in_one_line() -> Iterator[None]:
     """
     try:
         yield
+    except BrokenPipeError:  # whoever reads has seen enough: no bad input
+        raise
     except BAD_INPUT as error:
         if os.environ.get("TACTSLIP_TRACEBACK"):
             raise

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import torch
@@ -27,7 +28,7 @@ from tactslip_torch.live.pump import watch
 from tactslip_torch.live.rerun_log import RerunLog
 from tactslip_torch.live.ros2 import RosTopic
 from tactslip_torch.live.server import PageServer, page_facts
-from tactslip_torch.live.sinks import Callback, Counts, JsonLines, LineServer, Sink, Source
+from tactslip_torch.live.sinks import Callback, Counts, Event, JsonLines, LineServer, Sink, Source
 from tactslip_torch.live.sources import FileInTime, address_of, source_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.streaming import StreamingDetector
@@ -59,6 +60,7 @@ def stream(config: DictConfig, folder: Path) -> Counts:
     detector = SlipDetector.load(config.model, backend=config.backend)
     settings = settings_of(config, detector)
     source, counts = _source(config, detector), Counts()
+    events: SimpleQueue[Event] = SimpleQueue()
     dtype = source.dtype if isinstance(source, FileInTime) else torch.float64
     masked = config.masked_channels or ()
     watching = StreamingDetector(detector, settings, dtype=dtype, masked_channels=masked)
@@ -69,7 +71,7 @@ def stream(config: DictConfig, folder: Path) -> Counts:
         stack.enter_context(_quick_threads())
         sinks: list[Sink] = [Callback(lambda alarm: None, _say)]
         if config.serve:
-            page = _page(config, watching, source, counts)
+            page = _page(config, watching, source, counts, events)
             stack.callback(page.close)  # also where another sink cannot be made
             sinks.append(page)
             print(f"page: {page.address}", file=sys.stderr, flush=True)
@@ -83,12 +85,12 @@ def stream(config: DictConfig, folder: Path) -> Counts:
             if config.output == "stdout":
                 sinks.append(JsonLines.to_file(sys.stdout, **options))
             else:
-                lines = LineServer(*address_of(str(config.output), "output="))
+                lines = LineServer(*address_of(str(config.output), "output="), events.put)
                 stack.callback(lines.close)
                 sinks.append(JsonLines(lines.write, **options))
                 print(f"lines: {lines.host}:{lines.port}", file=sys.stderr, flush=True)
         try:
-            watch(source, watching, sinks, queue_s=config.queue_s, counts=counts)
+            watch(source, watching, sinks, queue_s=config.queue_s, counts=counts, events=events)
         except BrokenPipeError:  # whoever reads standard output has seen enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return counts
@@ -124,7 +126,11 @@ def _logs(config: DictConfig, watching: StreamingDetector, source: Source) -> li
 
 
 def _page(
-    config: DictConfig, watching: StreamingDetector, source: Source, counts: Counts
+    config: DictConfig,
+    watching: StreamingDetector,
+    source: Source,
+    counts: Counts,
+    events: SimpleQueue[Event],
 ) -> PageServer:
     """The page, served."""
     port, place = config.port, hosts_dir()
@@ -139,6 +145,7 @@ def _page(
         host=str(config.host),
         port=port,
         token=None if config.token is None else str(config.token),
+        tell=events.put,
     )
 
 

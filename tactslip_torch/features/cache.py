@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import logging
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,18 @@ from torch import Tensor
 from tactslip_torch.runtime import PACKAGE, __version__, whole_file
 
 log = logging.getLogger(__name__)
+_MAKE_FEATURES = (
+    "hand.py",
+    "runtime.py",
+    "own_files.py",
+    "signals",
+    "data",
+    "features",
+    "native",
+    "training/datamodule.py",
+)
+_KEPT = ("features", "longest_run")
+_told: set[tuple[str, str]] = set()
 
 
 def default_cache_folder() -> Path:
@@ -38,13 +51,24 @@ def cache_key(facts: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def source_digest(package: Path = PACKAGE) -> str:
-    """A digest of every source below a folder, so that features of changed code are not served."""
+def source_digest(package: Path = PACKAGE, parts: Sequence[str] = (".",)) -> str:
+    """A digest of every source below some files and folders of a package."""
     digest = hashlib.sha256()
-    for path in sorted(p for p in package.rglob("*") if p.suffix in (".py", ".cpp", ".h")):
+    roots = [package / part for part in parts]
+    paths = {path for root in roots for path in (root, *root.rglob("*"))}
+    sources = [p for p in paths if p.suffix in (".py", ".cpp", ".h") and p.is_file()]
+    for path in sorted(sources):
         digest.update(path.relative_to(package).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def features_digest(package: Path = PACKAGE, *, simulated: bool) -> str:
+    """A digest of the sources that make features, of simulated recordings those of samples too.
+
+    What else a package holds, such as hosts in a wheel, does not count.
+    """
+    return source_digest(package, [*_MAKE_FEATURES, *(["simulation"] if simulated else [])])
 
 
 def versions() -> dict[str, str]:
@@ -59,7 +83,8 @@ def versions() -> dict[str, str]:
 class FeatureCache:
     """Float32 features by key, in NPZ files, which have a checksum.
 
-    A damaged file counts as absent, and is written again.
+    It never ends a run: what cannot be read counts as absent, what cannot be written is left out,
+    and the log warns once for each cause and folder.
 
     Args:
         folder: made when first written to.
@@ -74,22 +99,30 @@ class FeatureCache:
         """Features ``[N, F]`` and the longest run of equal samples; ``None`` if damaged or none."""
         path = self._path(key)
         try:
-            with path.open("rb") as file, np.load(file) as content:
-                features = torch.from_numpy(content["features"])
-                longest_run = int(content["longest_run"])
-            os.utime(path)  # prune drops what was used longest ago
+            with zipfile.ZipFile(path) as content:  # to their ends, where the checksums are
+                features, longest_run = (
+                    np.load(io.BytesIO(content.read(f"{name}.npy"))) for name in _KEPT
+                )
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
-            log.warning("cached features %s are damaged; computing them again", path)
+        except OSError as error:
+            self._warn(f"cannot be read: {_cause(error)}", path)
             return None
-        return features, longest_run
+        except Exception:  # zipfile, zlib and NumPy raise many of damaged bytes
+            self._warn("are damaged", path)
+            return None
+        with contextlib.suppress(OSError):
+            os.utime(path)  # prune drops what was used longest ago
+        return torch.from_numpy(features), int(longest_run)
 
     def store(self, key: str, features: Tensor, longest_run: int) -> None:
         """Write features ``[N, F]`` and the longest run, whole or not at all."""
-        with whole_file(self._path(key)) as temporary, temporary.open("wb") as file:
-            array = features.numpy().astype("<f4", order="C")
-            np.savez(file, features=array, longest_run=np.int64(longest_run))
+        kept = features.numpy().astype("<f4", order="C"), np.int64(longest_run)
+        try:
+            with whole_file(self._path(key)) as temporary, temporary.open("wb") as file:
+                np.savez(file, **dict(zip(_KEPT, kept, strict=True)))
+        except OSError as error:
+            self._warn(f"cannot be stored: {_cause(error)}", self._path(key))
 
     def prune(self) -> None:
         """Delete the least recently used files until the folder holds at most ``most_bytes``."""
@@ -102,8 +135,18 @@ class FeatureCache:
         for _, size, path in sorted(found):
             if total <= self.most_bytes:
                 return
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
             total -= size
+
+    def _warn(self, cause: str, path: Path) -> None:
+        if (str(self.folder), cause) not in _told:
+            _told.add((str(self.folder), cause))
+            log.warning("cached features %s %s; they are computed anew", path, cause)
 
     def _path(self, key: str) -> Path:
         return self.folder / key[:2] / f"{key}.npz"
+
+
+def _cause(error: OSError) -> str:
+    return os.strerror(error.errno) if error.errno else str(error)

@@ -10,13 +10,15 @@ import binascii
 import re
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from tactslip_torch.live.sinks import Array, Block, Event
+from tactslip_torch.data.file_recordings import _place_of as place_of
+from tactslip_torch.data.formats._text import _NUMBER as NUMBER
+from tactslip_torch.live.sinks import Array, Block, Event, Notices, counted
 from tactslip_torch.runtime import check_choice, check_number
 
 COUNTER = "counter"
@@ -32,8 +34,12 @@ _CHECKSUMS: Mapping[str, tuple[int, Callable[[bytes], int]]] = {
     "crc32": (4, zlib.crc32),
 }
 _MOST_LINE = 1 << 16  # bytes of a line; what is longer is none
+_MOST_OTHERS = 64  # columns of a header beside the channels
 _MOST_MISSING_S = 10.0  # by a counter; what lacks more is another stream
-_TOLD_EVERY_S, _TOLD_AT_LEAST_S = 1.0, 60.0
+_BETWEEN = re.compile(r"[ \t]{0,99}[,;][ \t]{0,99}| *\t *| +")
+"""Between the values of a line; what is empty between two of them is missing."""
+_MARKS = re.compile(r"[,;\t]")
+"""Between names, which may have blanks within where there are such marks."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,8 @@ class Frames:
         format: ``"text"`` or ``"binary"``.
         columns: names of the values of an instant, in order; other names than the detector's
             channels are left out, ``"counter"`` counts lines of text. ``None``: the channels in the
-            order of the detector, or as the first line names them.
+            order of the detector, or as a line names them, whatever their case and the unit in
+            brackets behind them. Such a line may come again, as when a device restarts.
         scale: from a value to the detector's unit, one for all or one for each of its channels.
         offset: added to that.
         separator: between the values of a line; ``None``: blanks, tabs, commas and semicolons.
@@ -149,40 +156,6 @@ class Frames:
         return kind(self, channels, sample_rate_hz, begins_inside, now)
 
 
-class _Notices:
-    """Counts something, to be told in one line, again only after longer and longer times.
-
-    Args:
-        kind: of the event.
-        word: what is counted.
-        now: seconds of a clock.
-    """
-
-    def __init__(self, kind: str, word: str, now: Callable[[], float]) -> None:
-        self._kind, self._word, self._now = kind, word, now
-        self._num, self._why, self._since_s = 0, "", 0.0
-        self._told_s, self._every_s = -np.inf, _TOLD_EVERY_S
-
-    def add(self, num: int, why: str) -> None:
-        """So many more; the first reason is told."""
-        if not self._num:
-            self._why, self._since_s = why, self._now()
-        self._num += num
-
-    def events(self, is_over: bool, *, at_once: bool = False) -> Iterator[Event]:
-        """The line, if it is due: it is over, or has lasted."""
-        now = self._now()
-        is_due = now - self._told_s >= self._every_s
-        is_due &= is_over or now - self._since_s >= _TOLD_EVERY_S
-        if not self._num or not (is_due or at_once):
-            return
-        is_new = now - self._told_s > 4 * self._every_s
-        self._every_s = _TOLD_EVERY_S if is_new else min(2 * self._every_s, _TOLD_AT_LEAST_S)
-        self._told_s = now
-        yield Event(self._kind, f"{_counted(self._num, self._word)} {self._why}")
-        self._num = 0
-
-
 class FrameReader:
     """Bytes in, samples and events out. Made by ``Frames.reader``."""
 
@@ -205,10 +178,7 @@ class FrameReader:
         self._count: int | None = None  # of the last frame
         self._rows: list[Array] = []
         self._items: list[Block | Event] = []
-        self._garbage, self._lacking = (
-            _Notices("garbage", "byte", now),
-            _Notices("missing", "frame", now),
-        )
+        self._garbage = Notices("garbage", "byte", now)
         self._is_good = True  # what came last
 
     def feed(self, data: bytes) -> list[Block | Event]:
@@ -217,13 +187,13 @@ class FrameReader:
         self._find()
         self._flush()
         items, self._items = self._items, []
-        return [*items, *self._garbage.events(self._is_good), *self._lacking.events(True)]
+        return [*items, *self._garbage.events(self._is_good)]
 
     def end(self) -> list[Event]:
         """The stream ended or broke off: what is still to be told. Then as new."""
         self._buffer.clear()
         self.forget()
-        return [*(e for t in (self._garbage, self._lacking) for e in t.events(True, at_once=True))]
+        return [*self._garbage.events(True, at_once=True)]
 
     def forget(self) -> None:
         """The counter may go on anywhere."""
@@ -254,7 +224,6 @@ class FrameReader:
                 self._items.append(Event("gap", text))
             elif lacking:
                 self._missing(lacking * len(values))
-                self._lacking.add(lacking, "never came, as their counter shows; NaN in their place")
         picked = values[:, self._places].astype(np.float64)
         self._rows.append(picked * self._scale + self._offset)
         self._is_good = True
@@ -274,60 +243,87 @@ class FrameReader:
 
 
 class _LineReader(FrameReader):
-    """Lines of text."""
+    """Lines of text, which end in LF, CR or both."""
 
-    _is_first = True
+    _is_first = True  # of a connection
+    _has_begun = False  # there was a line of numbers
 
     def end(self) -> list[Event]:
         """As of all; the next line is the first."""
-        self._is_first = True
+        self._is_first, self._has_begun = True, False
         return super().end()
 
     def _find(self) -> None:
-        *lines, rest = self._buffer.split(b"\n")
+        *lines, rest = self._buffer.replace(b"\r", b"\n").split(b"\n")
         self._buffer = rest
         if len(rest) > _MOST_LINE:
             self._pass_over(len(rest), f"no end of line in {len(rest)} bytes")
             rest.clear()
         for line in lines:
-            text = line.strip()
-            if text and not text.startswith(b"#"):
-                self._take(bytes(text))
+            text = line.decode("utf-8", "replace").strip(" ")
+            if text.startswith("#"):
+                self._is_header(text.lstrip("# "))
+            elif text.strip():
+                self._take(text)
 
-    def _take(self, line: bytes) -> None:
+    def _take(self, line: str) -> None:
         is_first, self._is_first = self._is_first, False
-        if is_first and self._begins_inside:
-            return  # a part of a line may look like a whole one
-        separator = self._frames.separator
-        parts = re.split(rb"[\s,;]+", line) if separator is None else line.split(separator.encode())
-        try:
-            values = np.array([float(part.strip() or b"nan") for part in parts])
-        except ValueError:
-            if not is_first or not self._name(parts):
-                self._lose(line, "a line holds what is no number")
+        parts, wanted, names = self._parts(line, _BETWEEN), len(self._names), self._names
+        wrong = [part for part in parts if part and not NUMBER.fullmatch(part)]
+        if wrong and self._is_header(line):
             return
-        wanted, names = len(self._names), self._names
-        if len(values) != wanted:
-            what = f"a line has {_counted(len(values), 'value')}, expected {wanted}"
+        if is_first and self._begins_inside:  # a part of a line may look like a whole one
+            if wrong:
+                self._lose(line, "the first line may be cut")
+        elif len(parts) != wanted:
+            what = f"a line has {counted(len(parts), 'value')}, expected {wanted}"
             self._lose(line, f"{what}, {names[0]} to {names[-1]}; frame.columns says which")
-            return
-        if COUNTER not in names:
-            self._add(values[None], None)
-        elif np.isfinite(count := values[names.index(COUNTER)]):
-            self._add(values[None], int(count) % self._modulus)
+        elif len(wrong) == wanted:
+            self._lose(line, "a line holds no number")
         else:
-            self._lose(line, "the counter of a line is no number")
+            if wrong:
+                lost = ", ".join(map(repr, wrong))[:80]
+                self._pass_over(sum(map(len, wrong)), f"a line holds what is no number: {lost}")
+            row = np.array([float(p) if p and p not in wrong else np.nan for p in parts])
+            count = row[names.index(COUNTER)] if COUNTER in names else 0.0
+            if not np.isfinite(count):
+                self._lose(line, "the counter of a line is no number")
+                return
+            self._has_begun = True
+            self._add(row[None], int(count) % self._modulus if COUNTER in names else None)
 
-    def _name(self, parts: Sequence[bytes]) -> bool:
-        """Take the first line for names of columns; whether it is no line of numbers at all."""
-        names = [part.strip().decode("utf-8", "replace") for part in parts]
-        if self._frames.columns is None and set(self._channels) <= set(names):
-            self._set_columns(names)
-        return not any(re.match(r"[-+.\d]", name) for name in names)
+    def _parts(self, line: str, between: re.Pattern[str]) -> list[str]:
+        mark = self._frames.separator
+        return [part.strip() for part in (line.split(mark) if mark else between.split(line))]
 
-    def _lose(self, line: bytes, why: str) -> None:
-        self._pass_over(len(line) + 1, f"{why}: {line[:40].decode('ascii', 'replace')!r}")
-        if COUNTER not in self._names:
+    def _is_header(self, line: str) -> bool:
+        """Whether a line names the columns; then they are as it says, if nobody else did."""
+        parts = self._parts(line, _MARKS if _MARKS.search(line) else _BETWEEN)
+        if len(parts) > 4 * len(self._channels) + _MOST_OTHERS:  # which would take long
+            return False
+        cells = [part.strip("\"'") for part in parts]
+        places = [place_of(name, cells) for name in self._frames.columns or self._channels]
+        if None in places or len(set(cells)) < len(cells):
+            return False
+        if self._frames.columns is not None:
+            return places == [*range(len(cells))]
+        for name, place in zip(
+            (*self._channels, COUNTER), (*places, place_of(COUNTER, cells)), strict=True
+        ):
+            if place is not None:
+                cells[place] = name
+        if cells != self._names:
+            if self._has_begun:
+                self._flush()
+                text = f"the sender began anew, with the columns {', '.join(cells)}"
+                self._items.append(Event("gap", text))
+            self.forget()
+            self._set_columns(cells)
+        return True
+
+    def _lose(self, line: str, why: str) -> None:
+        self._pass_over(len(line) + 1, f"{why}: {line[:40]!r}")
+        if self._has_begun and COUNTER not in self._names:
             self._missing(1)  # a line is an instant
 
 
@@ -450,7 +446,3 @@ def _for_each(name: str, value: float | Sequence[float], channels: Sequence[str]
             f"got {value!r}"
         )
     return found
-
-
-def _counted(num: int, word: str) -> str:
-    return f"{num} {word}{'' if num == 1 else 's'}"

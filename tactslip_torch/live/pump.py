@@ -7,9 +7,11 @@ import time
 from collections import deque
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack
+from queue import SimpleQueue
 
 import numpy as np
 
+from tactslip_torch.live.losses import Losses
 from tactslip_torch.live.sinks import Block, Counts, Event, Placed, Sink, Source, merged
 from tactslip_torch.onset.decisions import Decisions
 from tactslip_torch.onset.streaming import StreamingDetector
@@ -28,6 +30,7 @@ def watch(
     *,
     queue_s: float = 2.0,
     counts: Counts | None = None,
+    events: SimpleQueue[Event] | None = None,
 ) -> Counts:
     """Watch a source until it ends: each sample through the detector, what it says to all sinks.
 
@@ -36,6 +39,10 @@ def watch(
     (``"dropped"``): decisions are late by no more than that. Behind samples that are lacking
     (dropped, or a connection that was lost) times go on as the clock of this machine did, and a new
     stream of decisions begins, if it is more than 0.05 s.
+
+    What is lost is told (``"missing"``): for each stretch of samples that the same channels lack an
+    event with time, number and channels when it ends, and one before if it lasts over 1 s. Of many
+    stretches some are told together.
 
     However it ends (a signal, or an exception of a sink), the last decisions are flushed and
     all sinks are closed.
@@ -46,6 +53,7 @@ def watch(
         sinks: called in their order.
         queue_s: most that waits.
         counts: to be kept up to date, for others to see.
+        events: of others than the source, such as servers, which are put there while it goes on.
 
     Returns:
         The counts.
@@ -61,7 +69,8 @@ def watch(
     reader.start()
     try:
         while not state.is_done.wait(0.2):  # signals come in between
-            pass
+            while events is not None and not events.empty():
+                state.put(events.get())
     except BaseException:  # Thread.join would take a thread for ended now (CPython, bpo-45274)
         state.stop()
         state.is_done.wait(_PATIENCE_S)
@@ -91,6 +100,8 @@ class _State:
         self._is_over = False
         self._next: int | None = None  # index of the sample that would go on
         self._is_break_told = False
+        pool = stream.detector.pool
+        self._losses = Losses(pool.hand.names, pool.sample_rate_hz)
         self.error: BaseException | None = None
         self.is_done = threading.Event()
 
@@ -111,7 +122,7 @@ class _State:
             for item in items:
                 if isinstance(item, Event):
                     is_broken |= item.kind in _BREAKS
-                    self._put(item)
+                    self.put(item)
                     continue
                 num, now_s = len(item.samples), time.monotonic()
                 if item.time_s is not None and num:
@@ -124,7 +135,7 @@ class _State:
                     position += max(lacking, round(_LONGER_THAN_GAP_S * self._rate))
                 is_broken, came_s = False, now_s
                 self.counts.received += len(item.samples)
-                self._put(Placed(position, item))
+                self.put(Placed(position, item))
                 position += num
                 if self._is_over:
                     break
@@ -136,7 +147,8 @@ class _State:
             self._is_over = True
             self._changed.notify_all()
 
-    def _put(self, item: Placed | Event) -> None:
+    def put(self, item: Placed | Event) -> None:
+        """Behind all that waits; where it waits too long, it makes room or waits itself."""
         with self._changed:
             if isinstance(item, Event):
                 self._queue.append(item)
@@ -168,10 +180,11 @@ class _State:
                 while items := self._get():
                     for item in merged(items):
                         if isinstance(item, Event):
-                            self._tell(item)
+                            self._tell(*(self._losses.end() if item.kind == "gap" else ()), item)
                         else:
                             self._push(*item)
                 self._hand_on(self._stream.flush())
+                self._tell(*self._losses.end())
                 if self.error is None:
                     self._tell(Event("ended", f"{self._source.name}: ended"))
             except BaseException as error:
@@ -206,6 +219,7 @@ class _State:
         if self._stream.num_gaps > gaps and not self._is_break_told:
             self._tell(Event("gap", f"a gap at {first / self._rate:.3f} s: decisions begin anew"))
         self._is_break_told = False
+        self._tell(*self._losses.take(first, block))
         for sink in self._sinks:
             sink.samples(first, block)
         self._hand_on(decisions)
@@ -216,10 +230,11 @@ class _State:
             for sink in self._sinks:
                 sink.decisions(decisions)
 
-    def _tell(self, event: Event) -> None:
-        self._is_break_told |= event.kind in _BREAKS
-        for sink in self._sinks:
-            sink.event(*event)
+    def _tell(self, *events: Event) -> None:
+        for event in events:
+            self._is_break_told |= event.kind in _BREAKS
+            for sink in self._sinks:
+                sink.event(*event)
 
     def _close(self, sink: Sink) -> None:
         try:

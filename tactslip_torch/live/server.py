@@ -23,7 +23,16 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
 from tactslip_torch.data.formats._reading import needs
-from tactslip_torch.live.sinks import Block, Counts, Placed, Sink, decision_columns, merged
+from tactslip_torch.live.sinks import (
+    Block,
+    Counts,
+    Event,
+    Notices,
+    Placed,
+    Sink,
+    decision_columns,
+    merged,
+)
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.runtime import plain
@@ -46,7 +55,10 @@ _TICK_S, _STATUS_S = 0.02, 1.0
 _WAITING_S = 2.0  # of samples that may wait for one page
 _MOST_TEXTS = 2000  # that may wait for one page; one that is further behind is sent away
 _MOST_PAGES = 16
+_BACKLOG = 8  # connections that are taken at once, so that files for them do not run out
+_IDLE_S = 10.0  # in which a request must have come and been answered
 _LEAST_TOKEN = 8
+_WRONG_TOKEN_S = 0.5
 _LAST_WORDS_S = 1.0
 
 
@@ -84,7 +96,10 @@ class PageServer(Sink):
     A page that is too slow misses samples, and is told how many; nothing waits for it.
 
     A request is refused if it comes from another site's page, or, on loopback, by another name;
-    the socket also without the token, where there is one.
+    the socket also without the token, where there is one: of all wrong tokens one in half a second
+    is answered. At most 16 pages are open, and 16 other connections: a further one takes the place
+    of the oldest of these. A connection without a request is closed after 10 s, a page that answers
+    no ping after 40 s.
 
     Args:
         folders: by the path that they are served under, ``""`` for the top, what holds the page.
@@ -95,6 +110,7 @@ class PageServer(Sink):
         host: address to listen at; beyond loopback there is always a token.
         port: to listen at, 0 for any that is free.
         token: that a page must give; ``None``: on loopback none, else one at random.
+        tell: is given an ``Event`` where a connection cannot be taken.
 
     Attributes:
         address: of the page, with the token.
@@ -116,6 +132,7 @@ class PageServer(Sink):
         host: str = "127.0.0.1",
         port: int = 0,
         token: str | None = None,
+        tell: Callable[[Event], object] = lambda event: None,
     ) -> None:
         needs("websockets", "serve=true", "live")
         self._is_loopback = is_loopback(host)
@@ -136,7 +153,10 @@ class PageServer(Sink):
         self._pending: deque[Placed | str] = deque()
         self._lock = threading.Lock()
         self._pages: set[_Page] = set()
+        self._refused, self._tell = Notices("refused", "connection"), tell
+        self._one_wrong_token = asyncio.Lock()
         self._loop = asyncio.new_event_loop()
+        self._loop.set_exception_handler(self._not_taken)
         self._started: threading.Event = threading.Event()
         self._error: OSError | None = None
         self._ending = asyncio.Event()
@@ -200,6 +220,8 @@ class PageServer(Sink):
     async def _serve(self, port: int) -> None:
         from websockets.asyncio.server import serve
 
+        from tactslip_torch.live._callers import callers
+
         quiet = logging.Logger("page", logging.CRITICAL)  # what strangers send is no news
         try:
             server: Server = await serve(
@@ -207,6 +229,9 @@ class PageServer(Sink):
                 self._host,
                 port,
                 process_request=self._answer,
+                create_connection=callers(),
+                backlog=_BACKLOG,
+                open_timeout=_IDLE_S,
                 compression=None,
                 max_size=1024,
                 close_timeout=_LAST_WORDS_S,
@@ -269,7 +294,16 @@ class PageServer(Sink):
             sending.cancel()
             await connection.close()
 
-    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+    def _not_taken(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Say in one line what asyncio would log with a trace, such as too many open files."""
+        del loop
+        error = context.get("exception")
+        reason = (isinstance(error, OSError) and error.strerror) or error or context["message"]
+        self._refused.add(1, f"of the page failed: {reason}")
+        for event in self._refused.events():
+            self._tell(event)
+
+    async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Files of the page, or a refusal; ``None`` for a socket that may open."""
         path, _, query = request.path.partition("?")
         host = request.headers.get("Host", "")
@@ -278,7 +312,7 @@ class PageServer(Sink):
         if (method := getattr(request, "method", "GET")) not in ("GET", "HEAD"):
             return _response(HTTPStatus.METHOD_NOT_ALLOWED, b"GET or HEAD\n")
         if path == "/ws":
-            return self._refusal(request.headers.get_all("Origin"), host, query)
+            return await self._refusal(request.headers.get_all("Origin"), host, query)
         if path == "/live.json":
             live = {"socket": "ws", "token_needed": self._token is not None}
             return _response(HTTPStatus.OK, json.dumps(live).encode(), ".json", host, method)
@@ -291,12 +325,14 @@ class PageServer(Sink):
             return _response(HTTPStatus.NOT_FOUND, b"no such file\n")
         return _response(HTTPStatus.OK, content, file.suffix, host, method)
 
-    def _refusal(self, origins: list[str], host: str, query: str) -> Response | None:
+    async def _refusal(self, origins: list[str], host: str, query: str) -> Response | None:
         """Why a socket may not open; a program that is no browser has no origin."""
         if any(origin not in (f"http://{host}", f"https://{host}") for origin in origins):
             return _response(HTTPStatus.FORBIDDEN, b"a page of another site\n")
         given = parse_qs(query).get("token", [""])[-1]
         if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
+            async with self._one_wrong_token:
+                await asyncio.sleep(_WRONG_TOKEN_S)
             return _response(HTTPStatus.UNAUTHORIZED, b"a wrong token or none\n")
         if len(self._pages) >= _MOST_PAGES:
             return _response(HTTPStatus.SERVICE_UNAVAILABLE, b"too many pages\n")

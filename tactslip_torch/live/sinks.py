@@ -10,8 +10,8 @@ import math
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self, TextIO, TypeVar
 
@@ -26,6 +26,8 @@ Array = NDArray[Any]
 
 _MOST_WAITING = 1 << 20
 """Bytes that a program which reads lines may be behind."""
+_MOST_READERS, _MOST_TAKEN, _IDLE_S = 16, 256, 10.0
+_TOLD_EVERY_S, _TOLD_AT_LEAST_S = 1.0, 60.0
 
 
 class Block(NamedTuple):
@@ -52,12 +54,51 @@ class Event(NamedTuple):
 
     Attributes:
         kind: ``"connected"``, ``"waiting"``, ``"lost"``, ``"garbage"``, ``"missing"``,
-            ``"dropped"``, ``"gap"`` or ``"ended"``.
+            ``"dropped"``, ``"gap"``, ``"refused"`` or ``"ended"``.
         text: one line for people.
     """
 
     kind: str
     text: str
+
+
+class Notices:
+    """Counts something, to be told in one line, again only after longer and longer times.
+
+    Args:
+        kind: of the event.
+        word: what is counted.
+        now: seconds of a clock.
+    """
+
+    def __init__(self, kind: str, word: str, now: Callable[[], float] = time.monotonic) -> None:
+        self._kind, self._word, self._now = kind, word, now
+        self._num, self._why, self._since_s = 0, "", 0.0
+        self._told_s, self._every_s = -np.inf, _TOLD_EVERY_S
+
+    def add(self, num: int, why: str) -> None:
+        """So many more; the first reason is told."""
+        if not self._num:
+            self._why, self._since_s = why, self._now()
+        self._num += num
+
+    def events(self, is_over: bool = True, *, at_once: bool = False) -> Iterator[Event]:
+        """The line, if it is due: it is over, or has lasted."""
+        now = self._now()
+        is_due = now - self._told_s >= self._every_s
+        is_due &= is_over or now - self._since_s >= _TOLD_EVERY_S
+        if not self._num or not (is_due or at_once):
+            return
+        is_new = now - self._told_s > 4 * self._every_s
+        self._every_s = _TOLD_EVERY_S if is_new else min(2 * self._every_s, _TOLD_AT_LEAST_S)
+        self._told_s = now
+        yield Event(self._kind, f"{counted(self._num, self._word)} {self._why}")
+        self._num = 0
+
+
+def counted(num: int, word: str) -> str:
+    """A number and what it counts, such as ``"1 byte"`` and ``"2 bytes"``."""
+    return f"{num} {word}{'' if num == 1 else 's'}"
 
 
 Other = TypeVar("Other")
@@ -282,11 +323,15 @@ def listener_at(host: str, port: int) -> socket.socket:
 
 
 class LineServer:
-    """A port on which programs connect to read lines. One that does not read is cut off.
+    """A port on which programs connect to read lines.
+
+    There are at most 16; others are refused. One that is 1 MiB behind, or takes nothing of what
+    waits for it for 10 s, is cut off.
 
     Args:
         host: address to listen at.
         port: to listen at, 0 for any that is free.
+        tell: is given an ``Event`` where a program is refused or cannot be taken.
 
     Attributes:
         host: that it listens at.
@@ -296,35 +341,66 @@ class LineServer:
         OSError: if the port is taken.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(
+        self, host: str, port: int, tell: Callable[[Event], object] = lambda event: None
+    ) -> None:
         self._listener = listener_at(host, port)
         self._listener.setblocking(False)
         self.host, self.port = host, int(self._listener.getsockname()[1])
-        self._readers: dict[socket.socket, bytearray] = {}
+        self._readers: dict[socket.socket, _Reader] = {}
+        self._refused, self._tell = Notices("refused", "program"), tell
 
     def write(self, text: str) -> None:
         """Send lines to all that are connected, as far as they take them now."""
-        with suppress(BlockingIOError):
-            while True:
-                reader, _ = self._listener.accept()
-                reader.setblocking(False)
-                self._readers[reader] = bytearray()
+        self._take()
+        now_s = time.monotonic()
         for reader, waiting in list(self._readers.items()):
-            waiting += text.encode()
+            if not waiting.content:
+                waiting.since_s = now_s
+            waiting.content += text.encode()
             try:
-                del waiting[: reader.send(waiting)]
+                num = reader.send(waiting.content)
             except BlockingIOError:
-                pass
+                num = 0
             except OSError:
-                waiting.extend(bytes(_MOST_WAITING))  # gone
-            if len(waiting) >= _MOST_WAITING:
-                self._readers.pop(reader).clear()
+                num, waiting.since_s = 0, -np.inf  # gone
+            if num:
+                del waiting.content[:num]
+                waiting.since_s = now_s
+            if len(waiting.content) >= _MOST_WAITING or now_s - waiting.since_s > _IDLE_S:
+                del self._readers[reader]
                 reader.close()
+
+    def _take(self) -> None:
+        """Whoever wants to read."""
+        try:
+            for _ in range(_MOST_TAKEN):
+                reader, _peer = self._listener.accept()
+                if len(self._readers) < _MOST_READERS:
+                    reader.setblocking(False)
+                    self._readers[reader] = _Reader(time.monotonic())
+                else:
+                    reader.close()
+                    self._refused.add(1, f"refused: {_MOST_READERS} read lines already")
+        except BlockingIOError:
+            pass
+        except OSError as error:  # of this one, or there is no room for any; asked again
+            self._refused.add(1, f"could not be taken: {error.strerror or error}")
+        for event in self._refused.events():
+            self._tell(event)
 
     def close(self) -> None:
         """No more lines."""
         for each in (self._listener, *self._readers):
             each.close()
+
+
+@dataclass
+class _Reader:
+    """What waits for a program, and since when it has taken nothing."""
+
+    since_s: float
+    content: bytearray = field(default_factory=bytearray)
 
 
 class FileSink(Sink):

@@ -6,7 +6,7 @@ A source connects again by itself; what happens to it comes as events among the 
 from __future__ import annotations
 
 import os
-import select
+import selectors
 import socket
 import sys
 import threading
@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -215,6 +215,20 @@ class SerialPort(_ByteSource):
         return f"the serial port {self._port} cannot be opened: {reason}"
 
 
+def _ready(*watched: socket.socket | int) -> list[Any]:
+    """Which of these have something to read, after at most ``_POLL_S``."""
+    with _Selector() as selector:
+        for each in watched:
+            selector.register(each, selectors.EVENT_READ)
+        return [key.fileobj for key, _ in selector.select(_POLL_S)]
+
+
+_Selector: type[selectors.BaseSelector] = getattr(
+    selectors, "PollSelector", selectors.SelectSelector
+)
+"""Opens no file of its own, and takes regular files too."""
+
+
 def _of_socket(connected: socket.socket, listener: socket.socket | None = None) -> _Connection:
     """A socket; ``listener`` says that another sender wants to take its place."""
     options = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
@@ -225,7 +239,7 @@ def _of_socket(connected: socket.socket, listener: socket.socket | None = None) 
 
     def read() -> bytes | None:
         watched = [each for each in (connected, listener) if each is not None]
-        ready, _, _ = select.select(watched, [], [], _POLL_S)
+        ready = _ready(*watched)
         if connected in ready:
             return connected.recv(_MOST_BYTES) or None
         if ready:
@@ -291,7 +305,7 @@ class TcpListener(_ByteSource):
             yield from super().__iter__()
 
     def _connect(self) -> _Connection | None:
-        if not select.select([self._listener], [], [], _POLL_S)[0]:
+        if not _ready(self._listener):
             return None
         connected, (self._peer, *_) = self._listener.accept()
         return _of_socket(connected, self._listener)
@@ -316,7 +330,7 @@ class StandardInput(_ByteSource):
 
     def _connect(self) -> _Connection:
         def read() -> bytes | None:
-            if sys.platform != "win32" and not select.select([0], [], [], _POLL_S)[0]:
+            if sys.platform != "win32" and not _ready(0):
                 return b""
             return os.read(0, _MOST_BYTES) or None
 

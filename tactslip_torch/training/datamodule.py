@@ -28,7 +28,7 @@ from tactslip_torch.data.labels import (
 )
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource, Timeline
 from tactslip_torch.data.splits import ROLES, Split
-from tactslip_torch.features.cache import FeatureCache, cache_key, source_digest
+from tactslip_torch.features.cache import FeatureCache, cache_key, features_digest
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import longest_runs
 from tactslip_torch.native import BackendName
@@ -133,8 +133,10 @@ class FeatureMaker:
         self.rule = rule
         self.cache = cache
         self.dtype = dtype
-        self._code = source_digest()
-        self._libraries = [version(name) for name in ("torch", "numpy", "ptwt", "PyWavelets")]
+        self._code = features_digest(simulated=source.is_simulated)
+        self._libraries = [version(name) for name in ("torch", "ptwt", "PyWavelets")]
+        if source.is_simulated:  # its random numbers may change between feature releases
+            self._libraries.append(".".join(version("numpy").split(".")[:2]))
 
     def __call__(self, recording: RecordingId, split: Split) -> RecordingFeatures:
         """Features, labels and roles of one recording.

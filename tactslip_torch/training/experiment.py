@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import tempfile
@@ -163,7 +164,11 @@ def feature_cache(setting: str | bool | None) -> Iterator[FeatureCache]:
     cache = FeatureCache(
         default_cache_folder() if setting in ("auto", True) else Path(str(setting)).expanduser()
     )
-    cache.folder.mkdir(parents=True, exist_ok=True)  # refused before a pass has begun
+    try:
+        cache.folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if error.errno in (errno.EEXIST, errno.ENOTDIR):  # a mistake, told before a pass has begun
+            raise
     yield cache
     cache.prune()
 
