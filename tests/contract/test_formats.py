@@ -614,7 +614,10 @@ def test_a_bag_in_several_files_is_one_recording(tmp_path, storage):
     text = (bag / "metadata.yaml").read_text()
     line = next(line for line in text.splitlines() if f"- part0.{ending}" in line)
     second = line.replace("part0", "part1")
-    (bag / "metadata.yaml").write_text(text.replace(line, f"{line}\n{second}", 1))
+    text = text.replace(line, f"{line}\n{second}", 1)
+    (bag / "metadata.yaml").write_text(text)
+    assert "holds 300 messages, where its metadata say 150" in refused(bag)
+    (bag / "metadata.yaml").write_text(text.replace("message_count: 150", "message_count: 300"))
     np.testing.assert_array_equal(read(bag)[0], values)
 
 

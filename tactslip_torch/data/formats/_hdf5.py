@@ -18,12 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._choice import (
-    LABEL_NAMES,
-    choose,
-    rate_in,
-    why_not_numbers,
-)
+from tactslip_torch.data.formats._choice import choose, rate_in, why_not_numbers
+from tactslip_torch.data.formats._names import CHANNEL_LISTS
 from tactslip_torch.data.formats._reading import (
     FREE_BYTES,
     MOST_MEMBERS,
@@ -83,7 +79,7 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         return opened_from(own, path, file["samples"], 1)
     found: dict[str, Any] = {}
     for name, dataset in _datasets(file, found):
-        is_label = name.rpartition("/")[2].lower() in LABEL_NAMES
+        is_label = name.rpartition("/")[2].lower() in CHANNEL_LISTS
         found[name] = _why_not(dataset) or dataset
         if is_label and _why_elsewhere(dataset) is None and _are_words(dataset):
             found[name] = _decoded(dataset[()])
@@ -95,7 +91,7 @@ def _said(dataset: Any) -> tuple[list[tuple[str, ...]], float | None]:
     around = [dataset]
     while around[-1].name != "/":
         around.append(around[-1].parent)
-    named = [(one, at) for one in around for at in one.attrs if at.lower() in LABEL_NAMES]
+    named = [(one, at) for one in around for at in one.attrs if at.lower() in CHANNEL_LISTS]
     rate = next(filter(None, map(_rate_of, around)), None)
     return [_attribute(one, at) for one, at in named], rate
 
