@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -49,6 +50,7 @@ _TO_WRITE = 4096  # rows at a time
 _TO_COUNT = 1024  # rows that show whether a column is their number
 _NO_THOUSANDS = re.compile(r",\d{0,2}(?!\d)|,\d{4}|(?<!\d)0,|\d{4},|(?<!\d),")
 _COMMENT = re.compile(r"(?:^|(?<=\s))#.*")
+_WHOLE = re.compile(r"[+-]?\d+")
 _BLANKS = " "
 _WITH_COMMAS = ("\t", ";")  # between columns whose decimals may stand behind a comma
 
@@ -204,7 +206,9 @@ def _rows_of(
         Refused: naming the first line that has another number of cells.
     """
     lines = plain = list(map(_without_comment, lines))
-    if not any(map(str.strip, lines)):
+    blanks = " \r" if layout.delimiter == "\t" else None  # tabs alone are a row of nothing
+    numbered = [(number, one) for number, one in enumerate(lines, line) if one.strip(blanks)]
+    if not numbered:
         return np.empty((0, layout.num_columns))
     if layout.has_tail:
         plain = [one.rstrip(" ").removesuffix(layout.delimiter) for one in plain]
@@ -217,8 +221,7 @@ def _rows_of(
             return rows
     except ValueError:  # cell by cell, so that what is empty is NaN and what is wrong has a line
         pass
-    numbered = enumerate(lines, line)
-    found = [_row_of(one, layout, number, words) for number, one in numbered if one.strip()]
+    found = [_row_of(one, layout, number, words) for number, one in numbered]
     return np.array(found, dtype=np.float64).reshape(-1, layout.num_columns)
 
 
@@ -348,22 +351,22 @@ def _numbering(num_columns: int) -> tuple[str, ...]:
 def _is_numbering(first: Sequence[str], rest: Sequence[Sequence[str]]) -> bool:
     """Whether the first of all lines counts the columns from 0, and is no row.
 
-    The numbers below are written otherwise, with decimals, or are far from those of this line.
+    It is none if the numbers below are written otherwise, 1.0 where it has 1, or are far from its.
     """
     if len(first) < 2 or tuple(first) != _numbering(len(first)) or len(rest) < 3:
         return False
     if any(len(cells) != len(first) for cells in rest):
         return False
-    columns = [[cell for cell in column if cell] for column in zip(*rest, strict=True)]
-    are_whole = [{re.fullmatch(r"[+-]?\d+", cell) is not None for cell in c} for c in columns]
+    columns = [[c.replace(",", ".") for c in column if c] for column in zip(*rest, strict=True)]
+    are_whole = [{_WHOLE.fullmatch(cell) is not None for cell in column} for column in columns]
     if any(len(kinds) > 1 for kinds in are_whole):
         return False
-    if any(kinds == {False} for kinds in are_whole):
-        return True
-    for number, column in enumerate(columns):
-        values = list(map(int, column)) or [number]
-        reach = 2 * max(max(values) - min(values), 2)
-        if not min(values) - reach <= number <= max(values) + reach:
+    for number, (column, kinds) in enumerate(zip(columns, are_whole, strict=True)):
+        numbers = map(number_in, filter(NUMBER.fullmatch, column))
+        values = [value for value in numbers if math.isfinite(value)] or [number]
+        reach = 2 * max(max(values) - min(values), 2.0 * (True in kinds))
+        is_far = not min(values) - reach <= number <= max(values) + reach
+        if is_far or any(cell.rstrip("0").endswith(".") for cell in column):
             return True
     return False
 
