@@ -76,6 +76,7 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     if own is not None:
         if why := _why_not(file["samples"]):
             raise ValueError(f"/samples {why}")
+        _check_chunks(file["samples"])
         return opened_from(own, path, file["samples"], 1)
     found: dict[str, Any] = {}
     for name, dataset in _datasets(file, found):
@@ -150,6 +151,14 @@ def _why_not(dataset: Any) -> str | None:
     except Refused as error:
         return str(error).strip()
     return why
+
+
+def _check_chunks(dataset: Any) -> None:
+    """Refuse samples of ours of which a chunk is not found: HDF5 gives zeros in its place."""
+    if dataset.chunks is not None:
+        for first in range(0, dataset.shape[1], dataset.chunks[1]):
+            if dataset.id.get_chunk_info_by_coord((0, first)).byte_offset is None:
+                raise ValueError(f"no samples from number {first} on")
 
 
 def _attribute(thing: Any, name: str) -> tuple[str, ...]:
