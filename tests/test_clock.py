@@ -127,6 +127,16 @@ NO_CLOCKS = [
     (lambda t: t[:2], None, "has 2 times, too few"),
     (lambda t: torch.cat([t[:100], t[99:]]), None, "samples 100 and before come 1 steps clos"),
     (lambda t: t * 1e3, RATE, r"reading\.time_unit=ms"),
+    (
+        lambda t: torch.cat([0 * t[:3], 1.7e9 + t[3:]]),
+        None,
+        "time jumps at sample 3, from 0 to 1.7e",
+    ),
+    (
+        lambda t: torch.cat([t[:90], t[90:] + 1e3]),
+        None,
+        "jumps at sample 90, from 0.0445 to 1000.04",
+    ),
     (at_random, None, "come so unevenly|steps closer than"),
 ]
 

@@ -3,6 +3,7 @@
 import hashlib
 import logging
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -170,7 +171,12 @@ def test_rows_of_channels_find_their_columns_by_name_or_by_place(tables):
 def test_a_column_that_may_be_the_label_is_no_channel_unless_said(tmp_path, name):
     table(tmp_path / "a.csv", samples(0), names=("t", "a", "b", name))
     manifest(tmp_path, "a.csv,wood,0,,,slip")
-    assert repr(name) in refused(r"a\.csv: has a column .* as reading\.channels", tmp_path)
+    source = FileRecordings(tmp_path)
+    assert source.hand.names == ("a", "b")
+    assert f"taken for no channels, {name}; if they are" in str(source.warnings[0])
+    asked = FileRecordings(tmp_path, channels=rows_named(name.partition(" ")[0], "a"))
+    assert torch.equal(first(asked), samples(0)[[2, 0]])
+    assert not asked.warnings
     for columns in (("a", "b"), ("a", name)):
         said = FileRecordings(tmp_path, reading={"channels": columns})
         assert said.hand.names == columns
@@ -384,7 +390,7 @@ def test_a_speed_that_is_not_there_is_one_line(tmp_path):
     with_speed(tmp_path / "a.csv")
     manifest(tmp_path, "a.csv,wood", columns="file,material")
     refused(r"labels\.speed_over=5 needs .*: data\.reading\.speed", tmp_path, speed_over=5.0)
-    refused(r"a\.csv: has a column 'speed', which may be", tmp_path)
+    assert FileRecordings(tmp_path).hand.names == ("a", "b", "c")
     refused(r"no column 'v' that reading\.speed names", tmp_path, reading={"speed": "v"})
     refused(r"reading\.speed_unit must be one of mm/s", tmp_path, reading={"speed_unit": "km/h"})
 
@@ -531,6 +537,19 @@ def test_a_rate_that_nobody_says_is_asked_for(tmp_path):
     manifest(tmp_path, "a.csv,wood,250", columns="file,material,sample_rate_hz")
     assert FileRecordings(tmp_path, reading={"time": None}).sample_rate_hz == 250.0
     refused(r"its times are 200 Hz, but 250 Hz is stated", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("rate", "is_read"), [(0.5, False), (1.0, True), (1e6, True), (2e6, False)]
+)
+def test_a_rate_that_no_sensor_has_is_asked_for(tmp_path, rate, is_read):
+    table(tmp_path / "a.csv", samples(0, 50), rate)
+    manifest(tmp_path, "a.csv,wood,0,,,slip")
+    if is_read:
+        assert FileRecordings(tmp_path).sample_rate_hz == rate
+    else:
+        said = re.escape(f"a.csv: is of {rate:g} Hz, which is no sample rate")
+        refused(f"{said} .* say reading.time_unit=", tmp_path)
 
 
 REFUSED = [

@@ -27,6 +27,7 @@ _SAME = 1e-5  # differences of stamps that are this near, by their median, are o
 _BEAT, _FEWEST_BEATS = 0.06, 5  # units that near to a step slip against it, seen so often
 _MOST_TOGETHER = 4
 _RATE_ERR = 0.01
+_MOST_LOST, _FREE = 10, 1 << 16  # times as many samples may be missing as are there, and so many
 _OSCILLATOR_ERR = 1e-4  # of three digits at most are what people mean
 _FIT_ERR = 2e-6
 _SAID_ERR = 1e-5
@@ -79,8 +80,8 @@ def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "tim
         name: of the file, for errors.
 
     Raises:
-        ValueError: if times are not finite, go back, come in bursts, contradict the rate, or are
-            too coarse to tell it.
+        ValueError: if times are not finite, go back, jump by more than gaps can be, come in bursts,
+            contradict the rate, or are too coarse to tell it.
     """
     if len(times) < 3:
         raise ValueError(f"{name} has {len(times)} times, too few to tell a rate")
@@ -93,6 +94,7 @@ def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "tim
             f"{name}: time goes back at sample {place + 1}, from {times[place]:g} to "
             f"{times[place + 1]:g} s; sort the file, or go without: reading.time=null"
         )
+    _refuse_jumps(times, name)
     seconds = times - times[0]
     start = seconds[:_MOST_FOR_STEP]
     _refuse_bursts(np.diff(start), name)
@@ -167,6 +169,21 @@ def _gaps_in(
             total = missing
         level[place:until] -= total
     return tuple(gaps), float(np.abs(late - calm).max())
+
+
+def _refuse_jumps(times: _Numbers, name: str) -> None:
+    """Refuse times of which a clock would have mostly missing samples, before it has any."""
+    steps = np.diff(times)
+    forward = steps[steps > 0]
+    if not len(forward):
+        return  # a burst
+    num = (times[-1] - times[0]) / np.median(forward)
+    if num > (1 + _MOST_LOST) * len(times) + _FREE:
+        place = int(np.argmax(steps))
+        raise ValueError(
+            f"{name}: time jumps at sample {place + 1}, from {times[place]:.9g} to "
+            f"{times[place + 1]:.9g} s; cut the file there, or {_STATE}"
+        )
 
 
 def _refuse_bursts(steps: _Numbers, name: str) -> None:

@@ -10,7 +10,6 @@ import hashlib
 import logging
 import math
 import os
-import re
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -41,6 +40,7 @@ from tactslip_torch.data.formats import (
     open_file,
     pieces,
 )
+from tactslip_torch.data.formats._names import bare
 from tactslip_torch.data.formats._reading import MM_S
 from tactslip_torch.data.labels import slip_by_speed
 from tactslip_torch.data.manifest import Entry, Listing, Problem, manifest_of, read_manifest
@@ -61,12 +61,8 @@ log = logging.getLogger(__name__)
 
 _NOWHERE = "unknown"
 """The finger and segment of a channel of which nobody said them."""
-_LABEL_NAMES = (
-    *("label", "labels", "slip", "is_slip", "contact", "trial", "material", "class"),
-    *("speed", "slip_speed"),
-)
-"""Names of columns, in small letters, that are no channel unless a person says so."""
-_UNIT = re.compile(r"\s*(?:\([^()]*\)|\[[^\[\]]*\])$")
+_RATES_HZ = 1.0, 1e6
+"""Sample rates that are believed; beyond, times are in another unit than they are taken for."""
 _RATE_ERROR = 0.01
 """By so much a rate that time stamps tell may differ from that of the set."""
 _WANTED_RATE_ERROR = 0.001  # and from that of a detector, as what is told in seconds errs
@@ -202,6 +198,12 @@ class Stream:
     units: str = "V"
     speed_over: float | None = None
 
+    @property
+    def how(self) -> Reading:
+        """How to open its files: columns that are called as its channels are, are channels."""
+        hand = () if self.channels is None else self.channels.names
+        return replace(self.reading, hand=hand)
+
 
 class _Part(NamedTuple):
     """One stream of one file.
@@ -216,6 +218,7 @@ class _Part(NamedTuple):
         own: all but the samples of a file of ours.
         rate_hz: of the stream in its set; a measured one is that of the set if it is near.
         by_speed: what the speed of slip tells, if it is wanted.
+        left_out: names of columns that are taken for no channels.
     """
 
     clock: Clock
@@ -227,6 +230,7 @@ class _Part(NamedTuple):
     own: Archived | None
     rate_hz: float
     by_speed: Timeline | None = None
+    left_out: tuple[str, ...] = ()
 
     @property
     def truth(self) -> Timeline:
@@ -250,7 +254,7 @@ def look(path: Path, stream: Stream, stated_hz: float | None = None) -> _Part:
         ValueError: if it cannot be read, its times are none of an even clock, nobody says its
             rate, or it has other channels than the stream.
     """
-    with open_file(path, stream.reading) as opened:
+    with open_file(path, stream.how) as opened:
         return _part_of(opened, path, stream, stated_hz)
 
 
@@ -280,11 +284,16 @@ def _part_of(opened: Opened, path: Path, stream: Stream, stated_hz: float | None
     is_measured = times is not None and stated is None
     clock = rows.times(per_row)
     rate = stated or clock.sample_rate_hz
+    if not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
+        raise ValueError(
+            f"{path} is of {rate:g} Hz, which is no sample rate of tactile sensors, 1 Hz to 1 MHz; "
+            "if its times are in another unit, say reading.time_unit=s, ms, us or ns"
+        )
     told = None
     if stream.speed_over is not None and opened.speed is not None:
         told = _by_speed(EvenSamples(opened.speed, rows), rows, stream)
-    num = samples.num_channels
-    return _Part(clock, is_measured, num, hand, tuple(places), units, own, rate, told)
+    num, left = samples.num_channels, () if stream.channels else opened.left_out
+    return _Part(clock, is_measured, num, hand, tuple(places), units, own, rate, told, left)
 
 
 def _by_speed(speed: EvenSamples, clock: Clock, stream: Stream) -> Timeline:
@@ -308,12 +317,6 @@ def _hand_of(opened: Opened, stream: Stream) -> tuple[HandLayout, list[int]]:
         return stream.channels, _rows_of(stream.channels, own, opened, stream)
     if opened.archived is not None:
         return opened.archived.hand, every
-    told = [name for name in own if _bare(name) in _LABEL_NAMES]
-    if told and stream.reading.channels is None:
-        raise ValueError(
-            f"has a column {told[0]!r}, which may be what a detector is to find out; list the "
-            "columns that are channels as reading.channels"
-        )
     adapting = stream.adapting or KNOWN_KINDS.get(stream.kind, "slow")
     before = f"{stream.name}_" if stream.name else ""
     names = [before + name for name in own or [f"ch{number + 1}" for number in every]]
@@ -347,13 +350,8 @@ def _place_of(name: str, own: Sequence[str]) -> int | None:
     """Where a name stands among others: as it is written or, if one alone is alike, by that."""
     if name in own:
         return list(own).index(name)
-    alike = [place for place, other in enumerate(own) if _bare(other) == _bare(name)]
+    alike = [place for place, other in enumerate(own) if bare(other) == bare(name)]
     return alike[0] if len(alike) == 1 else None
-
-
-def _bare(name: str) -> str:
-    """A name without its case and the unit behind it: ``"G1 (mV)"`` is ``"g1"``."""
-    return _UNIT.sub("", name.strip()).casefold()
 
 
 def _some(names: Sequence[str]) -> str:
@@ -503,7 +501,8 @@ def hand_file(
         ValueError: if it is damaged, of another hand, rate or unit, or nobody says its rate.
     """
     tare = _tare_of(tare_s, "tare_s")
-    with open_file(path, reading) as opened:
+    stream = Stream(reading=reading, channels=hand, units=units)
+    with open_file(path, stream.how) as opened:
         own, num = opened.archived, opened.samples.num_channels
         if (own or (opened.names is None and reading.channels is None)) and num != len(hand):
             raise ValueError(f"{path} has {num} channels, not {len(hand)}")
@@ -514,7 +513,7 @@ def hand_file(
                     f"channel {place} of {path} is {found.name} ({found.kind}), not {wanted.name} "
                     f"({wanted.kind}); give recordings of the detector's hand"
                 )
-        part = _part_of(opened, path, Stream(reading=reading, channels=hand, units=units))
+        part = _part_of(opened, path, stream)
         error = abs(part.rate_hz / sample_rate_hz - 1)
         if error > (_WANTED_RATE_ERROR if part.is_measured else 0.0):
             raise ValueError(
@@ -630,6 +629,11 @@ def _doubts(recording: _File) -> list[str]:
             "second before an onset, as far as it was recorded"
         )
     for part in parts:
+        if part.left_out:
+            doubts.append(
+                f"has columns that are taken for no channels, {_some(part.left_out)}; if they are, "
+                "list all channels as reading.channels"
+            )
         if gaps := part.clock.gaps:
             lost = sum(gap.missing for gap in gaps)
             first_s = gaps[0].start / part.rate_hz
@@ -952,7 +956,7 @@ class FileRecordings:
         """Each stream of a recording with its samples, open until the next."""
         path = self.root / one.entry.file
         for stream, part in zip(self._streams, one.parts, strict=True):
-            with open_file(path, stream.reading) as opened:
+            with open_file(path, stream.how) as opened:
                 most = self._most_bridged(part.rate_hz)
                 yield part, _of_hand(opened, path, part, tare_s, most)
 

@@ -1,10 +1,12 @@
 """Files: ours there and back, other people's as they meant them, by stretches; or one line."""
 
+import contextlib
 import importlib.util
 import json
 import os
 import pickle
 import shutil
+from dataclasses import replace
 from itertools import pairwise
 
 import h5py
@@ -16,6 +18,7 @@ import scipy.io
 import torch
 from foreign_files import LVM, made_73, made_hdf5, stored
 from mcap.reader import make_reader
+from mcap.records import Statistics
 from message_bags import (
     START_NS,
     STEP_NS,
@@ -431,6 +434,230 @@ def test_what_is_wrong_in_text_has_its_line(tmp_path, content, said):
     assert said in refused(tmp_path / "a.csv")
 
 
+# What people's programs write ------------------------------------------------------------------
+
+
+def lines(line, num=40):
+    return "".join(f"{line(i)}\n" for i in range(num))
+
+
+def stamped(unit, first=1_700_000_000):
+    """Whole stamps of 100 Hz since 1970, in so many of a second."""
+    return "timestamp,a\n" + lines(lambda i: f"{first * unit + i * unit // 100},{i}")
+
+
+HUNDRED = {"sample_rate_hz": 100.0}
+NAN, INF = float("nan"), float("inf")
+FOREIGN = {  # content, how it is read, names, numbers of the last sample, rate by its times
+    "NaN and infinity as Microsoft writes them": (
+        "time,a,b,c\n"
+        + lines(lambda i: f"{i / 100},{'-1.#IND' if i == 39 else i},1.#INF,{i},".strip(",")),
+        *({}, ("a", "b", "c"), [NAN, INF, 39.0], 100.0),
+    ),
+    "a line of units": (
+        "Time,Channel A\n(ms),(mV)\n" + lines(lambda i: f"{i * 0.5},{i}"),
+        *({}, ("Channel A",), [39.0], 2000.0),
+    ),
+    "a line of units in place of names": (
+        "ms,mV\n" + lines(lambda i: f"{i * 0.5},{i}"),
+        *({}, None, [39.0], 2000.0),
+    ),
+    "stamps since 1970 in ms": (stamped(10**3), {}, ("a",), [39.0], 100.0),
+    "stamps since 1970 in us": (stamped(10**6), {}, ("a",), [39.0], 100.0),
+    "stamps since 1970 in ns": (stamped(10**9), {}, ("a",), [39.0], 100.0),
+    "stamps since 1970 in s": (
+        "t,a\n" + lines(lambda i: f"{1_700_000_000 + i / 100:.2f},{i}"),
+        *({}, ("a",), [39.0], 100.0),
+    ),
+    "stamps without names": (stamped(10**3).partition("\n")[2], {}, None, [39.0], 100.0),
+    "a unit that is said": (
+        "time (ms),a\n" + lines(lambda i: f"{i},{i}"),
+        *({"time_unit": "us"}, ("a",), [39.0], 1e6),
+    ),
+    "units in words": (
+        "Time (sec),a\n" + lines(lambda i: f"{i / 100},{i}"),
+        *({}, ("a",), [39.0], 100.0),
+    ),
+    "micro": (
+        "Timestamp (\N{MICRO SIGN}s),a\n" + lines(lambda i: f"{i * 500},{i}"),
+        *({}, ("a",), [39.0], 2000.0),
+    ),
+    "millis": ("millis,a\n" + lines(lambda i: f"{i * 10},{i}"), {}, ("a",), [39.0], 100.0),
+    "rostopic echo": (
+        "%time,field.header.seq,field.header.frame_id,field.data\n"
+        + lines(lambda i: f"{17 * 10**17 + i * 10**7},{i},hand,{i}"),
+        *({}, ("field.data",), [39.0], 100.0),
+    ),
+    "no channels by their names": (
+        "frame,time,Frame Index,episode_index,seq,label,Slip [0/1],a,time (min)\n"
+        + lines(lambda i: f"{i},{i / 100},{i},0,{i},1,0,{i}.5,{i}"),
+        *({}, ("a",), [39.5], 100.0),
+    ),
+    "what is asked for by name": (
+        "time,seq,label\n" + lines(lambda i: f"{i / 100},{i},1"),
+        *({"channels": ["label", "seq"]}, ("label", "seq"), [1.0, 39.0], 100.0),
+    ),
+    "the index of a hand": (
+        "time,thumb,index\n" + lines(lambda i: f"{i / 100},1,{i}"),
+        *({}, ("thumb", "index"), [1.0, 39.0], 100.0),
+    ),
+    "times nobody wants": (
+        "time,a\n" + lines(lambda i: f"{i / 7},{i}"),
+        *({"time": None, **HUNDRED}, ("a",), [39.0], None),
+    ),
+    "words in a column": (
+        "time,a,note\n" + lines(lambda i: f"{i / 100},{i},{'slip' if i % 3 else ''}"),
+        *({"channels": ["a"]}, ("a",), [39.0], 100.0),
+    ),
+    "words in a column of labels": (
+        "time,a,label\n" + lines(lambda i: f"{i / 100},{i},slip"),
+        *({}, ("a",), [39.0], 100.0),
+    ),
+    "columns that are counted": (
+        "0,1\n" + lines(lambda i: f"{i * 0.5 + 0.25},{i * 0.25}"),
+        *({"time": None, **HUNDRED}, ("0", "1"), [19.75, 9.75], None),
+    ),
+    "columns that are counted, with decimal commas": (
+        "0;1\n" + lines(lambda i: f"0,{i:02d};1,{i:02d}"),
+        *(HUNDRED, ("0", "1"), [0.39, 1.39], None),
+    ),
+    "columns of whole numbers that are counted": (
+        "0,1,2\n" + lines(lambda i: f"{512 + i % 3},{498 + i % 5},{505 + i % 2}"),
+        *(HUNDRED, ("0", "1", "2"), [512.0, 502.0, 506.0], None),
+    ),
+    "a row that begins with 0 and 1": (
+        lines(lambda i: f"{i / 100:g},{1 + i}"),
+        *({}, None, [40.0], 100.0),
+    ),
+    "tabs alone are a row": (
+        "a\tb\n" + lines(lambda i: "\t" if i == 39 else f"{i}\t{i}"),
+        *(HUNDRED, ("a", "b"), [NAN, NAN], None),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FOREIGN)
+def test_nothing_that_people_write_is_read_silently_wrong(tmp_path, case):
+    content, how, names, last, rate = FOREIGN[case]
+    (tmp_path / "a.csv").write_text(content, encoding="utf-8")
+    samples, found, since, _ = read(tmp_path / "a.csv", Reading.of(how))
+    assert found == names
+    assert samples.shape[1] == 40
+    np.testing.assert_array_equal(samples[:, -1], last)
+    assert (since is None) == (rate is None)
+    if rate is not None:
+        assert even_clock(since).sample_rate_hz == pytest.approx(rate, rel=1e-6)
+
+
+def parquet(**columns):
+    return lambda path: pq.write_table(pa.table(columns), path)
+
+
+def joints(names, stamps):
+    """Messages of joints with a position each, which may come in another order."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    kind, header, time = "sensor_msgs/msg/JointState", "std_msgs/msg/Header", "Time"
+    made, head = store.types[kind], store.types[header]
+    clock = store.types[f"builtin_interfaces/msg/{time}"]
+    none = np.array([])
+    messages = []
+    for number, (order, stamp) in enumerate(zip(names, stamps, strict=True)):
+        values = np.array(["lr".index(name) + 1.0 for name in order])
+        message = made(head(clock(*divmod(stamp, 10**9)), ""), list(order), values, none, none)
+        messages.append((START_NS + number * 10**7, bytes(store.serialize_cdr(message, kind))))
+    return lambda path: write_mcap(path, [Sent("/j", kind, messages)])
+
+
+LATE = [0, 0, 0, *(START_NS + n * 10**7 for n in range(3, 40))]
+FILES = {  # file, what writes it, and what is said; or names, and numbers of the last sample
+    "a.npy": (lambda path: np.save(path, np.zeros((3, 4000))), None, [0.0] * 3),
+    "b.npz": (lambda path: np.savez(path, samples=np.zeros((4000, 3))), None, [0.0] * 3),
+    "windows.npz": (
+        lambda path: np.savez(path, X=np.zeros((40, 3, 100)), y=np.arange(40) % 2),
+        "'X', which has 3 dimensions",
+    ),
+    "labels.npz": (
+        lambda path: np.savez(path, a=np.arange(40), label=np.zeros(40), frame=np.zeros(40)),
+        *(("a",), [39.0]),
+    ),
+    "lists.parquet": (
+        parquet(tactile=[[1.0, 2.0]] * 9, timestamp=np.arange(9) / 10, frame_index=np.arange(9)),
+        "'tactile' holds 'list<element: double>'",
+    ),
+    "frames.parquet": (
+        parquet(index=np.arange(9), task_index=np.arange(9)),
+        "no column of samples: 'index', 'task_index' is taken for times, a label or book-keeping",
+    ),
+    "pandas.parquet": (
+        parquet(a=np.arange(9.0), __index_level_0__=np.arange(9)),
+        *(("a",), [8.0]),
+    ),
+    "swapped.mcap": (
+        joints([*["lr"] * 9, "rl"], [START_NS + n * 10**7 for n in range(10)]),
+        *(("position[l]", "position[r]"), [1.0, 2.0]),
+    ),
+    "other.mcap": (joints(["l", "r"], [1, 2]), "with other channels than the first"),
+    "stamps.mcap": (joints(["l"] * 40, LATE), "no stamp in message 1 on /j"),
+    "words.csv": (
+        lambda path: path.write_text("time,a,note\n0,1,slip\n1,2,\n2,3,\n"),
+        "line 2: 'slip' is no number, in column 'note'",
+    ),
+    "dates.csv": (
+        lambda path: path.write_text("timestamp,a\n" + lines(lambda i: f"2024-05-01T12:{i},{i}")),
+        "line 2: '2024-05-01T12:0' is no number, in column 'timestamp'",
+    ),
+    "label.csv": (
+        lambda path: path.write_text("time,label\n0,1\n1,2\n"),
+        "list it as reading.channels",
+    ),
+    **{
+        f"pointer.{ending}": (
+            lambda path: path.write_text(
+                "version https://git-lfs.github.com/spec/v1\noid sha256:0"
+            ),
+            "is a Git LFS pointer, not the file itself; run: git lfs pull",
+        )
+        for ending in ("parquet", "npy", "csv")
+    },
+    **{f"empty.{ending}": (lambda path: path.touch(), "is empty") for ending in ("csv", "h5")},
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_files_of_all_formats_are_read_as_meant_or_refused_in_a_line(tmp_path, name):
+    write, *wanted = FILES[name]
+    write(tmp_path / name)
+    if len(wanted) == 1:
+        assert wanted[0] in refused(tmp_path / name)
+        return
+    samples, names, *_ = read(tmp_path / name)
+    assert (names, samples[:, -1].tolist()) == tuple(wanted)
+
+
+def test_a_message_lost_from_an_mcap_file_is_noticed(tmp_path, monkeypatch):
+    counted = Statistics.write
+    monkeypatch.setattr(
+        Statistics, "write", lambda self, out: counted(replace(self, message_count=8), out)
+    )
+    path = write_mcap(tmp_path / "a.mcap", [wrenches(7)[0]])
+    assert "holds 7 messages, where its metadata say 8" in refused(path)
+
+
+def test_a_byte_of_a_mat_file_that_states_a_size_ends_no_process(tmp_path):
+    """The tag of the sizes of a matrix with a size of 0 killed Python in SciPy's reader."""
+    values = {"volts": noise(9, 2), "a": {"b": np.array(["x", "yz"], "O")}, "t": 1 + 2j}
+    scipy.io.savemat(tmp_path / "a.mat", values)
+    content = (tmp_path / "a.mat").read_bytes()
+    path, counts = tmp_path / "b.mat", [0, 0]
+    for place in range(128, len(content)):
+        for value in (0, 255):
+            path.write_bytes(content[:place] + bytes([value]) + content[place + 1 :])
+            with contextlib.suppress(ValueError), open_file(path) as opened:
+                opened.samples.read(0, 9)
+                counts[value > 0] += 1
+    assert all(counts)
+
+
 # Arrays: NumPy, HDF5, MAT, Parquet -------------------------------------------------------------
 
 
@@ -614,7 +841,10 @@ def test_a_bag_in_several_files_is_one_recording(tmp_path, storage):
     text = (bag / "metadata.yaml").read_text()
     line = next(line for line in text.splitlines() if f"- part0.{ending}" in line)
     second = line.replace("part0", "part1")
-    (bag / "metadata.yaml").write_text(text.replace(line, f"{line}\n{second}", 1))
+    text = text.replace(line, f"{line}\n{second}", 1)
+    (bag / "metadata.yaml").write_text(text)
+    assert "holds 300 messages, where its metadata say 150" in refused(bag)
+    (bag / "metadata.yaml").write_text(text.replace("message_count: 150", "message_count: 300"))
     np.testing.assert_array_equal(read(bag)[0], values)
 
 

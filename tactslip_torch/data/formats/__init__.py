@@ -167,6 +167,13 @@ class Format:
             raise FileNotFoundError(path)
         if not (path.is_dir() if self.is_folder else path.is_file()):
             raise Refused(f"must be a {'folder' if self.is_folder else 'file'}")
+        if not self.is_folder:
+            with path.open("rb") as file:
+                head = file.read(len(_LFS))
+            if not head:
+                raise Refused("is empty")
+            if head == _LFS:
+                raise Refused("is a Git LFS pointer, not the file itself; run: git lfs pull")
 
 
 FORMATS = {
@@ -182,6 +189,7 @@ FORMATS = {
     )
 }
 """By name; all can be written."""
+_LFS = b"version https://git-lfs.github.com/spec/"
 _EPISODE = Format("LeRobot", (_lerobot.ENDING[1:],), "_lerobot")
 
 

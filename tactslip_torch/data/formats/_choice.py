@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -12,20 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from tactslip_torch.data.formats._reading import (
-    SECONDS,
-    Opened,
-    Reading,
-    Refused,
-    Samples,
+from tactslip_torch.data.formats._names import (
+    CHANNEL_LISTS,
+    RATES,
     TimeUnit,
+    is_time,
+    no_channels,
+    time_unit_in,
 )
+from tactslip_torch.data.formats._reading import Opened, Reading, Refused, Samples
 
-LABEL_NAMES = ("channel_name", "channel_names", "channels", "columns", "labels")
-_RATE_NAMES = ("sample_rate_hz", "sample_rate", "sampling_rate", "samplingrate", "fs", "rate")
-_TIME_NAME = re.compile(  # "Time (ms)", "t_us", "t/s", "timestamps"
-    r"(?:time|t|timestamps?|stamp|time_stamp|seconds)(?:[\s_/(\[]+(s|ms|us|ns)[)\]]?)?"
-)
 _MOST_NAMED = 8  # in a message
 _NOT_NUMBERS = {"b": "true or false", "c": "complex numbers", "V": "compound values"}
 _NOT_NUMBERS |= {"O": "objects or text", "S": "text", "U": "text"}
@@ -72,18 +67,12 @@ def why_not_numbers(dtype: np.dtype[Any], shape: Sequence[int] | None) -> str | 
 def rate_in(numbers: Mapping[str, float]) -> float | None:
     """The sample rate among numbers by name, if one is called so."""
     lower = {name.lower(): value for name, value in numbers.items()}
-    return next((lower[n] for n in _RATE_NAMES if 0 < lower.get(n, 0) < math.inf), None)
+    return next((lower[n] for n in RATES if 0 < lower.get(n, 0) < math.inf), None)
 
 
 def unit_of_time(name: str | None, how: Reading) -> TimeUnit:
-    """The unit a time's name ends in, if it has one, else the one that is said."""
-    found = _TIME_NAME.fullmatch((name or "").strip().lower())
-    unit = found[1] if found else None
-    return next((known for known in SECONDS if known == unit), how.time_unit)
-
-
-def _is_time_name(name: str) -> bool:
-    return _TIME_NAME.fullmatch(name.strip().lower()) is not None
+    """The unit that is said, else the one a time's name ends in, else seconds."""
+    return how.time_unit or time_unit_in(name) or "s"
 
 
 # Columns of one table ---------------------------------------------------------------------------
@@ -98,7 +87,8 @@ def chosen_columns(
 ) -> tuple[int | None, list[int]]:
     """The place of the column of times, if there is one, and those of the channels.
 
-    If ``how`` does not say which hold samples, all do but times and ``others``.
+    If ``how`` does not say which hold samples, all do but ``others`` and those that are called as
+    times, labels or book-keeping are.
 
     Args:
         names: of all columns, if the file says.
@@ -110,7 +100,7 @@ def chosen_columns(
     Raises:
         Refused: if there is no such column, or none is left for samples.
     """
-    called = [place for place, name in enumerate(names or ()) if _is_time_name(name)]
+    called = [place for place, name in enumerate(names or ()) if is_time(name)]
     called = sorted({*called, *stamps})
     time: int | None = None
     if how.time == "auto":
@@ -120,12 +110,13 @@ def chosen_columns(
     if how.channels is not None:
         return time, [_position(names, num_columns, one, "channels") for one in how.channels]
     speed = None if how.speed is None else _position(names, num_columns, how.speed, "speed")
-    beside = {time, speed, *others, *stamps, *(called if time is not None else ())}
+    beside = {time, speed, *others, *stamps, *no_channels(names or (), how.hand)}
     channels = [place for place in range(num_columns) if place not in beside]
     if not channels:
+        which = f"{_some(list(map(repr, names)))} is" if names else "its only column is"
         raise Refused(
-            "has one column, and it is taken for times; say reading.time=null and "
-            "reading.sample_rate_hz if it holds samples"
+            f"has no column of samples: {which} taken for times, a label or book-keeping; if one "
+            "is a channel, list it as reading.channels and say reading.sample_rate_hz"
         )
     return time, channels
 
@@ -136,7 +127,8 @@ def opened_columns(
     how: Reading,
     samples: Callable[[list[int]], Samples],
     others: Iterable[int] = (),
-    units: Mapping[int, TimeUnit | None] = MappingProxyType({}),
+    stamps: Mapping[int, TimeUnit] = MappingProxyType({}),
+    units: Mapping[int, TimeUnit] = MappingProxyType({}),
 ) -> Opened:
     """A table as an open file: its channels, and the columns of times and of speed.
 
@@ -146,20 +138,25 @@ def opened_columns(
         how: what a person says of the file.
         samples: reads columns by their places.
         others: columns that are no channels unless a person says so.
-        units: of columns that hold times by their type; ``None`` of one that has only empty cells.
+        stamps: units of columns that hold times by their type.
+        units: that a line of units says of columns, if they hold times.
 
     Raises:
         Refused: as ``chosen_columns``.
     """
-    time, rows = chosen_columns(names, num_columns, how, others, tuple(units))
-    opened = Opened(samples(rows), names=None if names is None else tuple(names[r] for r in rows))
-    if how.speed is not None:
-        place = _position(names, num_columns, how.speed, "speed")
-        opened = opened._replace(speed=samples([place]))
+    time, rows = chosen_columns(names, num_columns, how, others, tuple(stamps))
+    opened = Opened(samples(rows))
+    speed = None if how.speed is None else _position(names, num_columns, how.speed, "speed")
+    if speed is not None:
+        opened = opened._replace(speed=samples([speed]))
+    if names is not None:
+        rest = [] if how.channels else sorted({*range(num_columns)} - {*rows, *stamps, time, speed})
+        chosen, left_out = (tuple(names[place] for place in places) for places in (rows, rest))
+        opened = opened._replace(names=chosen, left_out=left_out)
     if time is None:
         return opened
-    unit = units.get(time, unit_of_time(names[time] if names else None, how))
-    return opened if unit is None else opened._replace(stamps=samples([time]), time_unit=unit)
+    said = how.time_unit or time_unit_in(names[time] if names else None) or units.get(time)
+    return opened._replace(stamps=samples([time]), time_unit=stamps.get(time, said))
 
 
 def _position(names: Sequence[str] | None, num_columns: int, wanted: str | int, what: str) -> int:
@@ -230,12 +227,23 @@ def choose(
 
     times = [] if how.time in (None, "auto") else apart(how.time, "time")
     if how.time == "auto":
-        times = [array for array in columns if _is_time_name(array.leaf)]
+        times = [array for array in columns if is_time(array.leaf)]
     speeds = [] if how.speed is None else apart(how.speed, "speed")
     how = replace(how, speed=None) if speeds else how  # of the columns
     singles = [array for array in columns if array in within]
+    passed: list[Array] = []
     if how.channels is None:
         singles = [array for array in singles if array not in (*times, *speeds)]
+        if len(within) > 1 or how.samples is None:
+            places = no_channels([array.leaf for array in singles], how.hand)
+            passed = [singles[place] for place in places]
+            singles = [array for array in singles if array not in passed]
+    cubes = [name for name, why in refused.items() if why.endswith(" dimensions")]
+    if cubes and how.samples is None and how.channels is None:
+        raise Refused(
+            f"holds {cubes[0]!r}, which {refused[cubes[0]]}; a recording has 2, channels and time: "
+            "cut windows are no recording (SlipClassifier takes them), else say reading.samples"
+        )
     if is_matrix:
         if len(matrices) > 1:
             raise Refused(f"holds several arrays, {_listed(matrices)}; say reading.samples")
@@ -243,14 +251,15 @@ def choose(
     elif singles:
         opened, near = _of_columns(path, singles, columns, how)
     else:
-        whys = "; ".join([f"{name!r} {why}" for name, why in refused.items()][:3])
+        named = {array.name: "is a label or book-keeping by its name" for array in passed}
+        whys = "; ".join([f"{name!r} {why}" for name, why in (refused | named).items()][:3])
         reasons = f" ({whys})" if whys else " but times" if times else ""
         raise Refused(f"holds no samples{reasons}; say reading.samples if it does")
     length = opened.samples.num_samples
     fitting = [a for a in times if a.is_column and a.length == length]
     if opened.stamps is None and fitting:
-        stamps, unit = Samples(path, [fitting[0].values]), unit_of_time(fitting[0].leaf, how)
-        opened = opened._replace(stamps=stamps, time_unit=unit)
+        unit = how.time_unit or time_unit_in(fitting[0].leaf)
+        opened = opened._replace(stamps=Samples(path, [fitting[0].values]), time_unit=unit)
     elif opened.stamps is None and times and how.time != "auto":
         raise Refused(f"has times {_listed(times)} for {length} samples; say reading.time")
     if speeds:
@@ -258,7 +267,8 @@ def choose(
             raise Refused(f"has speeds {_listed(speeds)} for {length} samples; say reading.speed")
         opened = opened._replace(speed=Samples(path, [speeds[0].values]))
     rate = near.sample_rate_hz or _single_rate(arrays, near.name)
-    return opened._replace(sample_rate_hz=rate)
+    beside = tuple(array.name for array in passed if array.length == length)
+    return opened._replace(sample_rate_hz=rate, left_out=(*opened.left_out, *beside))
 
 
 def _of_matrix(
@@ -335,7 +345,7 @@ def _listed(arrays: Sequence[Array]) -> str:
 def _single_rate(arrays: Sequence[Array], name: str) -> float | None:
     """A rate that is an array of one number, the nearest to the samples by its name."""
     single = [a for a in arrays if math.prod(a.values.shape) == 1]
-    single = [a for a in single if a.leaf.lower() in _RATE_NAMES]
+    single = [a for a in single if a.leaf.lower() in RATES]
     single.sort(key=lambda one: len(os.path.commonprefix([one.name, name])))
     return rate_in({one.leaf: float(np.ravel(one.values[()])[0]) for one in single})
 
@@ -345,5 +355,5 @@ def _labels_near(
 ) -> list[tuple[str, ...]]:
     """The words of a file that may name the channels of an array, those beside it first."""
     group = name.rpartition(separator)[0]
-    called = [at for at in words if at.rpartition(separator)[2].lower() in LABEL_NAMES]
+    called = [at for at in words if at.rpartition(separator)[2].lower() in CHANNEL_LISTS]
     return [words[at] for at in sorted(called, key=lambda at: at.rpartition(separator)[0] != group)]

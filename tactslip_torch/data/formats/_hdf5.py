@@ -18,12 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._choice import (
-    LABEL_NAMES,
-    choose,
-    rate_in,
-    why_not_numbers,
-)
+from tactslip_torch.data.formats._choice import choose, rate_in, why_not_numbers
+from tactslip_torch.data.formats._names import CHANNEL_LISTS
 from tactslip_torch.data.formats._reading import (
     FREE_BYTES,
     MOST_MEMBERS,
@@ -80,10 +76,11 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     if own is not None:
         if why := _why_not(file["samples"]):
             raise ValueError(f"/samples {why}")
+        _check_chunks(file["samples"])
         return opened_from(own, path, file["samples"], 1)
     found: dict[str, Any] = {}
     for name, dataset in _datasets(file, found):
-        is_label = name.rpartition("/")[2].lower() in LABEL_NAMES
+        is_label = name.rpartition("/")[2].lower() in CHANNEL_LISTS
         found[name] = _why_not(dataset) or dataset
         if is_label and _why_elsewhere(dataset) is None and _are_words(dataset):
             found[name] = _decoded(dataset[()])
@@ -95,7 +92,7 @@ def _said(dataset: Any) -> tuple[list[tuple[str, ...]], float | None]:
     around = [dataset]
     while around[-1].name != "/":
         around.append(around[-1].parent)
-    named = [(one, at) for one in around for at in one.attrs if at.lower() in LABEL_NAMES]
+    named = [(one, at) for one in around for at in one.attrs if at.lower() in CHANNEL_LISTS]
     rate = next(filter(None, map(_rate_of, around)), None)
     return [_attribute(one, at) for one, at in named], rate
 
@@ -154,6 +151,14 @@ def _why_not(dataset: Any) -> str | None:
     except Refused as error:
         return str(error).strip()
     return why
+
+
+def _check_chunks(dataset: Any) -> None:
+    """Refuse samples of ours of which a chunk is not found: HDF5 gives zeros in its place."""
+    if dataset.chunks is not None:
+        for first in range(0, dataset.shape[1], dataset.chunks[1]):
+            if dataset.id.get_chunk_info_by_coord((0, first)).byte_offset is None:
+                raise ValueError(f"no samples from number {first} on")
 
 
 def _attribute(thing: Any, name: str) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -109,6 +110,7 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     def samples(places: list[int]) -> Samples:
         return Samples(path, [columns[place] for place in places])
 
+    how = replace(how, hand=names)  # whatever they are called, they are those of the feature
     opened = opened_columns([_TIME, *names], len(names) + 1, how, samples, [0])
     return opened._replace(sample_rate_hz=float(fps) * how.samples_per_row)
 

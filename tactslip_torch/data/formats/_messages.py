@@ -28,7 +28,8 @@ from urllib.parse import quote, unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._choice import chosen_columns, unit_of_time
+from tactslip_torch.data.formats._choice import chosen_columns
+from tactslip_torch.data.formats._names import epoch_unit, time_unit_in
 from tactslip_torch.data.formats._reading import (
     MOST_HEADER,
     MOST_MEMBERS,
@@ -49,6 +50,7 @@ TOPIC = "/tactile"
 HEADER = "tactslip_torch"
 """Under which metadata have the header."""
 _NOT_SAMPLES = ("/rosout", "/parameter_events", "/tf", "/tf_static", "/clock", "/diagnostics")
+_NAMES = ("name", "names", "joint_names")
 _LOG_TIME = "log_time"
 _BLOCK_S = 0.1
 RECORDING = "tactslip_torch recording"
@@ -205,7 +207,8 @@ def _rows_of(message: Any) -> NDArray[Any]:
 def _numbers(part: Any, name: str = "", depth: int = _MOST_DEPTH) -> Iterator[tuple[str, Any]]:
     """All numbers in a message by name, such as ``wrench.force.x``; arrays are one list.
 
-    Times and texts are none, ``null`` is NaN.
+    Where a field names as many words as arrays beside it have elements, each has its word:
+    ``position[wrist]``. Times and texts are none, ``null`` is NaN.
     """
     if depth < 0:
         raise Refused(f"messages nested deeper than {_MOST_DEPTH}")
@@ -217,8 +220,25 @@ def _numbers(part: Any, name: str = "", depth: int = _MOST_DEPTH) -> Iterator[tu
     elif part is None or isinstance(part, (int, float)):
         yield name, float("nan") if part is None else part
     elif _clock(part) is None:
-        for inner, value in _fields(part).items():
-            yield from _numbers(value, f"{name}.{inner}" if name else inner, depth - 1)
+        fields = _fields(part)
+        words = _words_in(fields)
+        for inner, value in fields.items():
+            whole = f"{name}.{inner}" if name else inner
+            if words and isinstance(value, np.ndarray | list) and len(value) == len(words):
+                elements = value if isinstance(value, list) else value.tolist()
+                for word, element in zip(words, elements, strict=True):
+                    yield from _numbers(element, f"{whole}[{word}]", depth - 1)
+            else:
+                yield from _numbers(value, whole, depth - 1)
+
+
+def _words_in(fields: Mapping[str, Any]) -> list[str]:
+    """The words of a field that names the elements of those beside it, as those of joints."""
+    for name in _NAMES:
+        words = fields.get(name)
+        if isinstance(words, list) and all(isinstance(word, str) for word in words):
+            return words if len(set(words)) == len(words) else []
+    return []
 
 
 @lru_cache(maxsize=64)
@@ -270,6 +290,7 @@ class TopicColumns:
         names: of the channels, if messages have names.
         time_name: of the number that is the time, since nothing else is.
         is_small: whether float32 holds all numbers.
+        left_out: names of numbers that are no channels by what they are called.
 
     Raises:
         Refused: if the messages hold no samples.
@@ -292,6 +313,9 @@ class TopicColumns:
         self._time, self._columns = chosen_columns(names, num_columns, how)
         self.names = None if names is None else tuple(names[place] for place in self._columns)
         self.time_name = names[self._time] if names and self._time is not None else None
+        rest = {*range(num_columns)} - {*self._columns, self._time}
+        is_asked = names is None or how.channels is not None
+        self.left_out = () if is_asked or names is None else tuple(names[n] for n in sorted(rest))
         self.num_channels = len(self._columns)
         self.is_small = self._is_array and np.can_cast(rows.dtype, np.float32)
 
@@ -322,6 +346,10 @@ class TopicColumns:
             Refused: if it holds other channels than the first.
         """
         rows, names, stamp = self._decoded(content)
+        first = self._alike[0]
+        if names != first and names and first and sorted(names) == sorted(first):
+            places = {name: place for place, name in enumerate(names)}
+            rows, names = rows[:, [places[name] for name in first]], first
         if (names, rows.shape[1], stamp is not None) != self._alike:
             raise Refused(
                 f"holds a message on {self.topic} with other channels than the first: "
@@ -366,9 +394,17 @@ class _TopicSamples(TopicColumns):
         """
         rows, (logged, stamps, counts) = self.spool.array(), self._marks.array().T
         times = stamps if self._how.time == "auto" and stamps.any() else logged
+        if times is stamps and (stamps == 0).sum() > 1:  # one alone may be where a clock begins
+            raise Refused(
+                f"has no stamp in message {int(np.argmin(stamps != 0)) + 1} on {self.topic}, and "
+                "one in others; say reading.time=log_time to go by the times of recording"
+            )
         if self._named:
-            unit = unit_of_time(self.time_name, self._how)
-            times = _nanoseconds(np.array(self._named), SECONDS[unit])
+            named = np.array(self._named)
+            unit = self._how.time_unit or time_unit_in(self.time_name)
+            if unit is None and named.dtype.kind in "iuf":
+                unit = epoch_unit(float(named.max()))
+            times = _nanoseconds(named, SECONDS[unit or "s"])
         if (np.diff(times) < 0).any():
             order = np.argsort(times, kind="stable")
             starts = np.cumsum(counts) - counts  # the first row of each message
@@ -451,7 +487,7 @@ def opened_messages(
     if topic is not None:
         rows, seconds = topic.ordered()
         stamps = None if seconds is None else Samples(path, [seconds])
-        return Opened(Samples(path, rows), None, topic.names, stamps)
+        return Opened(Samples(path, rows), None, topic.names, stamps, left_out=topic.left_out)
     if how.samples is None:
         why = "; ".join(f"{name}: {said}" for name, said in sorted(others.items())) or "no messages"
         raise Refused(f"has no topic with samples ({why[:800]})")
@@ -498,6 +534,19 @@ def _read_topic(
         found = one
         found.add(message)
     return found, others
+
+
+def _counted(messages: Iterable[Message], said: int | None) -> Iterator[Message]:
+    """The messages, which must be as many as the metadata of their file say, if they do."""
+    count = 0
+    for message in messages:
+        count += 1
+        yield message
+    if said is not None and count != said:
+        raise Refused(
+            f"holds {count} messages, where its metadata say {said}: it is damaged or a part; mcap "
+            "recover, or ros2 bag reindex, saves what is there"
+        )
 
 
 # MCAP, by the library ``mcap`` ------------------------------------------------------------------
@@ -558,12 +607,19 @@ def _mcap_header(reader: Any) -> dict[str, Any] | None:
 
 def _mcap_messages(reader: Any) -> Iterator[Message]:
     """In the order in which they stand in the file."""
-    for schema, channel, message in reader.iter_messages(log_time_order=False):
-        topic = Topic(channel.topic, "", channel.message_encoding)
-        if schema is not None:
-            text = schema.data.decode(errors="replace")
-            topic = topic._replace(kind=schema.name, schema_encoding=schema.encoding, schema=text)
-        yield Message(topic, message.log_time, message.data)
+    summary = reader.get_summary()
+    statistics = summary and summary.statistics
+    all_of_them = reader.iter_messages(log_time_order=False)
+    yield from _counted(map(_mcap_message, all_of_them), statistics and statistics.message_count)
+
+
+def _mcap_message(found: tuple[Any, Any, Any]) -> Message:
+    schema, channel, message = found
+    topic = Topic(channel.topic, "", channel.message_encoding)
+    if schema is not None:
+        text = schema.data.decode(errors="replace")
+        topic = topic._replace(kind=schema.name, schema_encoding=schema.encoding, schema=text)
+    return Message(topic, message.log_time, message.data)
 
 
 # rosbag2, by the library ``rosbags`` ------------------------------------------------------------
@@ -627,5 +683,5 @@ def _bag_messages(reader: Any) -> Iterator[Message]:
     for one in reader.connections:
         encoding = "ros2msg" if one.msgdef.format.name == "MSG" else ""
         topics[one.id] = Topic(one.topic, one.msgtype, "cdr", encoding, one.msgdef.data)
-    for connection, time, content in reader.messages():
-        yield Message(topics[connection.id], time, bytes(content))
+    found = (Message(topics[one.id], time, bytes(data)) for one, time, data in reader.messages())
+    yield from _counted(found, reader.message_count)

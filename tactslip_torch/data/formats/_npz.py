@@ -69,15 +69,14 @@ def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
 
 
 def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
-    """The samples of a file of ours, of an array ``[T, C]``, or of an archive of arrays.
+    """The samples of a file of ours, of an array, or of an archive of arrays.
 
-    Of an archive of others ``samples`` is ``[C, T]``; else what ``choose`` finds.
+    Of an archive of others ``samples``, if there is one; else what ``choose`` finds.
     """
     file = stack.enter_context(path.open("rb"))
     if file.read(len(npy.MAGIC_PREFIX)) == npy.MAGIC_PREFIX:
         stored = {"samples": _mapped(file, 0, path.stat().st_size)}
-        first = True if how.time_first is None else how.time_first
-        how = replace(how, samples=None, time_first=first)
+        how = replace(how, samples=None)
     else:
         with zipfile.ZipFile(file) as archive:
             stored = {
@@ -88,7 +87,7 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         if "format" in stored and how.samples in (None, "samples"):
             return opened_from(_header(stored), path, stored["samples"], 1)
         if how.samples is None and "samples" in stored:
-            how = replace(how, samples="samples", time_first=how.time_first is True)
+            how = replace(how, samples="samples")
     found = {n: why_not_numbers(kept.dtype, kept.shape) or kept for n, kept in stored.items()}
     return choose(path, found, how)
 

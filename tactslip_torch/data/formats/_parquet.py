@@ -84,8 +84,15 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         if names[:1] != [_TIME] or len(names) < 2 or refused:
             raise ValueError("times must stand first, then channels")
         return opened_from(own, path, _columns(file, names[1:]))
-    if len(refused) == len(names):
-        raise Refused(f"holds no samples ({names[0]!r} holds {str(schema.types[0])[:40]!r})")
+    lists = [n for n, kind in enumerate(schema.types) if types.is_nested(kind)]
+    wrong = lists if how.channels is None else []  # channels may be in them
+    if wrong or len(refused) == len(names):
+        place = (wrong or refused)[0]
+        raise Refused(
+            f"holds no samples that are a column each: {names[place]!r} holds "
+            f"{str(schema.types[place])[:40]!r}; list columns of numbers as reading.channels, or "
+            "give the folder if it is a LeRobot dataset"
+        )
 
     def samples(places: list[int]) -> Samples:
         if wrong := [place for place in places if place in refused]:

@@ -22,6 +22,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tactslip_torch.data.formats._names import SECONDS as SECONDS
+from tactslip_torch.data.formats._names import TimeUnit, epoch_unit
 from tactslip_torch.data.recording import MOMENTS, STRETCHES, Recording
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import check_choice, check_number
@@ -111,8 +113,6 @@ def needs(module: str, what: str, extra: str = "formats") -> ModuleType:
 
 # What a person says -----------------------------------------------------------------------------
 
-TimeUnit = Literal["s", "ms", "us", "ns"]
-SECONDS: dict[TimeUnit, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SpeedUnit = Literal["mm/s", "cm/s", "m/s", "um/s"]
 MM_S: dict[SpeedUnit, float] = {"mm/s": 1.0, "cm/s": 10.0, "m/s": 1000.0, "um/s": 1e-3}
 RowOrder = Literal["channel", "time"]
@@ -127,8 +127,10 @@ class Reading:
         time: the column, dataset, variable or field of times, by name or by number from 0.
             ``"auto"``: what is called ``time``, ``t``, ``timestamp`` or the like; of a table
             without names the first column, unless the rate is given. ``None``: there is none.
-        time_unit: of those times.
-        channels: columns by name or number, in the order of the hand; ``None``: all but the times.
+        time_unit: of those times; ``None``: as their name or a line of units says, else by the
+            size of stamps that count from 1970, else seconds.
+        channels: columns by name or number, in the order of the hand; ``None``: all but those that
+            are called as times, labels or book-keeping are (``no_channels``).
         samples: the dataset, variable, topic or feature (of LeRobot) that holds samples; ``None``:
             the only one that can.
         time_first: whether arrays are ``[T, C]``; ``None``: the longer axis is time.
@@ -145,6 +147,8 @@ class Reading:
             takes too much memory or time, or ends the process, is then refused in one line.
         isolate_gib: of memory that process may take beyond its libraries.
         isolate_s: it may take.
+        hand: names of channels that are wanted: a column of such a name is a channel, whatever it
+            is called. Set by who knows the hand.
 
     Raises:
         ValueError: for a value that cannot be.
@@ -152,7 +156,7 @@ class Reading:
 
     sample_rate_hz: float | None = None
     time: str | int | None = "auto"
-    time_unit: TimeUnit = "s"
+    time_unit: TimeUnit | None = None
     channels: Sequence[str | int] | None = None
     samples: str | None = None
     time_first: bool | None = None
@@ -164,13 +168,14 @@ class Reading:
     isolate: bool = False
     isolate_gib: float = 2.0
     isolate_s: float = 120.0
+    hand: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         for name in ("sample_rate_hz", "isolate_gib", "isolate_s"):
             if (value := getattr(self, name)) is not None or name != "sample_rate_hz":
                 check_number(f"reading.{name}", value)
         check_number("reading.samples_per_row", self.samples_per_row, whole=True)
-        check_choice("reading.time_unit", self.time_unit, SECONDS)
+        check_choice("reading.time_unit", self.time_unit, (*SECONDS, None))
         check_choice("reading.speed_unit", self.speed_unit, MM_S)
         check_choice("reading.row_order", self.row_order, (*get_args(RowOrder), None))
         columns, mark = self.channels, self.delimiter
@@ -203,14 +208,15 @@ class Reading:
         Raises:
             ValueError: for a key or value that is none.
         """
-        known = [one.name for one in fields(cls)]
+        known = [one.name for one in fields(cls) if one.name != "hand"]
         if given is not None and not (isinstance(given, Mapping) and set(given) <= set(known)):
             raise ValueError(f"reading must be of {', '.join(known)}, got {given!r}")
         return cls(**dict(given or {}))
 
     def key(self) -> dict[str, Any]:
         """What decides the samples that are read, as plain values; ``isolate`` does not."""
-        return {n: value for n, value in asdict(self).items() if not n.startswith("isolate")}
+        beside = ("isolate", "isolate_gib", "isolate_s", "hand")
+        return {n: value for n, value in asdict(self).items() if n not in beside}
 
 
 def _is_column(value: object) -> bool:
@@ -382,18 +388,20 @@ class Opened(NamedTuple):
         names: of the channels, if the file says.
         stamps: when the samples were taken, in the only channel, if the file says. Of rows with
             several samples, when the first of each was.
-        time_unit: of the stamps.
+        time_unit: of the stamps, if anybody says it.
         sample_rate_hz: if the file says; what a person says is not here.
         speed: of slip, in the only channel, at the same times as ``stamps``.
+        left_out: names of columns that are taken for no channels, by what they are called or hold.
     """
 
     samples: Samples
     archived: Archived | None = None
     names: tuple[str, ...] | None = None
     stamps: Samples | None = None
-    time_unit: TimeUnit = "s"
+    time_unit: TimeUnit | None = None
     sample_rate_hz: float | None = None
     speed: Samples | None = None
+    left_out: tuple[str, ...] = ()
 
     def times(self) -> NDArray[np.float64] | None:
         """Seconds since the first sample, ``[T]``; ``None`` if the file does not say.
@@ -404,7 +412,8 @@ class Opened(NamedTuple):
             return None
         values = self.stamps.stored(0, self.stamps.num_samples)[0]
         values = values.astype(np.int64 if values.dtype.kind in "iu" else np.float64)
-        return np.asarray((values - values[:1]).astype(np.float64) * SECONDS[self.time_unit])
+        unit = self.time_unit or epoch_unit(float(np.fmax.reduce(values, initial=0))) or "s"
+        return np.asarray((values - values[:1]).astype(np.float64) * SECONDS[unit])
 
 
 class Spool:

@@ -2,20 +2,22 @@
 
 A file of ours is a comment with the header, a line of column names, and a row an instant: its time
 and a column a channel, separated by commas in ``.csv`` and by tabs elsewhere. Of others most is
-found out from the first lines: delimiter, names, comments, a preamble, decimal commas, LabVIEW's
-headings. UTF-8, Latin-1 and UTF-16 with its mark are read. Every row is looked at when a file is
-opened; the numbers are kept in a temporary file (``TMPDIR``).
+found out from the first lines: delimiter, names, units, comments, a preamble, decimal commas,
+LabVIEW's headings. A ``#`` begins a comment at the start of a line or behind a blank. UTF-8,
+Latin-1 and UTF-16 with its mark are read. Every row is looked at when a file is opened; the numbers
+are kept in a temporary file (``TMPDIR``). A column that holds words is read as long as nobody asks
+for it.
 """
 
 from __future__ import annotations
 
 import codecs
 import csv
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -23,6 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactslip_torch.data.formats._choice import opened_columns
+from tactslip_torch.data.formats._names import (
+    NUMBER,
+    UNIT_CELL,
+    number_in,
+    time_unit_in,
+)
 from tactslip_torch.data.formats._reading import (
     FORM,
     MOST_HEADER,
@@ -31,7 +39,6 @@ from tactslip_torch.data.formats._reading import (
     Refused,
     Samples,
     Spool,
-    TimeUnit,
     header_in,
     opened_from,
     shape_of,
@@ -41,11 +48,9 @@ from tactslip_torch.data.formats._reading import (
 _HEAD = 2**20  # characters in which the first row must be found, and the most of a line
 _TO_WRITE = 4096  # rows at a time
 _TO_COUNT = 1024  # rows that show whether a column is their number
-_NUMBER = re.compile(
-    r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.IGNORECASE | re.ASCII
-)
 _NO_THOUSANDS = re.compile(r",\d{0,2}(?!\d)|,\d{4}|(?<!\d)0,|\d{4},|(?<!\d),")
-_UNIT = re.compile(r"[(\[].*[)\]]|-?|[muµn]?s|[muµk]?V|[mk]?N|[kM]?Pa|mm|counts?|[kM]?Hz")
+_COMMENT = re.compile(r"(?:^|(?<=\s))#.*")
+_WHOLE = re.compile(r"[+-]?\d+")
 _BLANKS = " "
 _WITH_COMMAS = ("\t", ";")  # between columns whose decimals may stand behind a comma
 
@@ -60,6 +65,7 @@ class _Layout(NamedTuple):
         names: of the columns, if the file says.
         has_tail: whether rows end in a delimiter behind their last column.
         has_commas: whether decimals stand behind a comma.
+        units: of the columns, from a line below their names.
         is_time_empty: whether the first column is for times and holds none, as LabVIEW has it.
         sample_rate_hz: if headings of LabVIEW state it.
     """
@@ -70,6 +76,7 @@ class _Layout(NamedTuple):
     names: tuple[str, ...] | None = None
     has_tail: bool = False
     has_commas: bool = False
+    units: tuple[str, ...] = ()
     is_time_empty: bool = False
     sample_rate_hz: float | None = None
 
@@ -109,22 +116,32 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
             for _ in range(layout.first_line - 1):
                 file.readline(_HEAD)
         spool = Spool(layout.num_columns, np.float64, stack)
+        words: dict[int, tuple[int, str]] = {}
         for line, lines in _blocks(file, layout.first_line):
-            spool.add(_rows_of(lines, layout, line))
+            spool.add(_rows_of(lines, layout, line, words))
     table = spool.array()
     if own is not None:
+        _refuse_words(words, range(layout.num_columns), layout)
         return opened_from(own, path, table[:, 1:])
     names, first_rows = layout.names, table[:_TO_COUNT]
-    if names is None and how.time == "auto" and how.sample_rate_hz is None:
+    is_unnamed = names is None or names == _numbering(layout.num_columns)
+    if is_unnamed and how.time == "auto" and how.sample_rate_hz is None:
         how = replace(how, time=0 if layout.num_columns > 1 else None)
     is_count = (first_rows[1:] == first_rows[:-1] + 1).all(0) & (len(first_rows) > 2)
     numbers = [
         n for n, name in enumerate(names or ()) if name in ("", f"column {n}", f"Unnamed: {n}")
     ]
-    counts = [n for n in numbers if is_count[n]]  # of the rows, which some libraries write first
-    columns = partial(Samples, path, table, 0)
-    empty: dict[int, TimeUnit | None] = {0: None} if layout.is_time_empty else {}
-    opened = opened_columns(names, layout.num_columns, how, columns, counts, empty)
+    others = [n for n in numbers if is_count[n]]  # of the rows, which some libraries write first
+    if layout.is_time_empty:
+        others.append(0)
+        how = replace(how, time=None) if how.time == "auto" else how
+
+    def columns(places: list[int]) -> Samples:
+        _refuse_words(words, places, layout)
+        return Samples(path, table, 0, places)
+
+    units = {n: unit for n, cell in enumerate(layout.units) if (unit := time_unit_in(cell))}
+    opened = opened_columns(names, layout.num_columns, how, columns, others, units=units)
     return opened._replace(sample_rate_hz=layout.sample_rate_hz)
 
 
@@ -173,16 +190,25 @@ def _blocks(file: IO[str], line: int) -> Iterator[tuple[int, list[str]]]:
     yield line, [rest]
 
 
-def _rows_of(lines: list[str], layout: _Layout, line: int) -> NDArray[np.float64]:
+def _without_comment(line: str) -> str:
+    return _COMMENT.sub("", line) if "#" in line else line
+
+
+def _rows_of(
+    lines: list[str], layout: _Layout, line: int, words: dict[int, tuple[int, str]]
+) -> NDArray[np.float64]:
     """The numbers of whole lines, ``[n, columns]``; the first line has the number ``line``.
 
-    Lines without anything and comments are passed over; a cell with nothing in it is NaN.
+    Lines without anything and comments are passed over; a cell with nothing in it is NaN, and so is
+    one that is no number: the first of each column is noted in ``words`` with its line.
 
     Raises:
-        Refused: naming the first line that is no such row.
+        Refused: naming the first line that has another number of cells.
     """
-    lines = plain = [one.partition("#")[0] for one in lines]
-    if not any(map(str.strip, lines)):
+    lines = plain = list(map(_without_comment, lines))
+    blanks = " \r" if layout.delimiter == "\t" else None  # tabs alone are a row of nothing
+    numbered = [(number, one) for number, one in enumerate(lines, line) if one.strip(blanks)]
+    if not numbered:
         return np.empty((0, layout.num_columns))
     if layout.has_tail:
         plain = [one.rstrip(" ").removesuffix(layout.delimiter) for one in plain]
@@ -195,11 +221,13 @@ def _rows_of(lines: list[str], layout: _Layout, line: int) -> NDArray[np.float64
             return rows
     except ValueError:  # cell by cell, so that what is empty is NaN and what is wrong has a line
         pass
-    found = [_row_of(one, layout, number) for number, one in enumerate(lines, line) if one.strip()]
+    found = [_row_of(one, layout, number, words) for number, one in numbered]
     return np.array(found, dtype=np.float64).reshape(-1, layout.num_columns)
 
 
-def _row_of(line: str, layout: _Layout, number: int) -> list[float]:
+def _row_of(
+    line: str, layout: _Layout, number: int, words: dict[int, tuple[int, str]]
+) -> list[float]:
     cells = _cells(line, layout.delimiter)
     if layout.has_tail and not cells[-1]:
         cells.pop()
@@ -207,12 +235,28 @@ def _row_of(line: str, layout: _Layout, number: int) -> list[float]:
         wanted = f"the row at line {layout.first_line} has {layout.num_columns}"
         raise _wrong(number, f"{len(cells)} cells, {wanted}; mend the line or take it out")
     row = []
-    for cell in cells:
+    for place, cell in enumerate(cells):
         plain = cell.replace(".", "?").replace(",", ".", 1) if layout.has_commas else cell
-        if plain and not _NUMBER.fullmatch(plain):
-            raise _wrong(number, f"{_quoted(cell)} is no number; leave empty what is missing")
-        row.append(float(plain or "nan"))
+        if plain and not NUMBER.fullmatch(plain):
+            words.setdefault(place, (number, cell))
+            plain = ""
+        row.append(number_in(plain))
     return row
+
+
+def _refuse_words(
+    words: Mapping[int, tuple[int, str]], places: Iterable[int], layout: _Layout
+) -> None:
+    """Refuse columns that hold what is no number."""
+    for place in places:
+        if place in words:
+            line, cell = words[place]
+            name = layout.names[place] if layout.names else place
+            raise _wrong(
+                line,
+                f"{_quoted(cell)} is no number, in column {name!r}; leave empty what is missing, "
+                "or list the columns that are channels as reading.channels",
+            )
 
 
 def _wrong(line: int, what: str) -> Refused:
@@ -248,21 +292,83 @@ def _layout_of(head: str, how: Reading) -> _Layout:
     lines = head.split("\n")
     if len(head) == _HEAD:
         lines.pop()  # cut
-    headings: list[tuple[int, str]] = []
     is_lvm = head.startswith("LabVIEW Measurement")
-    for number, line in enumerate(lines, 1):
-        bare = line.partition("#")[0]
-        marks = how.delimiter or [mark for mark in "\t;," if mark in bare] + [_BLANKS]
-        delimiter = next((m for m in marks if _is_row(_cells(bare, m), m, is_lvm)), None)
-        if delimiter is not None:
-            rows = [one.partition("#")[0] for one in lines[number - 1 :]]
-            return _named(_of_rows(rows, number, delimiter), headings, is_lvm)
-        if line.strip():
-            headings.append((number, line))
+    bare = list(map(_without_comment, lines))
+    marks = [how.delimiter] if how.delimiter else [*"\t;,", _BLANKS]
+
+    def split(place: int) -> Iterator[tuple[str, list[str]]]:
+        """The cells of a line by each delimiter that is in it."""
+        for mark in marks:
+            if mark in bare[place] or mark in (_BLANKS, how.delimiter):
+                yield mark, _cells(bare[place], mark)
+
+    rows = (
+        (place, mark)
+        for place in range(len(lines))
+        for mark, cells in split(place)
+        if _is_row(cells, mark, is_lvm)
+    )
+    place, delimiter = next(rows, None) or _with_words(split, len(lines))
+    above = [n for n in range(place) if bare[n].strip()]
+    num_columns = len(_cells(bare[place], delimiter))
+    while above and _has_words(_cells(bare[above[-1]], delimiter), num_columns):
+        place = above.pop()  # rows too, some cells of which are no numbers
+    below = [n for n in range(place + 1, len(lines)) if bare[n].strip()]
+    rest = [_cells(bare[n], delimiter) for n in below[:_TO_COUNT]]
+    if not above and _is_numbering(_cells(bare[place], delimiter), rest):
+        place = below[0]
+    headings = [(n + 1, lines[n]) for n in range(place) if lines[n].strip()]
+    return _named(_of_rows(bare[place:], place + 1, delimiter), headings, is_lvm)
+
+
+def _with_words(
+    split: Callable[[int], Iterator[tuple[str, list[str]]]], num_lines: int
+) -> tuple[int, str]:
+    """The first of two lines that have numbers in the same cells and words in all others."""
+    before: dict[str, list[bool]] = {}
+    for place in range(num_lines):
+        shapes = {mark: [bool(NUMBER.fullmatch(c)) for c in cells] for mark, cells in split(place)}
+        for mark, shape in shapes.items():
+            if any(shape) and len(shape) > 1 and before.get(mark) == shape:
+                return place - 1, mark
+        before = shapes
     raise Refused(
         f"holds no row of numbers in its first {_HEAD >> 20} MiB; "
         "it must be a table of numbers, with a decimal point"
     )
+
+
+def _has_words(cells: Sequence[str], num_columns: int) -> bool:
+    """Whether cells above a row are one as well: a number first, and words."""
+    return len(cells) == num_columns > 1 and NUMBER.fullmatch(cells[0]) is not None
+
+
+def _numbering(num_columns: int) -> tuple[str, ...]:
+    """Names of columns that have none, as pandas writes them."""
+    return tuple(map(str, range(num_columns)))
+
+
+def _is_numbering(first: Sequence[str], rest: Sequence[Sequence[str]]) -> bool:
+    """Whether the first of all lines counts the columns from 0, and is no row.
+
+    It is none if the numbers below are written otherwise, 1.0 where it has 1, or are far from its.
+    """
+    if len(first) < 2 or tuple(first) != _numbering(len(first)) or len(rest) < 3:
+        return False
+    if any(len(cells) != len(first) for cells in rest):
+        return False
+    columns = [[c.replace(",", ".") for c in column if c] for column in zip(*rest, strict=True)]
+    are_whole = [{_WHOLE.fullmatch(cell) is not None for cell in column} for column in columns]
+    if any(len(kinds) > 1 for kinds in are_whole):
+        return False
+    for number, (column, kinds) in enumerate(zip(columns, are_whole, strict=True)):
+        numbers = map(number_in, filter(NUMBER.fullmatch, column))
+        values = [value for value in numbers if math.isfinite(value)] or [number]
+        reach = 2 * max(max(values) - min(values), 2.0 * (True in kinds))
+        is_far = not min(values) - reach <= number <= max(values) + reach
+        if is_far or any(cell.rstrip("0").endswith(".") for cell in column):
+            return True
+    return False
 
 
 def _is_row(cells: Sequence[str], delimiter: str, is_lvm: bool) -> bool:
@@ -271,7 +377,7 @@ def _is_row(cells: Sequence[str], delimiter: str, is_lvm: bool) -> bool:
         cells = [cell.replace(",", ".", 1) for cell in cells]
     if not cells[0] and not is_lvm:
         return False
-    return any(cells) and all(not cell or _NUMBER.fullmatch(cell) for cell in cells)
+    return any(cells) and all(not cell or NUMBER.fullmatch(cell) for cell in cells)
 
 
 def _of_rows(lines: Sequence[str], number: int, delimiter: str) -> _Layout:
@@ -288,7 +394,10 @@ def _of_rows(lines: Sequence[str], number: int, delimiter: str) -> _Layout:
             "write it with decimal points"
         )
     num_columns = len(first) - has_tail
-    return _Layout(number, delimiter, num_columns, None, has_tail, has_commas, not first[0])
+    is_time_empty = not first[0]
+    return _Layout(
+        number, delimiter, num_columns, None, has_tail, has_commas, is_time_empty=is_time_empty
+    )
 
 
 def _named(layout: _Layout, headings: Sequence[tuple[int, str]], is_lvm: bool) -> _Layout:
@@ -296,6 +405,8 @@ def _named(layout: _Layout, headings: Sequence[tuple[int, str]], is_lvm: bool) -
     words = [(number, line) for number, line in headings if not line.lstrip().startswith("#")]
     if is_lvm:
         layout = layout._replace(sample_rate_hz=_rate_of(words, layout.delimiter))
+    if words and (units := _cells(words[-1][1], layout.delimiter)) and _are_units(units, layout):
+        layout = layout._replace(units=tuple(units))
     line, names = _names_line(words, layout) if words else _from_comment(headings, layout)
     if not names:
         return layout
@@ -322,6 +433,10 @@ def _named(layout: _Layout, headings: Sequence[tuple[int, str]], is_lvm: bool) -
     return layout._replace(names=tuple(names))
 
 
+def _are_units(cells: Sequence[str], layout: _Layout) -> bool:
+    return len(cells) >= layout.num_columns and all(map(UNIT_CELL.fullmatch, cells))
+
+
 def _names_line(words: Sequence[tuple[int, str]], layout: _Layout) -> tuple[int, list[str]]:
     """The nearest line of words that is no line of units; no names if it is a title of one cell.
 
@@ -330,11 +445,11 @@ def _names_line(words: Sequence[tuple[int, str]], layout: _Layout) -> tuple[int,
     """
     for number, line in reversed(words):
         cells = _cells(line, layout.delimiter)
-        if len(cells) >= layout.num_columns and all(map(_UNIT.fullmatch, cells)):
+        if _are_units(cells, layout):
             continue
-        numbers = [cell for cell in cells if _NUMBER.fullmatch(cell)]
+        numbers = [cell for cell in cells if NUMBER.fullmatch(cell)]
         is_broken = cells[0] in numbers or not all(map(str.isdigit, numbers))
-        if is_broken and len(cells) > 1:
+        if is_broken and len(cells) > 1 and tuple(cells) != _numbering(len(cells)):
             wrong = next(cell for cell in cells if cell not in numbers)
             raise _wrong(number, f"{_quoted(wrong)} is no number")
         return number, cells if len(cells) > 1 or layout.num_columns == 1 else []
@@ -347,7 +462,7 @@ def _from_comment(headings: Sequence[tuple[int, str]], layout: _Layout) -> tuple
         return 0, []
     number, line = headings[-1]
     cells = _cells(line.lstrip("# "), layout.delimiter)
-    is_header = len(cells) == layout.num_columns > 1 and not any(map(_NUMBER.fullmatch, cells))
+    is_header = len(cells) == layout.num_columns > 1 and not any(map(NUMBER.fullmatch, cells))
     return number, cells if is_header and all(cells) else []
 
 
@@ -364,7 +479,7 @@ def _rate_of(words: Sequence[tuple[int, str]], delimiter: str) -> float | None:
             raise _wrong(number, "times for each column; write X_Columns One or No")
         steps = {cell.replace(",", ".") for cell in rest if cell} if first == "Delta_X" else set()
         step = steps.pop() if len(steps) == 1 else ""
-        if _NUMBER.fullmatch(step) and float(step) > 0:
+        if NUMBER.fullmatch(step) and float(step) > 0:
             rate = 1 / float(step)
     return rate
 
