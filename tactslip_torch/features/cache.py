@@ -117,10 +117,10 @@ class FeatureCache:
 
     def store(self, key: str, features: Tensor, longest_run: int) -> None:
         """Write features ``[N, F]`` and the longest run, whole or not at all."""
-        kept = features.numpy().astype("<f4", order="C"), np.int64(longest_run)
+        array, run = features.numpy().astype("<f4", order="C"), np.int64(longest_run)
         try:
             with whole_file(self._path(key)) as temporary, temporary.open("wb") as file:
-                np.savez(file, **dict(zip(_KEPT, kept, strict=True)))
+                np.savez(file, features=array, longest_run=run)
         except OSError as error:
             self._warn(f"cannot be stored: {_cause(error)}", self._path(key))
 
