@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from tactslip_torch.data.file_recordings import _place_of as place_of
-from tactslip_torch.data.formats._text import _NUMBER as NUMBER
+from tactslip_torch.data.formats._names import NUMBER
 from tactslip_torch.live.sinks import Array, Block, Event, Notices, counted
 from tactslip_torch.runtime import check_choice, check_number
 
