@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,10 @@ from tactslip_torch.deploy.export import export_detector, wanted_graphs
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
+from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, most_stuck_samples
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.calibration import Calibration, Platt, calibration_from_dict, probability
-from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_from_dict
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
@@ -152,7 +154,13 @@ class _OfWindows(BaseEstimator):  # type: ignore[misc]  # scikit-learn has no an
         return pool, channel_filter
 
     def _read(
-        self, X: Any, y: Any = None, *, windows: bool | None = None, reset: bool = False
+        self,
+        X: Any,
+        y: Any = None,
+        *,
+        windows: bool | None = None,
+        reset: bool = False,
+        may_miss: bool = False,
     ) -> tuple[Array, Any]:
         """Features ``[N, F]`` or windows ``[N, C, T]`` in float64 or float32, and checked labels.
 
@@ -161,6 +169,7 @@ class _OfWindows(BaseEstimator):  # type: ignore[misc]  # scikit-learn has no an
             y: labels; without any those of scikit-learn are not asked for.
             windows: whether it must be windows; ``None``: either may come.
             reset: whether to learn the number of features.
+            may_miss: whether windows may hold NaN and Inf.
         """
         X, shape = _with_shape(X)
         wanted = {True: (3,), False: (2,), None: (2, 3)}[windows]
@@ -184,14 +193,13 @@ class _OfWindows(BaseEstimator):  # type: ignore[misc]  # scikit-learn has no an
         )  # fmt: skip
         if y is not None:
             x, y = x
-        if not np.isfinite(x).all():
+        if not (may_miss and x.ndim == 3) and not np.isfinite(x).all():
             first = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             kinds = ("window", "channel", "sample") if x.ndim == 3 else ("row", "column")
             where = ", ".join(f"{what} {i}" for what, i in zip(kinds, first, strict=True))
             value = "NaN" if np.isnan(x[first]) else "inf"
             raise ValueError(
-                f"X holds {value}: {where} (counted from 0); repair or leave out such samples. "
-                "SlipDetector.predict takes windows with broken channels"
+                f"X holds {value}: {where} (counted from 0); repair or leave out such samples"
             )
         return x, y
 
@@ -270,8 +278,14 @@ class TactileFeatures(TransformerMixin, _OfWindows):  # type: ignore[misc]
         self._layer: ChannelPooling | None = None
         self._columns = described
         if self.use != "channel":
-            features = described(self._bins(x), torch.float64)
-            layer = ChannelPooling.fit(self.hand_, described.names, features, self.pooling)
+            bins = self._bins(x)
+            features = described(bins, torch.float64)
+            num_counted = len(counted_channels(self.hand_, range(len(self.hand_)), is_pooled=True))
+            run = most_stuck_samples(self._pool.sample_rate_hz, int(longest_runs(_tensor(x)).max()))
+            self._sensing = Sensing.fit(_spans(bins), least_alive(num_counted), run)
+            layer = ChannelPooling.fit(
+                self.hand_, described.names, features, self.pooling, self._is_silent(bins)
+            )
             if self.use == "both":
                 layer = layer.with_channels(described.names)
             self._layer = layer
@@ -283,10 +297,16 @@ class TactileFeatures(TransformerMixin, _OfWindows):  # type: ignore[misc]
         check_is_fitted(self)
         x, _ = self._read(X, windows=True)
         with torch.no_grad():
-            features: Tensor = self._columns(self._bins(x), torch.float64)
+            bins = self._bins(x)
+            features: Tensor = self._columns(bins, torch.float64)
             if self._layer is not None:
-                features = self._layer(features)
+                features = self._layer(features, self._is_silent(bins))
         return features.numpy()
+
+    def _is_silent(self, bins: Tensor) -> Tensor:
+        """Channels that pools leave out, ``[N, C]``, bool."""
+        spans = _spans(bins)
+        return self._sensing.is_silent(spans, bins.shape[-1])
 
     def get_feature_names_out(self, input_features: Any = None) -> Array:
         """Names of the features, such as ``"PVDF3 D1 time std"`` or ``"std of PVDF D1 time std"``.
@@ -437,6 +457,8 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         self.__dict__.pop("detector_", None)
         if pool is not None:
             self.detector_ = plan.detector(pool, self._filter, head, info, self.backend)
+            run = most_stuck_samples(pool.sample_rate_hz, int(longest_runs(_tensor(x)).max()))
+            self.detector_.sensing = replace(self.detector_.sensing, stuck_samples=run)
             self.feature_names_ = [str(name) for name in self.detector_.selected_names]
         else:
             known = getattr(self, "feature_names_in_", None)
@@ -445,13 +467,14 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         return self
 
     def decision_function(self, X: ArrayLike | Tensor) -> Array:
-        """Scores ``[N]``; above 0 means ``classes_[1]``."""
-        score = self._score(X)
+        """Scores ``[N]``; above 0 means ``classes_[1]``, 0 where the decision is not valid."""
+        score = self._score(X)[0]
         return score if self.slip_label_ == self.classes_[1] else -score
 
     def predict(self, X: ArrayLike | Tensor) -> Array:
-        """Labels ``[N]``: slip where the score is at least 0."""
-        is_slip = self._score(X) >= 0
+        """Labels ``[N]``: slip where the score is at least 0, and the decision is valid."""
+        score, is_valid = self._score(X)
+        is_slip = (score >= 0) & is_valid
         other = self.classes_[self.classes_ != self.slip_label_][0]
         found: Array = np.where(is_slip, self.slip_label_, other).astype(self.classes_.dtype)
         return found
@@ -460,11 +483,19 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         """Probabilities of ``classes_``, ``[N, 2]``.
 
         Calibrated on the scores of groups that were left out (Platt's slope); one half is where the
-        decision changes.
+        decision changes, and where it is not valid.
         """
-        score = torch.from_numpy(self._score(X))
+        score = torch.from_numpy(self._score(X)[0])
         slip = probability(self._slope.llr(score), 0.5).numpy()
         return np.stack(self._ordered([1 - slip, slip]), axis=1)
+
+    def predict_valid(self, X: ArrayLike | Tensor) -> Array:
+        """Which decisions are valid, ``[N]``, bool: enough channels of the window are alive.
+
+        A channel is not alive that hardly moves, less than a tenth of what it did at rest in
+        training, or holds a NaN or Inf (``features.sensing``). Of features all are valid.
+        """
+        return self._score(X)[1]
 
     def to_detector(self, features: TactileFeatures | None = None) -> SlipDetector:
         """A ``SlipDetector``, for streams, ONNX and the commands.
@@ -500,7 +531,7 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         scaler, head = self._selection.scaler, self._head
         return SlipDetector(
             pool, features._filter, selected, scaler, head, self._info, None, layer,
-            backend=features.backend,
+            sensing=None if layer is None else features._sensing, backend=features.backend,
         )  # fmt: skip
 
     @classmethod
@@ -609,18 +640,19 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         detector = self.to_detector()
         return export_detector(detector, folder, wanted_graphs(None, detector))
 
-    def _score(self, X: Any) -> Array:
-        """Scores, positive for slip, in float64."""
+    def _score(self, X: Any) -> tuple[Array, Array]:
+        """Scores, positive for slip, in float64, 0 where not valid; and which are."""
         check_is_fitted(self)
         is_of_windows = hasattr(self, "detector_")
-        x, _ = self._read(X, windows=is_of_windows)
+        x, _ = self._read(X, windows=is_of_windows, may_miss=True)
         with torch.no_grad():
             if is_of_windows:
-                score = self.detector_(self._bins(x)).double()
+                found = self.detector_.predict(self._bins(x))
+                score, is_valid = found.score.double(), found.is_valid
             else:
                 score = self._head(self._selection(_tensor(x)))
-        found: Array = score.numpy()
-        return found
+                is_valid = torch.ones(len(score), dtype=torch.bool)
+        return torch.where(is_valid, score, 0.0).numpy(), is_valid.numpy()
 
     def _ordered(self, pair: list[Any]) -> list[Any]:
         """Non-slip and slip of what is in the order of ``classes_``, or the other way round."""
@@ -652,6 +684,11 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         tags.classifier_tags.multi_class = False
         tags.input_tags.three_d_array = True
         return tags
+
+
+def _spans(bins: Tensor) -> Tensor:
+    """Largest less smallest sample of each channel, ``[N, C, n] -> [N, C]``, float64."""
+    return (bins.amax(-1) - bins.amin(-1)).double()
 
 
 def _with_shape(X: Any) -> tuple[Any, tuple[int, ...]]:

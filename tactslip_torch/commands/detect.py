@@ -196,7 +196,10 @@ def _detect_in(
                 lost = [" ".join(decisions.names_lost(i)) for i in range(len(times))]
                 told = of | {"channels_lost": np.array(lost, object)}
                 write(zip(*(map(_cell, values.tolist()) for values in told.values()), strict=True))
-            events.extend(event._asdict() for event in stream.take_events())
+            for event in stream.take_events():
+                events.append(event._asdict())
+                for log in logs:
+                    log.event("hand", event.text)
 
         for first, piece in enumerate(pieces(samples, context.piece_samples)):
             traces.add_samples(piece.numpy())

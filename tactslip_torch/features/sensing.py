@@ -96,6 +96,12 @@ class Sensing:
         of_rest, of_most = tuple(rest.nan_to_num(0.0).tolist()), tuple(most.tolist())
         return cls(of_rest, of_most, min_alive, stuck_samples)
 
+    def is_silent(self, spans: Tensor, bin_samples: int) -> Tensor:
+        """Which channels of training bins are silent, by their spans: ``[N, C]``, bool."""
+        if bin_samples < FEWEST_SAMPLES:
+            return torch.zeros_like(spans, dtype=torch.bool)
+        return (spans < torch.tensor(self.floor).double()) | (spans == 0)
+
     @property
     def floor(self) -> tuple[float, ...]:
         """Span below which each channel is silent."""
@@ -202,7 +208,7 @@ def is_enough(
 
 
 class SpanFeatures:
-    """Spans of training bins by their features.
+    """Spans of training bins by their features, which tell the channels that are silent.
 
     That of a slow channel is the range of the bin, that of a fast one the range of its first
     approximation ``A1``, which holds all but the upper half of the band.
@@ -220,17 +226,15 @@ class SpanFeatures:
             for channel in hand.channels
         ]
         self._places = torch.tensor([place.get(name, -1) for name in wanted])
-        self._is_long = bin_samples >= FEWEST_SAMPLES
+        self._bin_samples = bin_samples
 
     def __call__(self, features: Tensor) -> Tensor:
         """Spans of bins, ``[N, F] -> [N, C]``, float64; NaN where the range is no feature."""
         return features[:, self._places].double().masked_fill(self._places < 0, torch.nan)
 
     def is_silent(self, spans: Tensor, sensing: Sensing) -> Tensor:
-        """Which channels of training bins are silent, by their spans: ``[N, C]``, bool."""
-        if not self._is_long:
-            return torch.zeros_like(spans, dtype=torch.bool)
-        return (spans < torch.tensor(sensing.floor).double()) | (spans == 0)
+        """Which channels of bins are silent, by their spans: ``[N, C]``, bool."""
+        return sensing.is_silent(spans, self._bin_samples)
 
 
 class StuckChannels:

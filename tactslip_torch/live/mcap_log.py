@@ -10,10 +10,11 @@ the fourth channel.
 topic                         type                        one message for
 ============================  ==========================  =============================
 ``/tactile``                  ``Float32MultiArray``       a sample of all channels
-``/slip/probability``         ``Float64``                 a decision
+``/slip/probability``         ``Float64``                 a decision (NaN: not valid)
 ``/slip/statistic``           ``Float64``                 a decision
 ``/slip/onset_score``         ``Float64``                 a decision (NaN: none yet)
-``/slip/valid``               ``Bool``                    a decision
+``/slip/valid``               ``Bool``                    a decision: it counts
+``/slip/in_range``            ``Bool``                    a decision: levels are as in training
 ``/slip/alarm``               ``Bool``                    a decision: an alarm stands
 ``/slip/onset``               ``TimeReference``           an alarm: when slip began
 ``/slip/truth``               ``Bool``                    a change, where it is known
@@ -46,7 +47,7 @@ _TIME, _HEADER = "builtin_interfaces/msg/Time", "std_msgs/msg/Header"
 _ONSET, _LOG = "sensor_msgs/msg/TimeReference", "rcl_interfaces/msg/Log"
 _KINDS = {
     **dict.fromkeys(("probability", "statistic", "onset_score"), _NUMBER),
-    **dict.fromkeys(("valid", "alarm", "truth"), _SWITCH),
+    **dict.fromkeys(("valid", "in_range", "alarm", "truth"), _SWITCH),
     "onset": _ONSET,
     "events": _LOG,
 }
@@ -135,6 +136,7 @@ class McapLog(FileSink):
             "probability": decisions.probability,
             "statistic": decisions.statistic,
             "valid": decisions.is_valid,
+            "in_range": decisions.in_range,
             "alarm": decisions.is_on,
         }
         if self._has_onset:

@@ -17,7 +17,7 @@ from tactslip_torch.onset.decisions import Decisions
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.runtime import one_thread
 
-_LONGER_THAN_GAP_S = 0.06  # begins a stream anew; StreamingDetector fills up to 0.05 s
+_LONGER_S = 0.01  # than what StreamingDetector fills: begins a stream anew
 _PATIENCE_S = 10.0  # for sinks, when all is to end
 _BREAKS = ("lost", "waiting", "gap", "dropped")
 """Events behind which samples are lacking."""
@@ -38,7 +38,7 @@ def watch(
     ``queue_s`` of samples wait to be decided on, all of them are dropped, counted and told
     (``"dropped"``): decisions are late by no more than that. Behind samples that are lacking
     (dropped, or a connection that was lost) times go on as the clock of this machine did, and a new
-    stream of decisions begins, if it is more than 0.05 s.
+    stream of decisions begins, if it is more than ``AlarmSettings.hold_s``.
 
     What is lost is told (``"missing"``): for each stretch of samples that the same channels lack an
     event with time, number and channels when it ends, and one before if it lasts over 1 s. Of many
@@ -132,7 +132,8 @@ class _State:
                     next_s = max(next_s, item.time_s[-1] + 1 / self._rate)
                 elif is_broken and position:
                     lacking = round((now_s - came_s) * self._rate) - num
-                    position += max(lacking, round(_LONGER_THAN_GAP_S * self._rate))
+                    longer_s = self._stream.settings.hold_s + _LONGER_S
+                    position += max(lacking, -(-round(longer_s * self._rate * 1e6) // 10**6))
                 is_broken, came_s = False, now_s
                 self.counts.received += len(item.samples)
                 self.put(Placed(position, item))
@@ -220,6 +221,8 @@ class _State:
             self._tell(Event("gap", f"a gap at {first / self._rate:.3f} s: decisions begin anew"))
         self._is_break_told = False
         self._tell(*self._losses.take(first, block))
+        of_hand = self._stream.take_events()
+        self._tell(*(Event("hand", f"{event.time_s:.3f} s: {event.text}") for event in of_hand))
         for sink in self._sinks:
             sink.samples(first, block)
         self._hand_on(decisions)

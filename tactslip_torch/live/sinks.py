@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.onset.decisions import Alarm, Decisions
+from tactslip_torch.onset.rules import NOTHING_YET
 
 Array = NDArray[Any]
 
@@ -54,7 +55,7 @@ class Event(NamedTuple):
 
     Attributes:
         kind: ``"connected"``, ``"waiting"``, ``"lost"``, ``"garbage"``, ``"missing"``,
-            ``"dropped"``, ``"gap"``, ``"refused"`` or ``"ended"``.
+            ``"dropped"``, ``"gap"``, ``"refused"``, ``"hand"`` or ``"ended"``.
         text: one line for people.
     """
 
@@ -188,8 +189,9 @@ def decision_columns(decisions: Decisions, *, has_onset: bool) -> dict[str, list
             ``onset_score`` and ``raised_by``.
 
     Returns:
-        ``time_s``, ``onset_s``, ``score``, ``probability``, ``valid``, ``statistic``, ``alarm``
-        and ``on`` (``export/README.md``), ``m`` entries each; ``None`` for what is not finite.
+        ``time_s``, ``onset_s``, ``score``, ``probability``, ``valid``, ``in_range``,
+        ``channels_lost`` (names), ``statistic``, ``alarm`` and ``on`` (``export/README.md``), ``m``
+        entries each; ``None`` for what is not finite, and where there is no statistic or score yet.
     """
     columns = {
         "time_s": decisions.available_s,
@@ -197,24 +199,36 @@ def decision_columns(decisions: Decisions, *, has_onset: bool) -> dict[str, list
         "score": decisions.score,
         "probability": decisions.probability,
         "valid": decisions.is_valid,
+        "in_range": decisions.in_range,
         "statistic": decisions.statistic,
         "alarm": decisions.is_alarm,
         "on": decisions.is_on,
     }
     if has_onset:
         columns["onset_score"] = decisions.onset_score
-    plain = {name: _finite(values.tolist()) for name, values in columns.items()}
+    plain: dict[str, list[Any]] = {}
+    for name, values in columns.items():
+        plain[name] = _known(values.tolist())
+        if name == "in_range":
+            lost = decisions.channels_lost.any(-1).tolist()
+            plain["channels_lost"] = [
+                list(decisions.names_lost(i)) if any_lost else [] for i, any_lost in enumerate(lost)
+            ]
     if has_onset:
         by = zip(plain["alarm"], decisions.by_onset.tolist(), strict=True)
         plain["raised_by"] = [("onset" if o else "status") if alarm else None for alarm, o in by]
     return plain
 
 
-def _finite(values: list[Any]) -> list[Any]:
-    return [value if math.isfinite(value) else None for value in values]
+def _known(values: list[Any]) -> list[Any]:
+    """``None`` for what is not finite, or was never."""
+    return [value if NOTHING_YET < value < math.inf else None for value in values]
 
 
-_OF_AN_ALARM = ("time_s", "onset_s", "score", "probability", "valid", "raised_by")
+_OF_AN_ALARM = (
+    *("time_s", "onset_s", "score", "probability", "valid", "in_range", "channels_lost"),
+    "raised_by",
+)
 
 
 class JsonLines(Sink):
@@ -459,7 +473,8 @@ def truth_changes(recording: Recording | None) -> list[tuple[float, bool]]:
 
 def alarm_text(alarm: Alarm) -> str:
     """An alarm in a line, for people."""
+    known = "-" if math.isnan(alarm.probability) else f"{alarm.probability:.3f}"
     return (
         f"slip alarm by {alarm.raised_by}; slip began {alarm.alarm_s - alarm.onset_s:.3f} "
-        f"s before; probability {alarm.probability:.3f}"
+        f"s before; probability {known}"
     )
