@@ -326,7 +326,7 @@ def _hand_of(opened: Opened, stream: Stream) -> tuple[HandLayout, list[int]]:
 
 def _rows_of(hand: HandLayout, own: Sequence[str], opened: Opened, stream: Stream) -> list[int]:
     """In which row of a file each channel of a hand is."""
-    places = [_place_of(name, own) for name in hand.names]
+    places = [place_of(name, own) for name in hand.names]
     rows = [place for place in places if place is not None]
     if len(rows) == len(hand) == len(set(rows)):
         return rows
@@ -346,7 +346,7 @@ def _rows_of(hand: HandLayout, own: Sequence[str], opened: Opened, stream: Strea
     )
 
 
-def _place_of(name: str, own: Sequence[str]) -> int | None:
+def place_of(name: str, own: Sequence[str]) -> int | None:
     """Where a name stands among others: as it is written or, if one alone is alike, by that."""
     if name in own:
         return list(own).index(name)

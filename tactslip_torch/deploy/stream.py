@@ -492,8 +492,9 @@ def onset_scores(
     shapes = memory_shapes(evidence)[: len(made)]
     lost, filled, of_hops, *kept = memory
     kept = [x.reshape(*shape) for x, shape in zip(kept, shapes, strict=True)]
-    of_fast = made[0].reshape(0, num_filters, len(fast)).sum(1).isfinite()
-    is_known = of_fast.cast(F64).sum(1) >= float(evidence.min_alive or 1)  # [k]
+    of_fast: Any = made[0].reshape(0, num_filters, len(fast))
+    alive = of_fast.sum(1).isfinite() & ((of_fast - evidence.silence).amax(1) > 0.0)
+    is_known = alive.cast(F64).sum(1) >= float(evidence.min_alive or 1)  # [k]
     longest, num_floor = evidence.windows[-1], evidence.memory - evidence.windows[-1]
 
     def scores_of(made: Sequence[Value], num_rows: Value) -> list[Value]:

@@ -16,8 +16,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from tactslip_torch.data.file_recordings import _place_of as place_of
-from tactslip_torch.data.formats._names import NUMBER
+from tactslip_torch.data.file_recordings import place_of
+from tactslip_torch.data.formats._names import NUMBER, number_in
 from tactslip_torch.live.sinks import Array, Block, Event, Notices, counted
 from tactslip_torch.runtime import check_choice, check_number
 
@@ -284,7 +284,7 @@ class _LineReader(FrameReader):
             if wrong:
                 lost = ", ".join(map(repr, wrong))[:80]
                 self._pass_over(sum(map(len, wrong)), f"a line holds what is no number: {lost}")
-            row = np.array([float(p) if p and p not in wrong else np.nan for p in parts])
+            row = np.array([np.nan if part in wrong else number_in(part) for part in parts])
             count = row[names.index(COUNTER)] if COUNTER in names else 0.0
             if not np.isfinite(count):
                 self._lose(line, "the counter of a line is no number")

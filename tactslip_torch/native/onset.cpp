@@ -45,15 +45,18 @@ struct Hop {
     }
   }
 
-  // Whether too few fast channels of a block are known.
+  // Whether too few fast channels of a block are alive.
   bool is_lost(const double* row) {
-    int64_t num_known = 0;
+    int64_t num_alive = 0;
     for (int64_t f = 0; f < own.num_fast; ++f) {
-      double sum = 0.0;
-      for (int64_t b = 0; b < num_filters; ++b) sum += row[f * num_filters + b];
-      num_known += run.listened[own.fast[f]] && isfinite(sum);
+      double sum = 0.0, rise = -INFINITY;
+      for (int64_t i = f * num_filters; i < (f + 1) * num_filters; ++i) {
+        sum += row[i];
+        rise = row[i] - own.silence[i] > rise ? row[i] - own.silence[i] : rise;
+      }
+      num_alive += run.listened[own.fast[f]] && isfinite(sum) && rise > 0.0;
     }
-    return num_known < own.min_alive;
+    return num_alive < own.min_alive;
   }
 
   // Mean, largest and smallest of rows of values over channels, 0 without any: `_over_channels`.

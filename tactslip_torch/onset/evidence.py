@@ -377,7 +377,7 @@ class OnsetClassifier:
 class OnsetStream:
     """Onset scores of a stream as its samples come; its memory has a fixed size.
 
-    A block in which too few fast channels are known (``OnsetEvidence.min_alive``) is lost. It has
+    A block in which too few fast channels are alive (``OnsetEvidence.min_alive``) is lost. It has
     no score and leaves the memory as it is. Beyond ``most_lost_samples`` of lost samples the memory
     begins anew, as at the beginning of a stream.
 
@@ -470,8 +470,9 @@ class OnsetStream:
         made = evidence.blocks(torch.from_numpy(x))
         logs = (made.power.log() * 0.5).transpose(1, 2)  # [F, k, B]
         fast = listened[list(evidence.hand.fast)]
-        num_known = logs.sum(-1).isfinite().numpy()[fast].sum(0)
-        is_lost = num_known < (evidence.min_alive or 1)
+        rises = (logs - evidence.silence.T[:, None]).amax(-1)
+        alive = logs.sum(-1).isfinite() & (rises > 0.0)  # [F, k]
+        is_lost = alive.numpy()[fast].sum(0) < (evidence.min_alive or 1)
         made_rows = torch.cat([logs.transpose(1, 2).flatten(0, 1), made.mean]).T.numpy()
         score, segments = np.full(len(made_rows), math.nan), list[tuple[bool, list[int]]]()
         for hop in range(len(made_rows)):

@@ -1,0 +1,403 @@
+"""Where nothing is sensed nothing is said: lost samples, dead hands, and what comes after them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from streams import detector_of, onset_of
+
+from tactslip_torch import SlipClassifier, SlipDetector, StreamingDetector, sample_recording
+from tactslip_torch.features.sensing import (
+    Sensing,
+    StuckChannels,
+    least_alive,
+    level_ratio,
+    longest_runs,
+    most_stuck_samples,
+    told_of_levels,
+)
+from tactslip_torch.hand import Channel, HandLayout
+from tactslip_torch.onset.decisions import AlarmSettings, Decider, joined_decisions
+from tactslip_torch.onset.evidence import OnsetStream
+from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN
+
+RATE = 2000.0
+REACH = 150  # samples that a decision of the shipped detector rests on
+SLIP_S = 1.2934
+N = 6000  # samples of a hand that senses nothing
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return SlipDetector.pretrained()
+
+
+@pytest.fixture(scope="module")
+def volts():
+    """The sample recording ``[T, C]``: quiet, then one slip."""
+    return sample_recording().samples.T.contiguous()
+
+
+@pytest.fixture(scope="module")
+def rules(detector, volts):
+    """Alarms of every kind, with thresholds of both signs, by name."""
+    usual = AlarmSettings.of(detector)
+    onset = onset_of(volts.T.double(), detector.pool.hand)
+    quiet = volts[: round(SLIP_S * RATE)].T.double()
+    blocks = onset.evidence.blocks_of_recording(quiet)
+    least = 0.1 * blocks.power.sqrt().median(-1).values
+    evidence = replace(onset.evidence, least_rms=tuple(map(tuple, least.tolist())))
+    onset = replace(onset, evidence=evidence)
+    onset = replace(onset, threshold=float(OnsetStream(onset).push(quiet).max()) + 0.1)
+    return {
+        "debounced": usual,
+        "k of n below 0": replace(usual, threshold=-0.5),
+        "one of one": replace(usual, rule=KOfN(1, 1), threshold=-1.0),
+        "cusum": replace(usual, rule=Cusum(0.5, 0.5, 9.0), threshold=3.0),
+        "onset": replace(usual, rule=Cusum(3.0, 0.5, 30.0), threshold=15.0, onset=onset),
+    }
+
+
+def decided(detector, settings, samples, piece=500):
+    """All decisions on samples ``[T, C]``, the alarms' times, and what is told of the hand."""
+    stream, parts = StreamingDetector(detector, settings), []
+    for part in samples.split(piece):
+        parts.append(stream.push(part))
+    parts.append(stream.flush())
+    made = joined_decisions(parts)
+    return made, [alarm.alarm_s for alarm in made.alarms], stream.take_events()
+
+
+def without(samples, start, num):
+    lost = samples.clone()
+    lost[start : start + num] = torch.nan
+    return lost
+
+
+RULES = ("debounced", "k of n below 0", "one of one", "cusum", "onset")
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("num_places", [8, pytest.param(120, marks=pytest.mark.slow)])
+def test_lost_samples_of_all_channels_raise_no_alarm_and_lose_none(
+    detector, volts, rules, rule, num_places
+):
+    _, clean, _ = decided(detector, rules[rule], volts)
+    assert clean, "the slip must be found without losses"
+    rng = np.random.default_rng(num_places)
+    for case in range(num_places):
+        num = int(rng.integers(1, 401)) if case else 1
+        near_slip = case % 3 == 0 and rule != "onset"  # whose evidence is the lost moment itself
+        start = rng.uniform(SLIP_S - 0.2, SLIP_S + 0.3) if near_slip else rng.uniform(0, 0.9)
+        lost = without(volts, round(start * RATE), num)
+        made, alarms, _ = decided(detector, rules[rule], lost)
+        assert not (made.is_alarm & ~made.is_valid).any()
+        late = [found - own for found, own in zip(alarms, clean, strict=True)]
+        assert all(-1e-9 <= delay <= (num + REACH) / RATE + 1e-9 for delay in late), (start, num)
+
+
+def test_one_lost_sample_says_what_the_whole_recording_says(detector, volts, rules):
+    made, alarms, _ = decided(detector, rules["debounced"], without(volts, 1000, 1))
+    _, clean, _ = decided(detector, rules["debounced"], volts)
+    assert alarms == clean
+    lost = ~made.is_valid
+    assert 1 <= lost.sum() <= REACH // 50 + 1
+    assert made.score[lost].isnan().all()
+    assert made.probability[lost].isnan().all()
+    assert made.channels_lost[lost].all()
+    assert made.probability[~lost].isfinite().all()
+
+
+def noise(size, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return size * torch.randn(N, 24, generator=generator)
+
+
+def hand_of(kind, quiet):
+    """Samples ``[N, 24]`` of a hand of which nothing, or not enough, can be known."""
+    usual = quiet.repeat(-(-N // len(quiet)), 1)[:N].clone()
+    match kind:
+        case "zero" | "constant" | "rail" | "low rail" | "nan":
+            value = {"zero": 0.0, "constant": 1.234, "rail": 5.0, "low rail": -5.0}.get(kind)
+            return torch.full((N, 24), torch.nan if value is None else value)
+        case "frozen":
+            return quiet[-1].expand(N, 24)
+        case "noise":
+            return noise(1e-4)
+        case "noise on an offset":
+            return quiet.mean(0) + noise(3e-5)
+        case "a thousandth":
+            return usual * 1e-3
+        case "fast channels off":
+            usual[:, 14:] = 0.0
+    return usual
+
+
+DEAD = (
+    *("zero", "constant", "rail", "low rail", "nan", "frozen", "noise", "noise on an offset"),
+    *("a thousandth", "fast channels off"),
+)
+
+
+@pytest.mark.parametrize("is_behind", [False, True])
+@pytest.mark.parametrize("kind", DEAD)
+def test_a_hand_that_senses_nothing_has_no_probability_and_no_alarm(
+    detector, volts, rules, kind, is_behind
+):
+    quiet = volts[:2000]
+    samples = hand_of(kind, quiet)
+    begins = len(quiet) if is_behind else 0
+    whole = torch.cat([quiet[:begins], samples, quiet])
+    for rule in ("debounced", "onset"):
+        made, alarms, events = decided(detector, rules[rule], whole)
+        assert not alarms, rule
+        first_s = (begins + REACH + 2 * 200) / RATE  # stuck after 200 samples
+        inside = (made.available_s > first_s) & (made.available_s < (begins + N) / RATE)
+        assert inside.sum() > 20
+        assert not made.is_valid[inside].any(), rule
+        assert made.score[inside].isnan().all()
+        assert made.probability[inside].isnan().all()
+        assert any("not valid" in event.text for event in events)
+        assert made.is_valid[made.available_s > (begins + N + 2400) / RATE].all()
+
+
+def test_half_of_the_fast_channels_and_a_third_of_the_gain_are_valid(detector, volts, rules):
+    half, quiet = volts[:2000].clone(), volts[:2000]
+    half[:, 14:19] = 0.0
+    for samples, num_lost in ((half, 5), (0.3 * quiet, 0)):
+        made, alarms, _ = decided(detector, rules["debounced"], samples)
+        assert made.is_valid.all()
+        assert made.in_range.all()
+        assert not alarms
+        assert (made.channels_lost.sum(-1) == num_lost).all()
+    half[:, 19] = 0.0  # four of ten are left
+    assert not decided(detector, rules["debounced"], half)[0].is_valid.any()
+
+
+def test_one_dead_channel_leaves_a_decision_valid_and_is_named(detector, volts, rules):
+    for dead in (0.0, 5.0, torch.nan):
+        lost = volts.clone()
+        lost[:, 16] = dead
+        made, alarms, events = decided(detector, rules["debounced"], lost)
+        assert made.is_valid.all()
+        assert set(map(made.names_lost, range(len(made.score)))) == {("PVDF3",)}
+        assert [event.text for event in events] == ["channels lost: PVDF3"]
+        assert len(alarms) == 1
+
+
+def test_an_alarm_stands_over_a_short_loss_and_ends_in_a_long_one(detector, volts, rules):
+    settings = rules["debounced"]
+    at = round(1.6 * RATE)  # an alarm stands
+    hold = round(settings.hold_s * RATE)
+    for num, stands in ((hold, True), (2 * hold, False)):
+        made, _, _ = decided(detector, settings, without(volts, at, num))
+        behind = int(np.searchsorted(made.available_s.numpy(), (at + num) / RATE))
+        assert bool(made.is_on[behind]) == stands
+
+
+def test_a_rule_begins_anew_behind_a_long_loss():
+    from tactslip_torch.model.calibration import Platt
+
+    settings = AlarmSettings(50, Platt(1.0, 0.0), KOfN(2, 3), 1.0, None)
+    for num, is_kept in ((3, True), (30, False)):
+        score = torch.tensor([-3.0, 3.0] + [0.0] * num + [3.0, -3.0])
+        valid = torch.tensor([True, True] + [False] * num + [True, True])
+        made = Decider(settings, RATE, 100, 25).decide(score, valid)
+        assert made.is_alarm[-2] == is_kept  # the first high one counts, or not any more
+
+
+def test_a_hand_whose_unit_is_another_is_told_once(detector, volts, rules):
+    quiet = volts[:2000].repeat(4, 1)
+    for factor, said in ((1e-3, "a thousandth"), (1e3, "a thousand times"), (1.0, None)):
+        _, _, events = decided(detector, rules["debounced"], factor * quiet)
+        told = [event.text for event in events if "levels" in event.text]
+        assert len(told) == (said is not None)
+        assert said is None or said in told[0]
+    made, _, _ = decided(detector, rules["debounced"], 1e3 * quiet)
+    assert made.is_valid.all()
+    assert not made.in_range.any()
+
+
+def test_levels_are_told_in_a_line():
+    sensing = Sensing((1.0, 2.0, 0.0), (9.0, 9.0, 9.0), 1, 200)
+    span = torch.tensor([1.0, 2.0, 5.0]).expand(20, 3)
+    assert level_ratio(span, sensing) == 1.0
+    assert not told_of_levels(level_ratio(0.3 * span, sensing), "V")
+    assert told_of_levels(level_ratio(1e-3 * span, sensing), "V").endswith("is the unit V?")
+    assert "40 times" in told_of_levels(level_ratio(40 * span, sensing), "V")
+    assert level_ratio(torch.full((4, 3), torch.nan), sensing) is None
+
+
+# Stuck channels ----------------------------------------------------------------------------------
+
+
+def naive_stuck(x, most):
+    """Sample by sample: NaN from the one behind ``most`` equal ones on."""
+    marked = x.copy()
+    for channel in range(len(x)):
+        run = 0
+        for i, value in enumerate(x[channel]):
+            run = run + 1 if i and value == x[channel, i - 1] else 1
+            if run > most:
+                marked[channel, i] = np.nan
+    return marked
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.integers(1, 40))
+def test_a_stuck_channel_is_missing_however_its_samples_come(seed, most, piece):
+    rng = np.random.default_rng(seed)
+    x = rng.choice([0.0, 1.0, np.nan], (3, 60), p=[0.6, 0.3, 0.1])
+    mark = StuckChannels(most)
+    parts = [mark(part) for part in np.split(x, range(piece, 60, piece), axis=1)]
+    np.testing.assert_array_equal(np.concatenate(parts, 1), naive_stuck(x, most))
+
+
+def test_stuck_is_longer_than_twice_what_training_had_within_limits():
+    x = torch.tensor([[0.0, 1, 1, 1, 2, 3], [4, 4, 4, 4, 4, 4]])
+    assert longest_runs(x).tolist() == [3, 0]  # one that never moves does not count
+    assert most_stuck_samples(2000.0, 3) == 200  # .1 s
+    assert most_stuck_samples(2000.0, 300) == 600
+    assert most_stuck_samples(2000.0, 30000) == 2000  # 1 s
+    assert most_stuck_samples(10.0, 30000) == 20
+    assert most_stuck_samples(2000.0) == 2000
+
+
+def test_a_clipped_peak_is_not_missing(detector, volts, rules):
+    clipped = volts.clone()
+    clipped[1000:1150] = 5.0  # 75 ms
+    stream = StreamingDetector(detector, rules["debounced"])
+    stream.push(clipped)
+    assert np.isfinite(stream._held).all()
+
+
+# Other hands -------------------------------------------------------------------------------------
+
+
+def test_least_alive_never_asks_for_all_of_several():
+    assert [least_alive(num) for num in (1, 2, 3, 5, 10)] == [1, 1, 1, 2, 5]
+    assert [least_alive(num, 1.0) for num in (1, 2, 10)] == [1, 1, 9]
+
+
+def windows(num_channels, num_samples, seed=0, whole=False):
+    rng = np.random.default_rng(seed)
+    y = np.arange(80) % 2
+    x = rng.standard_normal((80, num_channels, num_samples)) * (1 + 3 * y[:, None, None]) + 5
+    return (np.round(x) if whole else x), y
+
+
+def hand(adapting):
+    channels = [Channel(f"C{i}", f"{a}taxel", "any", "any", a) for i, a in enumerate(adapting)]
+    return HandLayout(tuple(channels))
+
+
+@pytest.mark.parametrize(
+    ("made", "num_lost", "is_valid"),
+    [
+        (hand(["fast"]), 0, True),
+        (hand(["fast"]), 1, False),
+        (hand(["slow"] * 4), 2, True),  # without fast ones the slow ones count
+        (hand(["slow"] * 4), 3, False),
+        (hand(["slow"] * 4 + ["fast"] * 2), 4, True),  # the slow ones do not count
+        (hand(["fast"] * 3 + ["slow"]), 2, True),
+        (hand(["fast"] * 3 + ["slow"]), 3, False),
+    ],
+)
+def test_channels_that_count_must_be_alive_on_any_hand(made, num_lost, is_valid):
+    x, y = windows(len(made), 100)
+    classifier = SlipClassifier(RATE, made, use="pooled").fit(x, y)
+    lost = x.copy()
+    lost[:, :num_lost] = 7.0
+    assert classifier.predict_valid(x).all()
+    assert (classifier.predict_valid(lost) == is_valid).all()
+    if not is_valid:
+        assert (classifier.predict(lost) == 0).all()
+        assert (classifier.decision_function(lost) == 0).all()
+        assert (classifier.predict_proba(lost) == 0.5).all()
+
+
+def test_short_windows_of_whole_counts_are_never_silent():
+    x, y = windows(3, 5, whole=True)
+    x[3:6] = 1.0
+    assert SlipClassifier(25.0, wavelet="haar").fit(x, y).predict_valid(x).all()
+
+
+def test_windows_with_missing_samples_are_predicted_and_not_fitted():
+    x, y = windows(4, 100)
+    classifier = SlipClassifier(RATE).fit(x, y)
+    missing = x.copy()
+    missing[0], missing[1, 0], missing[2, :, 5] = np.nan, np.nan, np.inf
+    assert classifier.predict_valid(missing)[:4].tolist() == [False, True, False, True]
+    assert np.isfinite(classifier.decision_function(missing)).all()
+    with pytest.raises(ValueError, match="X holds NaN: window 0, channel 0, sample 0"):
+        classifier.fit(missing, y)
+
+
+def test_min_alive_can_be_set(detector, volts):
+    own = SlipDetector.pretrained()
+    half = volts[:200].T.clone()[None]
+    half[:, 14:19] = torch.nan
+    raw = half[..., : own.context_before + 100 + own.context_after]
+    assert own.predict_raw(raw).is_valid.all()
+    own.sensing = replace(own.sensing, min_alive=6)
+    assert not own.predict_raw(raw).is_valid.any()
+    with pytest.raises(ValueError, match="min_alive is 11, of 10 channels that count"):
+        own.sensing = replace(own.sensing, min_alive=11)
+
+
+def test_unpooled_columns_of_lost_channels_take_their_training_means():
+    own = detector_of()
+    bins = torch.randn(7, 4, 100, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    own.imputation.copy_(torch.linspace(-1, 1, len(own.imputation)))
+    lost = bins.clone()
+    lost[:, 2] = 3.0  # silent
+    other = bins.clone()
+    other[:, 2] = torch.nan
+    found, missing = own.predict(lost), own.predict(other)
+    torch.testing.assert_close(found.score, missing.score)
+    assert found.channels_lost[:, 2].all()
+    z = own.scaled(own.extractor(bins), found.channels_lost)
+    torch.testing.assert_close(found.score, own.head(z))
+
+
+# Fast evidence -----------------------------------------------------------------------------------
+
+
+def test_fast_evidence_keeps_its_floor_over_a_loss_and_fills_it_anew_behind_a_long_one(volts):
+    samples = volts.T.double()
+    classifier = onset_of(samples, HandLayout.paper24())
+    evidence, hold = classifier.evidence, 500
+    clean = OnsetStream(classifier, hold).push(samples)
+    for num in (1, 300, 1500):
+        lost = samples.clone()
+        lost[:, 3000 : 3000 + num] = torch.nan
+        for backend in ("native", "torch"):
+            score = OnsetStream(classifier, hold, backend).push(lost)
+            known = score > NOTHING_YET
+            first = -(-(3000 + num + evidence.context) // evidence.hop_samples) + 1
+            torch.testing.assert_close(score[:300], clean[:300])
+            assert not known[301 : first - 1].any()
+            blind = 0 if num < hold else evidence.memory - 1
+            stop = min(first + blind, len(score))
+            assert not known[first : stop - 1].any()
+            assert known[stop + 2 :].all()
+
+
+def test_backends_agree_on_fast_evidence_with_losses(volts):
+    samples = volts.T.double().clone()
+    classifier = onset_of(samples, HandLayout.paper24())
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        start, num = rng.integers(0, 5000), rng.integers(1, 700)
+        channels = rng.choice(24, rng.integers(1, 25), replace=False)
+        samples[torch.from_numpy(channels)[:, None], torch.arange(start, start + num)] = torch.nan
+    scores = []
+    for backend, piece in (("native", 100000), ("torch", 100000), ("native", 37), ("torch", 333)):
+        stream = OnsetStream(classifier, 500, backend)
+        scores.append(torch.cat([stream.push(part) for part in samples.split(piece, -1)]))
+    for score in scores[1:]:
+        torch.testing.assert_close(score, scores[0], rtol=1e-9, atol=1e-9)
+    assert (scores[0] == NOTHING_YET).any()
+    assert (scores[0] > NOTHING_YET).any()
