@@ -250,9 +250,9 @@ LINES = {
         "",
     ),
     "no number": (
-        "1,2,3,4\n1_0,2,-1.#IND,4\n",
+        "1,2,3,4\n1_0,2,2..1,4\n",
         [[1, 2, 3, 4], [NAN, 2, NAN, 4]],
-        "'1_0', '-1.#IND'",
+        "'1_0', '2..1'",
     ),
     "too few or many": (
         "1,2,3,4\n1,2,3\n1,2,3,4,5\n",
@@ -379,20 +379,20 @@ class Device:
 
     def __init__(self, listens):
         self._server = socket.create_server(("127.0.0.1", 0)) if listens else None
-        self._port = self._server.getsockname()[1] if listens else None
+        self.port = self._server.getsockname()[1] if listens else None
 
     def source(self, detector):
         if self._server:
-            return TcpClient("127.0.0.1", self._port, BINARY, detector)
+            return TcpClient("127.0.0.1", self.port, BINARY, detector)
         source = TcpListener("127.0.0.1", 0, BINARY, detector)
-        self._port = source.port
+        self.port = source.port
         return source
 
     def plug(self):
         if self._server:
             self._peer = self._server.accept()[0]
         else:
-            self._peer = socket.create_connection(("127.0.0.1", self._port))
+            self._peer = socket.create_connection(("127.0.0.1", self.port))
 
     def send(self, content):
         self._peer.sendall(content)
@@ -918,3 +918,36 @@ def test_a_page_that_does_not_read_loses_samples_for_itself_alone(serve, detecto
         got = got[-1000:] + peer.recv(1 << 20)
     assert int(last[1]) > 0
     peer.close()
+
+
+def test_a_stream_with_few_files_goes_on_among_idle_connections(detector, samples, tmp_path):
+    detector.save(tmp_path / "detector.pt")
+    device = Device(listens=True)
+    text = "".join(f"{','.join(map(repr, row))}\n" for row in samples.tolist()).encode()
+    options = f"model=detector.pt source=tcp:127.0.0.1:{device.port} output=0 serve=true port=0"
+    command = (
+        f"ulimit -n 64; exec {sys.executable} -m tactslip_torch stream decisions=true {options}"
+    )
+    told = {"cwd": tmp_path, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(["bash", "-c", command], **told) as started:
+        said = [started.stderr.readline() for _ in range(2)]
+        page, lines = (int(re.search(r":(\d+)/?$", line.strip())[1]) for line in said)
+        device.plug()
+        reader, *others = idle(lines, 1)
+        for _ in range(3):
+            device.send(text)
+            time.sleep(0.5)  # it is decided on
+            device.pull()
+            others += [*idle(lines, 25), *idle(page, 25)]
+            device.plug()
+        started.terminate()
+        errors = started.stderr.read()
+    rows = [json.loads(line) for line in reader.makefile("rb").readlines()]
+    wanted = expected(detector, samples)["score"]
+    found = torch.tensor([row["score"] for row in rows if "score" in row], dtype=torch.float64)
+    torch.testing.assert_close(found, wanted.repeat(3), rtol=1e-9, atol=1e-9)
+    assert "Traceback" not in errors
+    assert "programs refused: 16 read lines already" in errors
+    assert len(errors.splitlines()) < 40
+    for each in (device, reader, *others):
+        each.close()

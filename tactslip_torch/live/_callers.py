@@ -4,31 +4,38 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import suppress
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from websockets.asyncio.server import ServerConnection
 from websockets.protocol import State
+
+MOST = 16
+"""Connections of a server that are no open page."""
 
 
 class Caller(ServerConnection):
     """A connection; of those that are no open page the oldest makes room for one too many."""
 
-    most: ClassVar[int] = 16
-    others: list[Caller]  # all of the server, the oldest first
+    made: ClassVar[list[Caller]]  # of the server, the oldest first
+
+    @classmethod
+    def drop(cls, most: int) -> None:
+        """Close the oldest of those that are no page, until there are no more than ``most``."""
+        others = [each for each in cls.made if each.state is not State.OPEN]
+        for each in others[: max(0, len(others) - most)]:
+            cls.made.remove(each)
+            each.transport.abort()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Count it."""
         super().connection_made(transport)
-        self.others.append(self)
-        waiting = [each for each in self.others if each.state is not State.OPEN]
-        if len(waiting) > self.most:
-            waiting[0].transport.abort()
-            self.others.remove(waiting[0])
+        self.made.append(self)
+        self.drop(MOST)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """It counts no more."""
-        if self in self.others:
-            self.others.remove(self)
+        if self in self.made:
+            self.made.remove(self)
         super().connection_lost(exc)
 
     def send_data(self) -> None:
@@ -43,6 +50,6 @@ class Caller(ServerConnection):
                 self.transport.write_eof()
 
 
-def callers() -> Any:
-    """The connections of one server, as what makes them."""
-    return type("CallerOfOne", (Caller,), {"others": []})
+def callers() -> type[Caller]:
+    """The connections of one server."""
+    return type("CallerOfOne", (Caller,), {"made": []})

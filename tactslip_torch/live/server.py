@@ -222,6 +222,7 @@ class PageServer(Sink):
 
         from tactslip_torch.live._callers import callers
 
+        caller = callers()
         quiet = logging.Logger("page", logging.CRITICAL)  # what strangers send is no news
         try:
             server: Server = await serve(
@@ -229,7 +230,7 @@ class PageServer(Sink):
                 self._host,
                 port,
                 process_request=self._answer,
-                create_connection=callers(),
+                create_connection=caller,
                 backlog=_BACKLOG,
                 open_timeout=_IDLE_S,
                 compression=None,
@@ -255,6 +256,7 @@ class PageServer(Sink):
             self._tell_state()
             if waits := [asyncio.ensure_future(page.empty.wait()) for page in self._pages]:
                 await asyncio.wait(waits, timeout=_LAST_WORDS_S)
+            caller.drop(0)  # else their requests are waited for
 
     def _send_pending(self) -> None:
         with self._lock:
