@@ -35,7 +35,12 @@ from tactslip_torch.deploy.value import BOOL, END, F64, I64, Graph, Value
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import LARGEST, AlarmSettings
-from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetClassifier, OnsetEvidence
+from tactslip_torch.onset.evidence import (
+    FEWEST_BLOCK_SAMPLES,
+    MEAN_HOPS,
+    OnsetClassifier,
+    OnsetEvidence,
+)
 from tactslip_torch.onset.rules import NOTHING_YET, Cusum, Rule, most_lost
 from tactslip_torch.signals.filtering import past_matrix
 
@@ -493,7 +498,12 @@ def onset_scores(
     lost, filled, of_hops, *kept = memory
     kept = [x.reshape(*shape) for x, shape in zip(kept, shapes, strict=True)]
     of_fast: Any = made[0].reshape(0, num_filters, len(fast))
-    alive = of_fast.sum(1).isfinite() & ((of_fast - evidence.silence).amax(1) > 0.0)
+    moves: Any = (of_fast - evidence.silence).amax(1) > 0.0
+    if hop >= FEWEST_BLOCK_SAMPLES:
+        own = frames.slice(context, END, 1)
+        moves = moves & ~(own - own.slice(0, 1, 1)).abs().amax(1).eq(0.0)
+    is_told = graph.constant(evidence.silence.isinf().all(0).numpy(), BOOL)
+    alive = of_fast.sum(1).isfinite() & (moves | is_told)
     is_known = alive.cast(F64).sum(1) >= float(evidence.min_alive or 1)  # [k]
     longest, num_floor = evidence.windows[-1], evidence.memory - evidence.windows[-1]
 

@@ -10,6 +10,8 @@
 
 namespace {
 
+constexpr int64_t FEWEST_SAMPLES = 4;  // of a hop that may be one value
+
 struct Hop {
   const Onset& own;
   const OnsetHops& run;
@@ -20,6 +22,15 @@ struct Hop {
   double sample(int64_t channel, int64_t place) const {
     int64_t at = channel * run.channel_stride + place;
     return run.is_float ? ((const float*)run.samples)[at] : ((const double*)run.samples)[at];
+  }
+
+  // Whether a fast channel's own samples of the hop are not all one value.
+  bool moves(int64_t start, int64_t f) const {
+    int64_t first = start + own.context;
+    bool is_one = own.hop >= FEWEST_SAMPLES;
+    for (int64_t i = first + 1; i < first + own.hop; ++i)
+      is_one &= sample(own.fast[f], i) == sample(own.fast[f], first);
+    return !is_one;
   }
 
   // OnsetEvidence.blocks: of the hop whose context begins at a sample.
@@ -46,7 +57,7 @@ struct Hop {
   }
 
   // Whether too few fast channels of a block are alive.
-  bool is_lost(const double* row) {
+  bool is_lost(int64_t start, const double* row) {
     int64_t num_alive = 0;
     for (int64_t f = 0; f < own.num_fast; ++f) {
       double sum = 0.0, rise = -INFINITY;
@@ -54,7 +65,8 @@ struct Hop {
         sum += row[i];
         rise = row[i] - own.silence[i] > rise ? row[i] - own.silence[i] : rise;
       }
-      num_alive += run.listened[own.fast[f]] && isfinite(sum) && rise > 0.0;
+      bool alive = isfinite(sum) && (isinf(rise) || (rise > 0.0 && moves(start, f)));
+      num_alive += run.listened[own.fast[f]] && alive;
     }
     return num_alive < own.min_alive;
   }
@@ -179,7 +191,7 @@ extern "C" int ONSET_ENTRY(const Onset* own, OnsetHops* run) {
     double* row = run->rows + run->num_rows * of.width;
     of.block(k * own->hop, row);
     run->score[k] = NAN;
-    run->is_lost[k] = of.is_lost(row);
+    run->is_lost[k] = of.is_lost(k * own->hop, row);
     run->num_lost += run->is_lost[k];
     if (run->is_lost[k]) continue;
     if (run->num_lost > own->most_lost) {  // as at the beginning of a stream

@@ -56,6 +56,8 @@ MEAN_HOPS = 3
 """Over which the score is averaged: a knock is over sooner than a slip begins."""
 _NUMBERS: Mapping[str, Any] = {"hop_samples": int, "mains_hz": float, "comb_periods": int}
 _KNEES = ("fast_knee", "slow_knee")
+FEWEST_BLOCK_SAMPLES = 4
+"""Of a block that counts as still where all its samples are one value."""
 _LEAST_RISE = 1e-6  # of a floor over that of silence, in half the log power
 
 
@@ -65,10 +67,13 @@ class Blocks(NamedTuple):
     Attributes:
         power: of each fast channel and filter, mean square and knee, ``[F, B, m]``.
         mean: of each slow channel, ``[S, m]``.
+        moves: whether the block's own samples of a fast channel are not all one value,
+            ``[F, m]``, bool; of blocks of fewer than 4 samples always. Not kept.
     """
 
     power: Tensor
     mean: Tensor
+    moves: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,10 +135,17 @@ class OnsetEvidence:
 
     @cached_property
     def silence(self) -> Tensor:
-        """Half the log power of a silent channel, ``[B, F]``, float64."""
+        """Half the log power of a silent channel, ``[B, F]``, float64.
+
+        Minus infinity for a channel that was still in the usual block of training, such as one of
+        few counts: it is never silent.
+        """
         knee = np.array(self.fast_knee)
         least = np.array(self.least_rms or np.zeros((len(self.hand.fast), len(knee))))
-        return torch.from_numpy(np.log(np.hypot(knee, least)).T + _LEAST_RISE)
+        silence = np.log(np.hypot(knee, least)) + _LEAST_RISE
+        if self.least_rms:
+            silence[(least == 0).all(-1)] = -np.inf
+        return torch.from_numpy(silence.T.copy())
 
     @cached_property
     def context(self) -> int:
@@ -218,7 +230,9 @@ class OnsetEvidence:
         square = heard.unflatten(-1, (len(self.fast_knee), hop)).square().mean(-1)  # [F, k, B]
         power = square.mT + torch.from_numpy(np.square(self.fast_knee))[:, None]
         mean = x[list(self.hand.slow), context:].unfold(-1, hop, hop).mean(-1)
-        return Blocks(power, mean)
+        own = frames[..., context:]
+        moves = (own != own[..., :1]).any(-1) | (hop < FEWEST_BLOCK_SAMPLES)
+        return Blocks(power, mean, moves)
 
     def blocks_of_recording(self, samples: Tensor) -> Blocks:
         """Of a whole recording ``[C, T]``: those that have their context."""
@@ -240,7 +254,7 @@ class OnsetEvidence:
             - masked: ``[C]``, bool
             - output: ``[k, K]`` and ``[k]``, bool
         """
-        power, mean = blocks
+        power, mean, _ = blocks
         num, windows = power.shape[-1] - self.memory + 1, self.windows
         level = torch.stack([_moving_mean(power, n)[..., -num:] for n in windows], -1)
         logs = power[..., : -windows[-1]].log() * 0.5
@@ -471,7 +485,8 @@ class OnsetStream:
         logs = (made.power.log() * 0.5).transpose(1, 2)  # [F, k, B]
         fast = listened[list(evidence.hand.fast)]
         rises = (logs - evidence.silence.T[:, None]).amax(-1)
-        alive = logs.sum(-1).isfinite() & (rises > 0.0)  # [F, k]
+        assert made.moves is not None  # of blocks that were just made
+        alive = logs.sum(-1).isfinite() & ((rises > 0.0) & made.moves | rises.isinf())  # [F, k]
         is_lost = alive.numpy()[fast].sum(0) < (evidence.min_alive or 1)
         made_rows = torch.cat([logs.transpose(1, 2).flatten(0, 1), made.mean]).T.numpy()
         score, segments = np.full(len(made_rows), math.nan), list[tuple[bool, list[int]]]()

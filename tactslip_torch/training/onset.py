@@ -147,7 +147,8 @@ def _knees(
     if source.hand.slow:
         steps = blocks.mean.unfold(-1, len(evidence.step_matrix), 1) @ evidence.step_matrix
     slow = steps.abs().flatten(0, 1).nanmedian(0).values
-    usual = rms.nanmedian(-1).values.nan_to_num(0.0)
+    knee = torch.tensor(evidence.fast_knee).square()[:, None]
+    usual = (blocks.power - knee).clamp(min=0).sqrt().nanmedian(-1).values.nan_to_num(0.0)
     return _FAST_KNEE * fast.numpy(), _SLOW_KNEE * slow.numpy(), usual.numpy()
 
 
