@@ -41,6 +41,16 @@ def root(tmp_path):
 # check ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("rate", "said"), [(100.0, "are 5 samples at 100 Hz"), (200.0, "")])
+def test_check_says_where_a_bin_has_few_samples(tmp_path, capsys, rate, said):
+    table(tmp_path / "a.csv", samples(0), rate)
+    manifest(tmp_path, "a.csv,wood,0,,,slip")
+    assert run("check", tmp_path) == 0
+    out = capsys.readouterr().out
+    assert said in out
+    assert ("train with labels.bin_ms=80 or more" in out) == bool(said)
+
+
 def test_check_lists_every_problem_and_warning(tmp_path, capsys):
     expected = broken(tmp_path)
     flat = samples(0)

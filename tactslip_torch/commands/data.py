@@ -8,6 +8,7 @@ manifest to fill in. ``data=authors_raw`` does the first three for the authors' 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -34,6 +35,7 @@ from tactslip_torch.runtime import __version__, in_processes
 
 FIGURE = Path("outputs/data.png")
 _SHOWN = 5  # rows of a template
+_BIN_MS, _FEWEST = 50.0, 8  # the bin that train takes unless it is told, and samples it should have
 
 
 def check(config: DictConfig) -> int:
@@ -56,6 +58,12 @@ def check(config: DictConfig) -> int:
         print(line)
     if source.ids:
         print(f"channels: {', '.join(source.hand.names)}")
+        if (num := source.sample_rate_hz * _BIN_MS / 1000) < _FEWEST:
+            least_ms = math.ceil(1000 * _FEWEST / source.sample_rate_hz)
+            print(
+                f"bins: {_BIN_MS:g} ms are {num:g} samples at {source.sample_rate_hz:g} Hz, fewer "
+                f"than {_FEWEST}; train with labels.bin_ms={least_ms} or more"
+            )
     print(_headline(source, problems, warnings))
     return len(problems)
 
