@@ -1040,6 +1040,9 @@ def test_isolated_reading_gives_the_same_or_is_refused_in_a_line(tmp_path):
     with open_file(tmp_path / "a.h5", Reading(isolate=True)) as opened:
         assert_truth(opened.archived, recording(), hand_of("ab"))
         assert torch.equal(opened.samples.read(100, 200), recording().samples[:, 100:200])
+    (tmp_path / "c.csv").write_text("t,a,label\n0,1,1\n1,2,0\n")
+    with open_file(tmp_path / "c.csv", Reading(isolate=True)) as opened:
+        assert (opened.names, opened.left_out) == (("a",), ("label",))
     (tmp_path / "b.csv").write_text("t,a\n0,1\n1,two\n")
     assert "line 3" in refused(tmp_path / "b.csv", Reading(isolate=True))
     path = tmp_path / "a.mat"

@@ -339,8 +339,8 @@ def _isolated(path: Path, how: Reading, stack: ExitStack) -> Opened:
         return opened_from(found["header"], path, kept["samples"])
     stamps, speed = (Samples(path, [kept[n]]) if n in kept else None for n in ("times", "speed"))
     names = None if found["names"] is None else tuple(found["names"])
-    samples = Samples(path, kept["samples"])
-    return Opened(samples, None, names, stamps, "s", found["sample_rate_hz"], speed)
+    samples, rate = Samples(path, kept["samples"]), found["sample_rate_hz"]
+    return Opened(samples, None, names, stamps, "s", rate, speed, tuple(found["left_out"]))
 
 
 def _read_for_parent() -> None:
@@ -392,4 +392,5 @@ def _written(opened: Opened, folder: Path) -> dict[str, Any]:
     if archived is not None:
         header = header_of(archived.recording, archived.hand, archived.key)
         header["shape"] = [samples.num_channels, samples.num_samples]
-    return {"names": opened.names, "sample_rate_hz": opened.sample_rate_hz, "header": header}
+    plain = {name: getattr(opened, name) for name in ("names", "sample_rate_hz", "left_out")}
+    return plain | {"header": header}

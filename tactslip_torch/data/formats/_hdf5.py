@@ -154,11 +154,17 @@ def _why_not(dataset: Any) -> str | None:
 
 
 def _check_chunks(dataset: Any) -> None:
-    """Refuse samples of ours of which a chunk is not found: HDF5 gives zeros in its place."""
-    if dataset.chunks is not None:
-        for first in range(0, dataset.shape[1], dataset.chunks[1]):
-            if dataset.id.get_chunk_info_by_coord((0, first)).byte_offset is None:
-                raise ValueError(f"no samples from number {first} on")
+    """Look at all samples of ours once, packed: for a chunk that HDF5 does not find it gives zeros.
+
+    Raises:
+        ValueError: if one is not in the file, or is read without its check sum.
+    """
+    size = dataset.file.id.get_filesize()
+    for first in range(0, dataset.shape[1], dataset.chunks[1]) if dataset.chunks else ():
+        chunk = dataset.id.get_chunk_info_by_coord((0, first))
+        is_there = chunk.byte_offset is not None and chunk.byte_offset + chunk.size <= size
+        if not is_there or dataset.id.read_direct_chunk((0, first))[0]:
+            raise ValueError(f"no samples from number {first} on")
 
 
 def _attribute(thing: Any, name: str) -> tuple[str, ...]:
