@@ -1,6 +1,7 @@
 /* Checks the parts by themselves and, given a model, that pushes take no memory and that chunks
  * make no difference. Ends at the first that does not hold. */
 #include <locale.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -124,9 +125,12 @@ static void check_pushes(const char *path) {
         for (size_t k = 0; k < num[0]; k++) {
             const struct slip_decision *one = all + k, *other = all + (size_t)i * room + k;
             HOLDS(one->time_s == other->time_s && one->valid == other->valid);
-            HOLDS(one->score - other->score < 1e-3 && other->score - one->score < 1e-3);
+            HOLDS(one->in_range == other->in_range && isnan(one->score) == isnan(other->score));
+            HOLDS(isnan(one->score) || fabs(one->score - other->score) < 1e-3);
         }
     }
+    for (size_t c = 0; c < width; c++) HOLDS(slip_channel(slip, c) && *slip_channel(slip, c));
+    HOLDS(!slip_channel(slip, width));
     HOLDS(slip_push(slip, samples, 0, all) == 0);
     HOLDS(slip_push(slip, samples, LARGEST + 1, all) == -1 && strstr(slip_error(slip), "333"));
     slip_close(slip);
