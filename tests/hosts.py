@@ -23,9 +23,10 @@ from test_detector import random_detector
 
 from tactslip_torch import Scene, SlipDetector, simulate
 from tactslip_torch.deploy import export
+from tactslip_torch.features.sensing import Sensing
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import KEY, AlarmSettings, score_stream
-from tactslip_torch.onset.rules import Cusum
+from tactslip_torch.onset.rules import NOTHING_YET, Cusum
 from tactslip_torch.onset.streaming import StreamingDetector
 
 EXPORT = Path(__file__).parents[1] / "export"
@@ -53,11 +54,14 @@ def slipping_stream() -> np.ndarray:
 def alarming_detector(with_onset: bool = False) -> SlipDetector:
     """A detector nobody trained, of a seed and settings by which the stream raises some alarms.
 
+    Its levels are those of the stream.
     With an onset classifier some are raised by it, and some by bins.
     """
     detector = random_detector(seed=32)
     samples = torch.from_numpy(slipping_stream().T.copy()).double()
-    scores = score_stream(detector, samples, HOP).score
+    scores, *_, spans = score_stream(detector, samples, HOP)
+    known = detector.sensing
+    detector.sensing = Sensing.fit(spans, known.min_alive, known.stuck_samples)
     rise = 2.0 / float(scores.std())
     settings = AlarmSettings(
         HOP,
@@ -138,6 +142,23 @@ def installed(folder: Path) -> None:
         assert ran.returncode == 0, ran.stderr
 
 
+LOST = {
+    # rows and channels that are lost, and what they read instead
+    "one sample": ((slice(300, 301), slice(None)), np.nan),
+    "200 samples": ((slice(400, 600), slice(None)), np.nan),
+    "a dead channel": ((slice(None), -1), 0.0),
+    "all silent behind the onset": ((slice(2000, None), slice(None)), 0.0),
+    "all missing": ((slice(None), slice(None)), np.nan),
+}
+
+
+def without(samples: np.ndarray, lost: str) -> np.ndarray:
+    """Samples ``[T, C]`` as a hand sends them that has lost some."""
+    (place, value), broken = LOST[lost], samples.copy()
+    broken[place] = value
+    return broken
+
+
 # Running a host --------------------------------------------------------------------------------
 
 
@@ -181,16 +202,22 @@ def truth(
     elif threshold is not None:
         settings = replace(settings, threshold=threshold)
     decisions = StreamingDetector(detector, settings, dtype=torch.float64).push(samples)
-    columns = [getattr(decisions, field).tolist() for field in STREAM_OUTPUTS.values()]
-    rows = [dict(zip(STREAM_OUTPUTS, row, strict=True)) for row in zip(*columns, strict=True)]
-    if settings.onset:
-        kinds = {alarm.alarm_s: alarm.raised_by for alarm in decisions.alarms}
-        for row, score in zip(rows, decisions.onset_score.tolist(), strict=True):
-            row |= {"onset_score": score, "raised_by": kinds.get(row["time_s"])}
+    fields = STREAM_OUTPUTS | {"in_range": "in_range", "onset_score": "onset_score"}
+    of_onset = ["onset_score"] if settings.onset else []
+    kinds = {alarm.alarm_s: alarm.raised_by for alarm in decisions.alarms}
+    rows = []
+    for i, lost in enumerate(map(decisions.names_lost, range(len(decisions.number)))):
+        row = {name: getattr(decisions, field)[i].item() for name, field in fields.items()}
+        row["channels_lost"] = list(lost)
+        if row["onset_score"] == NOTHING_YET:
+            row["onset_score"] = None
+        row = {name: row[name] for name in (*ALARM_KEYS, "statistic", "alarm", "on", *of_onset)}
+        row |= {name: None for name, value in row.items() if value != value}  # NaN
+        rows.append(row | ({"raised_by": kinds.get(row["time_s"])} if settings.onset else {}))
     return rows
 
 
-ALARM_KEYS = ("time_s", "onset_s", "score", "probability", "valid")
+ALARM_KEYS = ("time_s", "onset_s", "score", "probability", "valid", "in_range", "channels_lost")
 
 
 def assert_same(ran: Ran, expected: list[dict[str, Any]], *, exact: bool = False) -> None:
@@ -200,16 +227,19 @@ def assert_same(ran: Ran, expected: list[dict[str, Any]], *, exact: bool = False
     deviation (float32), or 1e-9 (``exact``: a model in float64).
     """
     close = 1e-9 if exact else 1e-3
-    spread = np.std([row["score"] for row in expected])
+    scores = [row["score"] for row in expected if row["score"] is not None]
+    spread = np.std(scores) if scores else 0.0
     near = {"score": close * spread, "probability": close, "statistic": close * 8.0}
     assert ran.status == 0, ran.stderr
     assert len(ran.lines) == len(expected)
-    assert all(line.keys() == expected[0].keys() for line in ran.lines)
+    assert all(list(line) == list(expected[0]) for line in ran.lines)
     for name in expected[0]:
         found, wanted = ([row[name] for row in rows] for rows in (ran.lines, expected))
-        if name in near:  # before the first bin the statistic is -1e30
+        if name in near:
+            found, wanted = (np.array(each, float) for each in (found, wanted))  # null is NaN
             np.testing.assert_allclose(found, wanted, rtol=1e-7, atol=near[name], err_msg=name)
         elif name in ("time_s", "onset_s", "onset_score"):
+            found, wanted = (np.array(each, float) for each in (found, wanted))
             np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9, err_msg=name)
         else:
             assert found == wanted, name

@@ -27,6 +27,7 @@ from hosts import (
     slipping_stream,
     truncated,
     truth,
+    without,
 )
 from PIL import Image
 from test_host_web import WEB, recordings_in
@@ -172,10 +173,12 @@ def ran(lines: list[str]) -> Ran:
     return Ran(decisions, summary, "", 0)
 
 
-def broken_stream() -> np.ndarray:
-    broken = slipping_stream()[:2000].copy()
-    broken[700:740] = np.nan
-    return broken
+def broken_streams() -> dict[str, np.ndarray]:
+    """With lost samples and, at the end, another level; with a dead channel; without all."""
+    faint = without(slipping_stream()[:2000], "200 samples")
+    faint[1200:] *= 0.2
+    dead = without(slipping_stream()[:2000], "a dead channel")
+    return {"faint": faint, "dead": dead, "missing": dead * np.nan}
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +197,7 @@ def seen(script, model, recording, tmp_path_factory):
     folder = tmp_path_factory.mktemp("dropped")
     (folder / "notes.npy").write_text("volts\n")
     seven = saved(folder / "seven.npy", slipping_stream()[:600, :7].copy())
-    broken = saved(folder / "broken.npy", broken_stream())
+    broken = [saved(folder / f"{name}.npy", x) for name, x in broken_streams().items()]
     good = recordings_in(folder)
     cut = folder / "cut.npz"
     cut.write_bytes(good["npz"].read_bytes()[:50_000])
@@ -210,7 +213,7 @@ def seen(script, model, recording, tmp_path_factory):
         change(changed[-1])
     files = ["--simulated", "--model", model, "--recording", recording]
     dropped = [
-        f"--drop={path}" for path in (folder / "notes.npy", seven, cut, *good.values(), broken)
+        f"--drop={path}" for path in (folder / "notes.npy", seven, cut, *good.values(), *broken)
     ]
     done = script("check.mjs", *files, *dropped, *[f"--altered={path}" for path in changed])
     assert done.returncode == 0, done.stderr
@@ -288,14 +291,22 @@ def test_a_file_that_is_no_recording_is_one_line_and_the_page_goes_on(seen):
         assert told["lines"] == seen["lines"]
 
 
-def test_missing_samples_are_flagged_and_the_page_goes_on(seen):
-    told = seen["broken.npy"]
-    expected = truth(broken_stream())
-    assert [line["valid"] for line in ran(told["lines"]).lines] == [
-        row["valid"] for row in expected
-    ]
-    assert told["invalid"] == sum(not row["valid"] for row in expected) > 0
+@pytest.mark.parametrize("name", broken_streams())
+def test_lost_channels_are_named_and_the_page_goes_on(seen, name):
+    told, expected = seen[f"{name}.npy"], truth(broken_streams()[name])
+    assert_same(ran(told["lines"]), expected)
+    assert told["invalid"] == sum(not row["valid"] for row in expected)
+    assert (told["invalid"] > 0) == (name != "dead")
     assert told["said"] == ""
+    *_, last = expected
+    assert bool(last["channels_lost"]) == (name != "faint")
+    assert all(channel in told["channels"] for channel in last["channels_lost"])
+    assert ("levels far" in told["channels"]) == (name == "faint")
+    assert (
+        ("too few" in told["channels"])
+        == (told["probability"] == "\N{EN DASH}")
+        == (name == "missing")
+    )
 
 
 @pytest.mark.parametrize("ending", ["npz", "csv"])
@@ -361,6 +372,9 @@ def test_a_live_stream_is_drawn_whole_and_as_the_package_decides(script, tmp_pat
     for name, column in expected.items():
         drawn = [decision[name] for decision in held]
         wanted = column[skipped : skipped + len(held)]
+        if name == "channels_lost":
+            assert drawn == wanted
+            continue
         np.testing.assert_allclose(drawn, wanted, rtol=1e-5, atol=1e-6, err_msg=name)
 
 

@@ -1,6 +1,7 @@
 /* Checks the parts by themselves and, given a model, that pushes take no memory and that chunks
  * make no difference. Ends at the first that does not hold. */
 #include <locale.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -53,7 +54,7 @@ static void check_sidecar(void) {
                        "\n \"b\": -2.5e1,\n \"t\": \"whole\",\n \"c\": null\n}\n";
     double value;
     size_t count;
-    char text[8], said[64];
+    char text[8], said[64], **texts;
     HOLDS(sidecar_number(json, "b", &value) && value == -25.0);
     HOLDS(!sidecar_number("{\"b\": 2,5}", "b", &value) || value == 2.0); /* a comma ends a number */
     sidecar_said(json, "pairs", said, sizeof said);
@@ -61,9 +62,15 @@ static void check_sidecar(void) {
     sidecar_said(json, "p", said, sizeof said);
     HOLDS(!strcmp(said, "nothing"));
     HOLDS(sidecar_text(json, "t", text, sizeof text) && !strcmp(text, "whole"));
-    HOLDS(sidecar_entries(json, "list", &count) && count == 2);
-    HOLDS(sidecar_entries(json, "pairs", &count) && count == 3);
-    HOLDS(sidecar_entries(json, "none", &count) && count == 0);
+    HOLDS((texts = sidecar_texts(json, "list", &count)) && count == 2);
+    HOLDS(!strcmp(texts[0], "p") && !strcmp(texts[1], "q, ]"));
+    free(texts);
+    HOLDS(!sidecar_texts(json, "pairs", &count) && !sidecar_texts(json, "none", &count));
+    HOLDS((texts = sidecar_texts("{\"l\": [\"\\u00b5\\\"\\\\\", \"\\ud83d\\ude00\"]}", "l", &count)));
+    HOLDS(!strcmp(texts[0], "\xc2\xb5\"\\") && !strcmp(texts[1], "\xf0\x9f\x98\x80"));
+    free(texts);
+    HOLDS(!sidecar_texts("{\"l\": [\"\\x\"]}", "l", &count));
+    HOLDS(!sidecar_texts("{\"l\": [\"\\u0000\"]}", "l", &count));
     HOLDS(!sidecar_number(json, "c", &value) && !sidecar_number(json, "t", &value));
     HOLDS(!sidecar_number(json, "p", &value) && !sidecar_text(json, "b", text, sizeof text));
     HOLDS(!sidecar_text(json, "quote", text, sizeof text)); /* escapes are not read */
@@ -73,7 +80,9 @@ static void check_sidecar(void) {
         memcpy(cut, json, length);
         HOLDS(!sidecar_text(cut, "t", text, sizeof text) || !strcmp(text, "whole"));
         HOLDS(!sidecar_number(cut, "b", &value) || value == -25.0);
-        HOLDS(!sidecar_entries(cut, "pairs", &count) || count == 3);
+        texts = sidecar_texts(cut, "list", &count);
+        HOLDS(!texts || count == 2);
+        free(texts);
     }
 }
 
@@ -116,9 +125,12 @@ static void check_pushes(const char *path) {
         for (size_t k = 0; k < num[0]; k++) {
             const struct slip_decision *one = all + k, *other = all + (size_t)i * room + k;
             HOLDS(one->time_s == other->time_s && one->valid == other->valid);
-            HOLDS(one->score - other->score < 1e-3 && other->score - one->score < 1e-3);
+            HOLDS(one->in_range == other->in_range && isnan(one->score) == isnan(other->score));
+            HOLDS(isnan(one->score) || fabs(one->score - other->score) < 1e-3);
         }
     }
+    for (size_t c = 0; c < width; c++) HOLDS(slip_channel(slip, c) && *slip_channel(slip, c));
+    HOLDS(!slip_channel(slip, width));
     HOLDS(slip_push(slip, samples, 0, all) == 0);
     HOLDS(slip_push(slip, samples, LARGEST + 1, all) == -1 && strstr(slip_error(slip), "333"));
     slip_close(slip);

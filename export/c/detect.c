@@ -94,9 +94,9 @@ static int read_options(int count, char **words, struct options *options) {
 
 /* As few digits as read back to the same number, which is a float where is_single. */
 static void print_number(const char *before, const char *name, double value, bool is_single) {
-    char text[32];
+    char text[32] = "null"; /* JSON has no NaN */
     int most = is_single ? 9 : 17;
-    for (int digits = most - 3; digits <= most; digits++) {
+    for (int digits = most - 3; isfinite(value) && digits <= most; digits++) {
         snprintf(text, sizeof text, "%.*g", digits, value);
         if (is_single ? strtof(text, NULL) == (float)value : strtod(text, NULL) == value) break;
     }
@@ -107,14 +107,39 @@ static void print_flag(const char *before, const char *name, bool flag) {
     printf("%s\"%s\": %s", before, name, flag ? "true" : "false");
 }
 
-static void print_decision(const struct slip_decision *decision, const struct slip_facts *facts,
+static void print_text(const char *before, const char *text) {
+    printf("%s\"", before);
+    for (; *text; text++) {
+        if ((unsigned char)*text < ' ')
+            printf("\\u%04x", (unsigned)*text);
+        else
+            printf(*text == '"' || *text == '\\' ? "\\%c" : "%c", *text);
+    }
+    putchar('"');
+}
+
+static void print_lost(const struct slip *slip, const bool *lost) {
+    const char *before = "";
+    printf(", \"channels_lost\": [");
+    for (size_t i = 0; i < slip_facts(slip)->num_channels; i++) {
+        if (!lost[i]) continue;
+        print_text(before, slip_channel(slip, i));
+        before = ", ";
+    }
+    putchar(']');
+}
+
+static void print_decision(const struct slip_decision *decision, const struct slip *slip,
                            bool is_whole) {
+    const struct slip_facts *facts = slip_facts(slip);
     bool is_single = !facts->is_double;
     print_number("{", "time_s", decision->time_s, false);
     print_number(", ", "onset_s", decision->onset_s, false);
     print_number(", ", "score", decision->score, is_single);
     print_number(", ", "probability", decision->probability, is_single);
     print_flag(", ", "valid", decision->valid);
+    print_flag(", ", "in_range", decision->in_range);
+    print_lost(slip, decision->channels_lost);
     if (is_whole) {
         print_number(", ", "statistic", decision->statistic, is_single);
         print_flag(", ", "alarm", decision->alarm);
@@ -129,14 +154,14 @@ static void print_decision(const struct slip_decision *decision, const struct sl
 }
 
 static void take(const struct slip_decision *decision, const struct options *options,
-                 const struct slip_facts *facts, struct tally *tally) {
+                 const struct slip *slip, struct tally *tally) {
     tally->decisions++;
     tally->alarms += decision->alarm;
-    bool is_known = decision->time_s >= facts->first_bin_s; /* what a bin says */
+    bool is_known = decision->time_s >= slip_facts(slip)->first_bin_s; /* what a bin says */
     if (is_known && !decision->valid && !tally->not_valid++)
         tally->first_not_valid_s = decision->time_s;
     if (options->all_decisions || decision->alarm)
-        print_decision(decision, facts, options->all_decisions);
+        print_decision(decision, slip, options->all_decisions);
 }
 
 static int watch(struct slip *slip, struct npy *recording, const struct options *options) {
@@ -158,7 +183,7 @@ static int watch(struct slip *slip, struct npy *recording, const struct options 
         int num = recording->is_double ? slip_push_double(slip, samples, n, decisions)
                                        : slip_push(slip, samples, n, decisions);
         if (num < 0) status = refuse(WRONG, "%s: %s", options->model, slip_error(slip));
-        for (int i = 0; i < num; i++) take(decisions + i, options, facts, &tally);
+        for (int i = 0; i < num; i++) take(decisions + i, options, slip, &tally);
     }
     free(samples);
     free(decisions);
@@ -170,8 +195,8 @@ static int watch(struct slip *slip, struct npy *recording, const struct options 
     if (ferror(stdout)) return refuse(WRONG, "the output cannot be written; is the disk full?");
     if (tally.not_valid)
         fprintf(stderr,
-                "warning: %zu of %zu decisions are not valid, the first at %.3f s: a channel in "
-                "use is dead or broken\n",
+                "warning: %zu of %zu decisions are not valid, the first at %.3f s: too few "
+                "channels are alive\n",
                 tally.not_valid, tally.decisions, tally.first_not_valid_s);
     return 0;
 }

@@ -8,7 +8,7 @@
 #include "sha256.h"
 #include "sidecar.h"
 
-#define FORMAT "tactslip_torch onnx 1"
+#define FORMAT "tactslip_torch onnx 2"
 enum { LONGEST_PATH = 4096, LARGEST_COUNT = 1 << 24 };
 
 static bool fail(char *error, size_t size, const char *format, ...) {
@@ -58,8 +58,8 @@ static const char *wrong_fact(struct model *model, const char *json, const char 
     model->is_double = !strcmp(text, "float64");
     if (!model->is_double && strcmp(text, "float32")) return "precision";
     *wanted = "a list of names";
-    if (!sidecar_entries(json, "channels", &model->num_channels) || !model->num_channels)
-        return "channels";
+    model->channels = sidecar_texts(json, "channels", &model->num_channels);
+    if (!model->channels) return "channels";
     *wanted = "a positive number";
     if (!sidecar_number(json, "sample_rate_hz", &model->sample_rate_hz) ||
         !(model->sample_rate_hz > 0))
@@ -124,5 +124,6 @@ bool model_read(struct model *model, const char *path, char *error, size_t size)
 
 void model_free(struct model *model) {
     free(model->bytes);
-    model->bytes = NULL;
+    free(model->channels);
+    *model = (struct model){0};
 }

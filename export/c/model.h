@@ -10,6 +10,7 @@ struct model {
     size_t size;
     size_t num_channels, hop_samples, first_samples, frame_samples, tail_samples, state_size;
     size_t onset_hop_samples; /* 0: no onset classifier */
+    char **channels; /* names, [num_channels] */
     double sample_rate_hz;
     bool is_double;
 };

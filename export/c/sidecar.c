@@ -92,11 +92,69 @@ void sidecar_said(const char *json, const char *key, char *text, size_t size) {
     if (!length && size > strlen("nothing")) strcpy(text, "nothing");
 }
 
-bool sidecar_entries(const char *json, const char *key, size_t *count) {
-    const char *at = value_of(json, key);
-    if (!at || *at != '[') return false;
-    bool is_empty = *past_space(at + 1) == ']';
-    if (!past_value(at, count)) return false;
-    *count = is_empty ? 0 : *count + 1;
-    return true;
+/* The number of four hexadecimal digits, or -1. */
+static long hex_digits(const char *at) {
+    long value = 0;
+    for (int i = 0; i < 4; i++) {
+        const char *digits = "0123456789abcdef", *found;
+        char letter = at[i] >= 'A' && at[i] <= 'F' ? (char)(at[i] + 'a' - 'A') : at[i];
+        if (!letter || !(found = strchr(digits, letter))) return -1;
+        value = 16 * value + (found - digits);
+    }
+    return value;
+}
+
+/* Writes a code point in UTF-8, and gives the place behind it. */
+static char *put_code(char *out, long code) {
+    static const int heads[] = {0, 0, 0xc0, 0xe0, 0xf0};
+    int size = code < 0x80 ? 1 : code < 0x800 ? 2 : code < 0x10000 ? 3 : 4;
+    for (int i = size - 1; i > 0; i--, code >>= 6) out[i] = (char)(0x80 | (code & 0x3f));
+    *out = (char)(heads[size] | code);
+    return out + size;
+}
+
+/* Reads a text, of which end lies behind the closing quote, without its escapes; gives the place
+ * behind the zero that ends it, or NULL for an escape that is none, or a zero within. */
+static char *put_text(char *out, const char *at, const char *end) {
+    static const char letters[] = "\"\\/bfnrt", values[] = "\"\\/\b\f\n\r\t";
+    for (at++; at < end - 1; at++) {
+        const char *found;
+        if (*at != '\\') {
+            *out++ = *at;
+        } else if (*++at != 'u') {
+            if (!(found = strchr(letters, *at))) return NULL;
+            *out++ = values[found - letters];
+        } else {
+            long code = hex_digits(at + 1), low;
+            if (code <= 0) return NULL;
+            at += 4;
+            bool is_high = code >= 0xd800 && code < 0xdc00 && at[1] == '\\' && at[2] == 'u';
+            if (is_high && (low = hex_digits(at + 3)) >= 0xdc00 && low < 0xe000) {
+                code = 0x10000 + ((code - 0xd800) << 10) + (low - 0xdc00);
+                at += 6;
+            }
+            out = put_code(out, code);
+        }
+    }
+    *out = '\0';
+    return out + 1;
+}
+
+char **sidecar_texts(const char *json, const char *key, size_t *count) {
+    const char *at = value_of(json, key), *end;
+    size_t commas;
+    if (!at || *at != '[' || !(end = past_value(at, &commas))) return NULL;
+    *count = commas + 1; /* what is read is never longer than what stands there */
+    char **texts = malloc(*count * sizeof *texts + (size_t)(end - at));
+    char *out = texts ? (char *)(texts + *count) : NULL;
+    for (size_t i = 0; out && i < *count; i++) {
+        const char *first = past_space(at + 1), *behind = *first == '"' ? past_text(first) : NULL;
+        texts[i] = out;
+        out = behind ? put_text(out, first, behind) : NULL;
+        at = out ? past_space(behind) : at;
+        if (*at != (i + 1 < *count ? ',' : ']')) out = NULL;
+    }
+    if (out) return texts;
+    free(texts);
+    return NULL;
 }

@@ -3,6 +3,7 @@
  * in, one for each number of decisions out. */
 #include "slip.h"
 
+#include <math.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -15,11 +16,12 @@ enum { SAMPLES, TAIL, STATE, THRESHOLD, NUM_INPUTS };
 static const char *const INPUTS[NUM_INPUTS] = {"samples", "tail", "state", "threshold"};
 
 enum { NEXT_TAIL, NEXT_STATE, FIRST_COLUMN };
-enum { SCORE, PROBABILITY, STATISTIC, TIME, ONSET, VALID, ALARM, ON, ONSET_SCORE, BY_ONSET };
-enum { NUM_BIN_COLUMNS = ONSET_SCORE, NUM_COLUMNS = BY_ONSET + 1 };
+enum { SCORE, PROBABILITY, STATISTIC, TIME, ONSET, VALID, IN_RANGE, ALARM, ON, LOST };
+enum { ONSET_SCORE = LOST + 1, BY_ONSET, NUM_COLUMNS, NUM_BIN_COLUMNS = ONSET_SCORE };
 static const char *const OUTPUTS[FIRST_COLUMN + NUM_COLUMNS] = {
-    "next_tail", "next_state", "score", "probability", "statistic",   "time_s",
-    "onset_s",   "valid",      "alarm", "on",          "onset_score", "by_onset"};
+    "next_tail", "next_state", "score", "probability", "statistic",     "time_s",      "onset_s",
+    "valid",     "in_range",   "alarm", "on",          "channels_lost", "onset_score", "by_onset"};
+static const double NO_EVIDENCE = -1e30; /* onset score of the graph */
 
 enum { NOTHING, ONE, OTHER, NUM_HELD }; /* what is remembered: nothing yet, or one of two copies */
 
@@ -79,6 +81,11 @@ static int column_type(const struct slip *slip, int column) {
     return column >= TIME ? ORT_DOUBLE : slip->type;
 }
 
+/* Flags of channels are [decisions, channels], the other columns [decisions]. */
+static size_t column_width(const struct slip *slip, int column) {
+    return column == LOST ? slip->facts.num_channels : 0;
+}
+
 /* A value [rows, columns], or [rows] where columns is 0. */
 static bool make_value(struct slip *slip, void *data, int type, size_t rows, size_t columns,
                        OrtValue **value) {
@@ -116,7 +123,8 @@ static bool take_memory(struct slip *slip) {
                    (slip->states[held] = calloc(model->state_size + 1, sizeof(double)));
     }
     for (int i = 0; i < NUM_COLUMNS; i++) {
-        size_t size = size_of(column_type(slip, i));
+        size_t width = column_width(slip, i);
+        size_t size = size_of(column_type(slip, i)) * (width ? width : 1);
         is_there = is_there && (slip->columns[i] = calloc(num_decisions + 1, size)) &&
                    (slip->columns_of[i] = calloc(num_decisions + 1, sizeof(OrtValue *)));
     }
@@ -133,8 +141,8 @@ static bool make_values(struct slip *slip) {
         is_made = make_value(slip, slip->samples, slip->type, n, width, slip->samples_of + n);
     for (int i = 0; i < NUM_COLUMNS; i++)
         for (size_t k = 0; k <= slip->facts.max_decisions && is_made; k++)
-            is_made = make_value(slip, slip->columns[i], column_type(slip, i), k, 0,
-                                 slip->columns_of[i] + k);
+            is_made = make_value(slip, slip->columns[i], column_type(slip, i), k,
+                                 column_width(slip, i), slip->columns_of[i] + k);
     for (int held = 0; held < NUM_HELD && is_made; held++) {
         size_t rows = held ? model->tail_samples : 0, size = held ? model->state_size : 0;
         is_made = make_value(slip, slip->tails[held], slip->type, rows, width,
@@ -168,7 +176,8 @@ struct slip *slip_open(const char *model, size_t max_samples, char error[SLIP_ER
             .first_bin_s = (double)first_bin(&slip->model) / slip->model.sample_rate_hz,
         };
         is_open = open_session(slip) && take_memory(slip) && make_values(slip);
-        model_free(&slip->model); /* the session has what it needs of the bytes */
+        free(slip->model.bytes); /* the session has what it needs of them */
+        slip->model.bytes = NULL;
     }
     if (is_open) return slip;
     memcpy(error, slip->error, SLIP_ERROR);
@@ -177,6 +186,10 @@ struct slip *slip_open(const char *model, size_t max_samples, char error[SLIP_ER
 }
 
 const struct slip_facts *slip_facts(const struct slip *slip) { return &slip->facts; }
+
+const char *slip_channel(const struct slip *slip, size_t index) {
+    return index < slip->facts.num_channels ? slip->model.channels[index] : NULL;
+}
 
 const char *slip_error(const struct slip *slip) { return slip->error; }
 
@@ -196,8 +209,13 @@ static double number(const struct slip *slip, int column, size_t i) {
                      : ((double *)slip->columns[column])[i];
 }
 
-static bool flag(const struct slip *slip, int column, size_t i) {
-    return ((bool *)slip->columns[column])[i];
+static const bool *flags(const struct slip *slip, int column, size_t i) {
+    return (const bool *)slip->columns[column] + i;
+}
+
+static double onset_score(const struct slip *slip, size_t i) {
+    double score = slip->facts.has_onset ? number(slip, ONSET_SCORE, i) : NAN;
+    return score > NO_EVIDENCE ? score : NAN;
 }
 
 /* Runs the graph on the n samples in slip->samples. */
@@ -223,11 +241,13 @@ static int run(struct slip *slip, size_t n, struct slip_decision *out) {
             .score = number(slip, SCORE, i),
             .probability = number(slip, PROBABILITY, i),
             .statistic = number(slip, STATISTIC, i),
-            .valid = flag(slip, VALID, i),
-            .alarm = flag(slip, ALARM, i),
-            .on = flag(slip, ON, i),
-            .onset_score = number(slip, ONSET_SCORE, i),
-            .by_onset = flag(slip, BY_ONSET, i),
+            .valid = *flags(slip, VALID, i),
+            .in_range = *flags(slip, IN_RANGE, i),
+            .channels_lost = flags(slip, LOST, i * slip->facts.num_channels),
+            .alarm = *flags(slip, ALARM, i),
+            .on = *flags(slip, ON, i),
+            .onset_score = onset_score(slip, i),
+            .by_onset = *flags(slip, BY_ONSET, i),
         };
     }
     return (int)k;

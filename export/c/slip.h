@@ -25,13 +25,15 @@ struct slip_facts {
 struct slip_decision {
     double time_s;  /* when it could be made, from the first sample */
     double onset_s; /* when the slip that it speaks of began */
-    double score;   /* of the bin: at least 0 is slip */
-    double probability;
-    double statistic; /* of the sequential rule */
-    bool valid;       /* false: a channel in use is dead or broken */
-    bool alarm;       /* raised by this decision */
-    bool on;          /* stands after it */
-    double onset_score; /* of fast evidence, -1e30 for none; 0 without an onset classifier */
+    double score;   /* of the bin: at least 0 is slip; NaN: too few channels are alive */
+    double probability; /* NaN likewise */
+    double statistic;   /* of the sequential rule; NaN likewise */
+    bool valid;         /* the decision counts; one that does not raises no alarm */
+    bool in_range;      /* the channels move about as much as in training */
+    const bool *channels_lost; /* silent or missing, [num_channels]; until the next push */
+    bool alarm;                /* raised by this decision */
+    bool on;                   /* stands after it */
+    double onset_score; /* of fast evidence; NaN: none, or no onset classifier */
     bool by_onset;      /* it reaches its threshold: then it raised the alarm, else the statistic */
 };
 
@@ -40,6 +42,9 @@ struct slip_decision {
 struct slip *slip_open(const char *model, size_t max_samples, char error[SLIP_ERROR]);
 
 const struct slip_facts *slip_facts(const struct slip *slip);
+
+/* The name of a channel, UTF-8; NULL behind the last. */
+const char *slip_channel(const struct slip *slip, size_t index);
 
 /* Takes the next n instants of volts [n, num_channels], NaN where a sample is missing.
  * Returns how many decisions they made possible, which stand in out[max_decisions]; or -1 if n is

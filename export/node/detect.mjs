@@ -81,7 +81,7 @@ async function detect({ model, recording, rate, chunk, threshold, decisions: isW
   if (count.invalid) {
     process.stderr.write(
       `warning: ${count.invalid} of ${count.decisions} decisions are not valid, the first at ` +
-        `${firstInvalid.toFixed(3)} s: a channel in use is dead or broken\n`,
+        `${firstInvalid.toFixed(3)} s: too few channels are alive\n`,
     );
   }
 }

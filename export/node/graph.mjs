@@ -1,6 +1,7 @@
 // The stream graph of an exported detector: samples in, decisions out, in Node and in browsers.
 
-const FORMAT = "tactslip_torch onnx 1";
+const FORMAT = "tactslip_torch onnx 2";
+const NO_EVIDENCE = -1e30; // onset score of the graph
 const MOST_ROWS = 2000; // in one run; memory grows with its decisions
 const SESSION = { intraOpNumThreads: 1, interOpNumThreads: 1, logSeverityLevel: 3 }; // errors only
 const COUNTS = ["first_samples", "frame_samples", "tail_samples", "state_size"];
@@ -24,7 +25,7 @@ export async function checkedFacts(model, sidecar, name) {
   const { onset_hop_samples: fast } = facts; // of a model with an onset classifier
   const wrong = [
     ["graph", facts.graph === "stream", "bin or stream"],
-    ["channels", Array.isArray(channels) && channels.length > 0, "a list of names"],
+    ["channels", isNames(channels), "a list of names"],
     ["sample_rate_hz", Number.isFinite(rate) && rate > 0, "a positive number"],
     ["hop_samples", isCount(hop) && hop > 0, "a positive whole number"],
     ["onset_hop_samples", fast === undefined || (isCount(fast) && fast > 0), "a positive whole number"],
@@ -49,6 +50,11 @@ export async function checkedFacts(model, sidecar, name) {
     );
   }
   return facts;
+}
+
+function isNames(value) {
+  const isText = (name) => typeof name === "string";
+  return Array.isArray(value) && value.length > 0 && value.every(isText);
 }
 
 function isCount(value) {
@@ -113,8 +119,11 @@ export class StreamGraph {
    *   an instant, NaN a sample that is missing. Not to be changed before the promise is kept
    * @returns {Promise<object[]>} `time_s` (when it could be made, from the first sample), `onset_s`
    *   (when the slip it speaks of began), `score` (at least 0 is slip), `probability`, `statistic`
-   *   of the alarm, `valid` (every channel in use was whole), `alarm`, `on` (an alarm stands); with
-   *   an onset classifier `onset_score` and `raised_by`, "onset" or "status", null without alarm
+   *   of the alarm, `valid` (enough channels are alive; else these three are NaN, and there is no
+   *   alarm), `in_range` (the living ones move about as much as in training), `channels_lost` (names
+   *   of those that are silent or missing), `alarm`, `on` (an alarm stands); with an onset
+   *   classifier `onset_score`, NaN without evidence, and `raised_by`, "onset" or "status", null
+   *   without alarm
    * @throws {Error} if samples are no volts or no whole rows; nothing is changed then
    */
   push(samples) {
@@ -180,6 +189,8 @@ export class StreamGraph {
       score,
       probability: made.probability.data[i],
       valid: made.valid.data[i] !== 0,
+      in_range: made.in_range.data[i] !== 0,
+      channels_lost: channels.filter((_, c) => made.channels_lost.data[i * channels.length + c]),
       statistic: made.statistic.data[i],
       alarm: made.alarm.data[i] !== 0,
       on: made.on.data[i] !== 0,
@@ -190,5 +201,9 @@ export class StreamGraph {
 
 function onsetPart(made, i) {
   const by = made.by_onset.data[i] ? "onset" : "status";
-  return { onset_score: made.onset_score.data[i], raised_by: made.alarm.data[i] ? by : null };
+  const score = made.onset_score.data[i];
+  return {
+    onset_score: score > NO_EVIDENCE ? score : NaN,
+    raised_by: made.alarm.data[i] ? by : null,
+  };
 }

@@ -3,7 +3,7 @@
 const DIGITS = { float32: 9, float64: 17 }; // read back as the same number
 
 /**
- * One decision, without newline.
+ * One decision, without newline; what is NaN becomes null.
  *
  * @param {object} decision as `StreamGraph.push` gives it
  * @param {string} precision of the model
@@ -11,13 +11,16 @@ const DIGITS = { float32: 9, float64: 17 }; // read back as the same number
  */
 export function decisionLine(decision, precision, isWhole) {
   const shown = (value) => Number(value.toPrecision(DIGITS[precision]));
-  const { time_s, onset_s, score, probability, valid, statistic, alarm, on } = decision;
+  const { time_s, onset_s, score, probability, statistic, alarm, on } = decision;
+  const { valid, in_range, channels_lost } = decision;
   const line = {
     time_s,
     onset_s,
     score: shown(score),
     probability: shown(probability),
     valid,
+    in_range,
+    channels_lost,
   };
   const { onset_score, raised_by } = decision; // undefined, and left out, without a classifier
   const whole = isWhole && { statistic: shown(statistic), alarm, on, onset_score };

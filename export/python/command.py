@@ -1,6 +1,8 @@
 """How a command ends: what is wrong is one line on stderr and status 1."""
 
 import contextlib
+import json
+import math
 import os
 import sys
 
@@ -15,6 +17,15 @@ def run(main, *arguments):
     except Exception as error:  # onnxruntime's errors share no other base
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         leave(1)
+
+
+def json_line(row):
+    """A dict as one line of JSON, which has no NaN: null."""
+    plain = {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in row.items()
+    }
+    return json.dumps(plain, allow_nan=False)
 
 
 def say(*line, end="\n", flush=False):

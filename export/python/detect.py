@@ -6,15 +6,14 @@
 an alarm, or with ``--decisions`` one a decision, and a summary.
 """
 
-import json
 import sys
 
 from arguments import Parser, chunk, number
-from command import run, say
+from command import json_line, run, say
 from files import load_recording
 from stream import Stream
 
-ALARM_KEYS = ("time_s", "onset_s", "score", "probability", "valid", "raised_by")
+OF_EVERY = ("statistic", "alarm", "on", "onset_score")  # not printed of alarms alone
 
 
 def main(options):
@@ -31,15 +30,15 @@ def main(options):
         known = [decision for decision in decisions if decision["time_s"] >= first_bin_s]
         not_valid_s += [decision["time_s"] for decision in known if not decision["valid"]]
         for decision in decisions if options.decisions else alarms:
-            wanted = decision if options.decisions else ALARM_KEYS
-            say(json.dumps({key: decision[key] for key in decision if key in wanted}))
+            left_out = () if options.decisions else OF_EVERY
+            say(json_line({key: decision[key] for key in decision if key not in left_out}))
     seconds = len(recording) / stream.facts["sample_rate_hz"]
     sums = {"decisions": num_decisions, "alarms": num_alarms, "seconds": seconds}
-    say(json.dumps(sums), flush=True)
+    say(json_line(sums), flush=True)
     if not_valid_s:
         print(
             f"warning: {len(not_valid_s)} of {num_decisions} decisions are not valid, the first at "
-            f"{not_valid_s[0]:.3f} s: a channel in use is dead or broken",
+            f"{not_valid_s[0]:.3f} s: too few channels are alive",
             file=sys.stderr,
         )
 

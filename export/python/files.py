@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
-FORMAT = "tactslip_torch onnx 1"
+FORMAT = "tactslip_torch onnx 2"
 USUAL = {"bin": "model.onnx", "stream": "stream.onnx"}  # which file holds which graph
 COUNTS = {
     "bin": ("bin_samples", "context_before_samples", "context_after_samples"),
@@ -57,6 +57,11 @@ def is_count(value, least):
     return type(value) is int and value >= least
 
 
+def is_names(value):
+    """A list of texts, not empty."""
+    return isinstance(value, list) and value and all(isinstance(name, str) for name in value)
+
+
 def check_facts(sidecar, facts):
     """Refuse a sidecar that lacks something a host needs, or has it wrong."""
     graph, names, rate = (facts.get(key) for key in ("graph", "channels", "sample_rate_hz"))
@@ -64,7 +69,7 @@ def check_facts(sidecar, facts):
         ("graph", graph in ("bin", "stream"), "bin or stream"),
         ("onnx_sha256", isinstance(facts.get("onnx_sha256"), str), "64 hexadecimal digits"),
         ("precision", facts.get("precision") in ("float32", "float64"), "float32 or float64"),
-        ("channels", isinstance(names, list) and len(names) > 0, "a list of names"),
+        ("channels", is_names(names), "a list of names"),
         (
             "sample_rate_hz",
             type(rate) in (int, float) and math.isfinite(rate) and rate > 0,

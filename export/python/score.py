@@ -3,22 +3,24 @@
     python score.py model.onnx recording.npy
 
 ``recording.npy`` holds volts ``[T, C]``. Prints a JSON line a bin: slip where its score is at least
-0, a guess where it is not valid, because a channel in use is dead or broken.
+0. A bin with too few living channels is not valid and has no score.
 """
 
-import json
+from itertools import compress
 
 import numpy as np
 from arguments import Parser
-from command import run, say
+from command import json_line, run, say
 from files import load_model, load_recording
 
+KEYS = ("score", "probability", "valid", "in_range", "channels_lost")
 BATCH = 256  # bins scored at a time
 
 
 def score_bins(session, facts, recording):
     """Start in seconds and what the graph says of every bin that has its context, as dicts."""
-    names = [output.name for output in session.get_outputs()]
+    given = {output.name for output in session.get_outputs()}
+    names = [key for key in KEYS if key in given]  # a detector need not be calibrated
     bin_samples, before = facts["bin_samples"], facts["context_before_samples"]
     window = before + bin_samples + facts["context_after_samples"]
     starts = np.arange(0, len(recording) - window + 1, bin_samples)
@@ -28,7 +30,8 @@ def score_bins(session, facts, recording):
         rows = zip(*(column.tolist() for column in columns), strict=True)
         for start, row in zip(some, rows, strict=True):
             start_s = float(start + before) / facts["sample_rate_hz"]
-            yield {"start_s": start_s, **dict(zip(names, row, strict=True))}
+            scored = {"start_s": start_s, **dict(zip(names, row, strict=True))}
+            yield scored | {"channels_lost": list(compress(facts["channels"], row[-1]))}
 
 
 def main(options):
@@ -36,7 +39,7 @@ def main(options):
     session, facts = load_model(options.model, "bin")
     recording = load_recording(options.recording, facts)
     for scored in score_bins(session, facts, recording):
-        say(json.dumps(scored))
+        say(json_line(scored))
 
 
 if __name__ == "__main__":

@@ -150,6 +150,8 @@ async function dropped(page, path) {
     simulated: await text(page, "simulated"),
     lines: await decisionLines(page),
     invalid: await count(page, "invalid"),
+    channels: await text(page, "channels"),
+    probability: await text(page, "probability"),
   };
 }
 

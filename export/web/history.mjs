@@ -58,7 +58,9 @@ export class History {
     const names = ["time_s", "onset_s", "score", "probability", "statistic"];
     if (this.hasOnset) names.push("onset_score");
     this.columns = Object.fromEntries(names.map((name) => [name, new Float64Array(capacity)]));
-    this.flags = new Uint8Array(capacity); // 1 valid, 2 alarm, 4 on, 8 raised by the onset score
+    this.flags = new Uint8Array(capacity); // 1 valid, 2 alarm, 4 on, 8 raised by onset, 16 in range
+    this.channels = facts.channels;
+    this.lost = new Uint8Array(capacity * facts.channels.length);
   }
 
   /** @param {object[]} decisions as `StreamGraph.push` gives them */
@@ -68,7 +70,10 @@ export class History {
       const place = i % this.capacity;
       for (const name in this.columns) this.columns[name][place] = decision[name] ?? NaN;
       this.flags[place] = decision.valid + 2 * decision.alarm + 4 * decision.on;
-      if (decision.raised_by === "onset") this.flags[place] += 8;
+      this.flags[place] += 8 * (decision.raised_by === "onset") + 16 * decision.in_range;
+      const names = decision.channels_lost;
+      const width = this.channels.length;
+      this.channels.forEach((name, c) => (this.lost[place * width + c] = names.includes(name)));
       if (this.isDoubtful(i)) this.numInvalid += 1;
       this.count += 1;
       this.first = Math.max(0, this.count - this.capacity);
@@ -96,9 +101,18 @@ export class History {
     return low - 1;
   }
 
-  /** Whether it speaks of a bin that is not valid. */
+  /** Whether it does not count, once there are bins to decide on. */
   isDoubtful(i) {
     return !this.#has(i, 1) && !(this.get("time_s", i) < this.firstBinS);
+  }
+
+  /** Whether the hand moves about as much as in training. */
+  isInRange(i) {
+    return this.#has(i, 16);
+  }
+
+  isLost(i, channel) {
+    return this.lost[(i % this.capacity) * this.channels.length + channel] !== 0;
   }
 
   isOn(i) {
@@ -108,6 +122,8 @@ export class History {
   /** A decision as `add` took it. */
   decision(i) {
     const decision = { valid: this.#has(i, 1), alarm: this.#has(i, 2), on: this.isOn(i) };
+    decision.in_range = this.isInRange(i);
+    decision.channels_lost = this.channels.filter((_, c) => this.isLost(i, c));
     for (const name in this.columns) decision[name] = this.get(name, i);
     if (!this.hasOnset) return decision;
     const by = this.#has(i, 8) ? "onset" : "status";

@@ -167,12 +167,16 @@ function report() {
   const { facts, history, position, recording, isPlaying, isLive } = source;
   const now = history.before(position / facts.sample_rate_hz);
   const isKnown = now >= history.first;
-  const status = !isKnown ? "waiting" : history.isOn(now) ? "slip" : "no slip";
+  const isDoubtful = isKnown && history.isDoubtful(now);
+  const rest = isDoubtful ? "not valid" : "no slip";
+  const status = !isKnown ? "waiting" : history.isOn(now) ? "slip" : rest;
   const box = element("status");
   if (box.dataset.status !== status) box.dataset.status = status;
-  box.classList.toggle("doubtful", isKnown && history.isDoubtful(now));
+  box.classList.toggle("doubtful", isDoubtful);
   write("status-word", status);
-  write("probability", isKnown ? history.get("probability", now).toFixed(2) : "–");
+  write("probability", isKnown ? digits(history.get("probability", now)) : "–");
+  write("channels", isKnown ? channelsText(now) : "–");
+  element("channels").classList.toggle("doubtful", isKnown && !history.isInRange(now));
   write("alarms", history.numAlarms.toLocaleString("en"));
   write("decisions", history.count.toLocaleString("en"));
   write("invalid", history.numInvalid.toLocaleString("en"));
@@ -190,6 +194,25 @@ function report() {
   else reportLatencies(source.latencies);
   listAlarms(history);
   return status;
+}
+
+/** What a decision says of its channels. */
+function channelsText(i) {
+  const { history, facts } = source;
+  const names = facts.channels.filter((_, channel) => history.isLost(i, channel));
+  const all = names.length === facts.channels.length ? "all channels" : names.join(", ");
+  const isFar = !history.isDoubtful(i) && !history.isInRange(i);
+  const parts = [
+    names.length ? `lost: ${all}` : "no channel lost",
+    history.isDoubtful(i) ? "too few channels are alive" : null,
+    isFar ? "levels far from training" : null,
+  ];
+  return parts.filter(Boolean).join("; ");
+}
+
+/** Two digits of a probability, or a dash where there is none. */
+function digits(probability) {
+  return Number.isFinite(probability) ? probability.toFixed(2) : "–";
 }
 
 function positionText() {
@@ -240,7 +263,7 @@ function listAlarms(history) {
   if (isAtTop) rows.scrollTop = 0;
 }
 
-function alarmRow({ time_s: alarmS, onset_s: onsetS, probability, valid, raised_by: by }, index) {
+function alarmRow({ time_s: alarmS, onset_s: onsetS, probability, raised_by: by }, index) {
   const row = document.createElement("tr");
   row.dataset.index = index;
   const button = document.createElement("button");
@@ -248,11 +271,9 @@ function alarmRow({ time_s: alarmS, onset_s: onsetS, probability, valid, raised_
   button.setAttribute("aria-label", `show the alarm at ${alarmS.toFixed(3)} s`);
   button.dataset.timeS = alarmS;
   row.insertCell().append(button);
-  for (const text of [`${onsetS.toFixed(3)} s`, probability.toFixed(2), ...(by ? [by] : [])]) {
+  for (const text of [`${onsetS.toFixed(3)} s`, digits(probability), ...(by ? [by] : [])]) {
     row.insertCell().textContent = text;
   }
-  if (!valid) row.title = "not valid: a channel in use is dead or broken";
-  row.classList.toggle("doubtful", !valid);
   return row;
 }
 

@@ -35,7 +35,7 @@ export class Scope {
   #end = 0; // ... to here are in the ring
   #history = null; // whose they are
   #samples = null;
-  #hatch = null; // fills what is not valid
+  #hatch = null; // fills what is lost or not valid
   #scaledAt = -Infinity;
   #drawn = ""; // what the picture shows
 
@@ -166,13 +166,20 @@ export class Scope {
       context.fillStyle = style;
       context.fillRect(x, panel.top * ratio, 1, panel.height * ratio);
     };
+    const traces = [status, probability, statistic];
     const lanes = { top: groups[0].top, height: bottom - groups[0].top };
     if (isOn) fill(colours.pale, lanes);
     if (isKnown) fill(isOn ? colours.slip : colours.rest, status);
-    if (isKnown && history.isDoubtful(now)) for (const p of [lanes, status]) fill(this.#hatch, p);
+    if (isKnown && history.isDoubtful(now)) for (const p of traces) fill(this.#hatch, p);
     for (const group of groups) {
-      context.fillStyle = group.kind === "SG" ? colours.gauge : isOn ? colours.slip : colours.rest;
-      for (const channel of group.members) this.#lane(context, x, channel, group.lane, from, to);
+      const colour = group.kind === "SG" ? colours.gauge : isOn ? colours.slip : colours.rest;
+      for (const channel of group.members) {
+        const top = this.panels.centre[channel] - group.lane / 2;
+        const lost = isKnown && history.isLost(now, channel);
+        if (lost) fill(this.#hatch, { top, height: group.lane });
+        context.fillStyle = colour;
+        this.#lane(context, x, channel, group.lane, from, to);
+      }
     }
     if (!isKnown) return;
     const before = Math.max(history.first, history.before(from / facts.sample_rate_hz));
@@ -201,14 +208,14 @@ export class Scope {
     this.#stroke(context, x, place(high), place(low), 1);
   }
 
-  /** From the value before a column to the one at its end. */
+  /** From the value before a column to the one at its end; nothing where there is none. */
   #trace(context, x, panel, [low, high], name, before, now) {
-    const place = (i) => {
-      const share = (this.source.history.get(name, i) - low) / (high - low);
+    const values = [before, now].map((i) => this.source.history.get(name, i));
+    const places = values.filter(Number.isFinite).map((value) => {
+      const share = (value - low) / (high - low);
       return panel.top + panel.height * (1 - Math.min(1, Math.max(0, share)));
-    };
-    const [a, b] = [place(before), place(now)];
-    this.#stroke(context, x, Math.min(a, b), Math.max(a, b), 1.5);
+    });
+    if (places.length) this.#stroke(context, x, Math.min(...places), Math.max(...places), 1.5);
   }
 
   #stroke(context, x, top, bottom, thickness) {
@@ -330,7 +337,7 @@ export class Scope {
   }
 }
 
-/** Diagonal lines, for what is not to be relied on. */
+/** Diagonal lines, for lost channels and decisions that are not valid. */
 function hatching(context, colour, ratio) {
   const size = Math.round(8 * ratio);
   const tile = new OffscreenCanvas(size, size);

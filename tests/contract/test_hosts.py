@@ -22,8 +22,6 @@ from .recordings import samples_of
 pytestmark = pytest.mark.onnx
 
 SAMPLES = samples_of("D", 1)[1500:5500]
-BROKEN = SAMPLES.copy()
-BROKEN[2500:2510, 1:3] = np.nan
 EVERY, CHUNK, THRESHOLD, RATE = (
     names.HOST_OPTIONS[word] for word in ("every", "chunk", "threshold", "rate")
 )
@@ -116,12 +114,36 @@ def test_a_host_decides_what_the_package_decides(
         assert expected != truth(SAMPLES, detector=selected.detector)
 
 
-def test_missing_samples_are_flagged_and_told_once(host, stream, selected, tmp_path):
-    ran = run_host(host, stream, saved(tmp_path / "recording.npy", BROKEN), EVERY)
-    hosts.assert_same(ran, truth(BROKEN, detector=selected.detector))
-    assert not all(line["valid"] for line in ran.lines)
-    (warning,) = ran.stderr.splitlines()
-    assert warning.startswith("warning: ")
+@pytest.mark.parametrize("lost", hosts.LOST)
+def test_lost_channels_are_named_and_raise_no_alarm(
+    host, stream, selected, fast_stream, tmp_path, lost
+):
+    broken = hosts.without(SAMPLES, lost)
+    ran = run_host(host, stream, saved(tmp_path / "recording.npy", broken), EVERY)
+    hosts.assert_same(ran, truth(broken, detector=selected.detector))
+    whole = sum(row["alarm"] for row in truth(SAMPLES, detector=selected.detector))
+    assert ran.summary["alarms"] <= whole
+    assert any(line["channels_lost"] for line in ran.lines)
+    if not_valid_s := [line["time_s"] for line in ran.lines if not line["valid"]]:
+        counts = f"{len(not_valid_s)} of {len(ran.lines)} decisions are not valid"
+        pattern = rf"warning: {counts}, the first at (\S+) s: too few channels are alive\n"
+        (first_s,) = re.fullmatch(pattern, ran.stderr).groups()
+        assert float(first_s) == pytest.approx(not_valid_s[0], abs=1e-3)
+    assert (not not_valid_s) == (lost == "a dead channel") == (not ran.stderr)
+    broken = hosts.without(hosts.slipping_stream(), lost)
+    ran = run_host(host, fast_stream, saved(tmp_path / "recording.npy", broken), EVERY)
+    hosts.assert_same(ran, truth(broken, with_onset=True))
+
+
+def test_names_of_channels_are_written_as_json(host, stream, selected, tmp_path):
+    names_of_hand = ['a "b"', "c\\d", "\u00e9\t\x01", "\U0001f600"]
+    model = copied(stream, tmp_path)
+    told(channels=names_of_hand)(sidecar_of(model))
+    missing = saved(tmp_path / "recording.npy", SAMPLES * np.nan)
+    in_use = [names_of_hand[i] for i in selected.detector.needed_index.tolist()]
+    lines = run_host(host, model, missing, EVERY).lines
+    assert lines
+    assert all(line["channels_lost"] == in_use for line in lines)
 
 
 @pytest.mark.parametrize(
@@ -325,20 +347,28 @@ SCORE = [sys.executable, EXPORT / "python" / "score.py"]
 def test_bins_are_scored_as_the_package_scores_them(stream, selected, tmp_path):
     detector = selected.detector
     before, after = detector.context_before, detector.context_after
-    path = saved(tmp_path / "recording.npy", BROKEN)
+    broken = hosts.without(SAMPLES, "200 samples")
+    broken[2500:2510, 1:3] = np.nan
+    path = saved(tmp_path / "recording.npy", broken)
     ran = run_host(SCORE, stream.with_name(names.BIN_GRAPH), path)
     lines = [*ran.lines, ran.summary]  # there is no line of sums
     starts = [round(line["start_s"] * 2000) for line in lines]
     assert np.diff(starts).tolist() == [100] * (len(lines) - 1)
     assert starts[0] <= before
-    assert len(BROKEN) - 100 < starts[-1] + 100 + after <= len(BROKEN)
-    bins = np.stack([BROKEN[s - before : s + 100 + after].T for s in starts[1:-1]])
+    assert len(broken) - 100 < starts[-1] + 100 + after <= len(broken)
+    bins = np.stack([broken[s - before : s + 100 + after].T for s in starts[1:-1]])
     predicted = detector.predict_raw(torch.from_numpy(bins).double())
     assert [line["valid"] for line in lines[1:-1]] == predicted.is_valid.tolist()
+    assert [line["in_range"] for line in lines[1:-1]] == predicted.in_range.tolist()
+    names_lost = [
+        [name for name, is_lost in zip(detector.pool.hand.names, row, strict=True) if is_lost]
+        for row in predicted.channels_lost.tolist()
+    ]
+    assert [line["channels_lost"] for line in lines[1:-1]] == names_lost
     assert not predicted.is_valid.all()
-    found = torch.tensor([line["score"] for line in lines[1:-1]], dtype=torch.float64)
-    close = 1e-3 * float(predicted.score.std())
-    torch.testing.assert_close(found, predicted.score, rtol=0, atol=close)
+    found = np.array([line["score"] for line in lines[1:-1]], float)  # null is NaN
+    close = 1e-3 * np.nanstd(predicted.score)
+    np.testing.assert_allclose(found, predicted.score, rtol=0, atol=close)
 
 
 def test_a_stream_graph_is_refused_for_bins(stream, recording):
