@@ -24,6 +24,9 @@ from tactslip_torch.data.file_recordings import FileRecordings, Inspected
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest, write_template
 from tactslip_torch.data.manifest import Problem
 from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.features.sensing import level_ratio, told_of_levels, without_stuck
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.report.recordings import (
     dataset_figure,
     ranges_table,
@@ -35,6 +38,7 @@ from tactslip_torch.runtime import __version__, in_processes
 
 FIGURE = Path("outputs/data.png")
 _SHOWN = 5  # rows of a template
+_LEVELS_S = 30.0  # of a recording, from which levels are taken
 _BIN_MS, _FEWEST = 50.0, 8  # the bin that train takes unless it is told, and samples it should have
 
 
@@ -54,6 +58,8 @@ def check(config: DictConfig) -> int:
                 problems.append(entry.problem(found))
             else:
                 warnings += map(entry.problem, found.oddities(source.hand.names))
+    if config.model is not None and source.ids:
+        warnings += _levels(config, source)
     for line in (*(f"problem: {p}" for p in problems), *(f"warning: {w}" for w in warnings)):
         print(line)
     if source.ids:
@@ -188,6 +194,35 @@ def _inspect_all(
 
     found = in_processes(one, source.ids, "reading samples", "recording", config.num_workers)
     return list(zip(source.ids, found, strict=True))
+
+
+def _levels(config: DictConfig, source: FileRecordings) -> list[Problem]:
+    """Recordings whose levels at rest are far from those that a detector was trained on.
+
+    Raises:
+        ValueError: if the detector is of another hand or rate.
+    """
+    detector = SlipDetector.load(str(config.model))
+    pool, stuck = detector.pool, detector.sensing.stuck_samples
+    if pool.hand.names != source.hand.names or pool.sample_rate_hz != source.sample_rate_hz:
+        raise ValueError(
+            f"{config.model} is of {len(pool.hand)} channels {pool.hand.names[0]} to "
+            f"{pool.hand.names[-1]} at {pool.sample_rate_hz:g} Hz, {config.root} has "
+            f"{len(source.hand)}, {source.hand.names[0]} to {source.hand.names[-1]}, at "
+            f"{source.sample_rate_hz:g} Hz; give the detector of this hand"
+        )
+
+    def one(recording: RecordingId) -> str:
+        samples = source.load(recording).samples[:, : round(_LEVELS_S * pool.sample_rate_hz)]
+        found = score_stream(detector, without_stuck(samples, stuck), pool.bin_samples)
+        return told_of_levels(level_ratio(found.span, detector.sensing), source.units)
+
+    told = in_processes(one, source.ids, "comparing levels", "recording", config.num_workers)
+    return [
+        source.entry(recording).problem(text)
+        for recording, text in zip(source.ids, told, strict=True)
+        if text
+    ]
 
 
 def _headline(

@@ -14,7 +14,7 @@ MOST = 16
 
 
 class Caller(ServerConnection):
-    """A connection; of those that are no open page the oldest makes room for one too many."""
+    """A connection; of those that are no open page the oldest is closed for one too many."""
 
     made: ClassVar[list[Caller]]  # of the server, the oldest first
 

@@ -149,7 +149,7 @@ class _State:
             self._changed.notify_all()
 
     def put(self, item: Placed | Event) -> None:
-        """Behind all that waits; where it waits too long, it makes room or waits itself."""
+        """Behind all that waits; of too much the oldest is dropped, or the source waits."""
         with self._changed:
             if isinstance(item, Event):
                 self._queue.append(item)

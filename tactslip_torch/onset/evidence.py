@@ -471,8 +471,12 @@ class OnsetStream:
         start = max(self._num_rows + 1 - memory, 0)
         listened = self._all if masked is None else ~masked.numpy()
         call = self._by_torch if self._engine is None else self._engine
-        given = self._rows[start : self._num_rows + num], self._num_rows - start, self._num_lost
-        score, is_lost, num_rows, self._num_lost = call(x, *given, listened)
+        rows, num_before = self._rows[start : self._num_rows + num], self._num_rows - start
+        score, is_lost, num_rows, self._num_lost = call(
+            x, rows, num_before, self._num_lost, listened
+        )
+        if num_rows < num_before + int((~is_lost).sum()):  # began anew: what was before is gone
+            self._rows[:num_rows], start = rows[:num_rows].copy(), 0
         self._num_rows = start + num_rows
         return score, is_lost
 
