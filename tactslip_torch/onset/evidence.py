@@ -459,6 +459,9 @@ class OnsetStream:
         call = self._by_torch if self._engine is None else self._engine
         given = self._rows[start : self._num_rows + num], self._num_rows - start, self._num_lost
         score, is_lost, num_rows, self._num_lost = call(x, *given, listened)
+        if num_rows < given[1] + int((~is_lost).sum()):  # began anew: what was before is forgotten
+            self._rows[:num_rows] = self._rows[start : start + num_rows].copy()
+            start = 0
         self._num_rows = start + num_rows
         return score, is_lost
 
