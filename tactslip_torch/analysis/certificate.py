@@ -94,8 +94,8 @@ class Comparison:
     """Bins scored in float32 and in float64.
 
     Args:
-        exact: ``[N]``, scores in float64.
-        rounded: ``[N]``, scores in float32.
+        exact: ``[N]``, scores in float64 of the channels that float32 resolves, NaN: not valid.
+        rounded: ``[N]``, scores in float32, likewise.
         stages: ``[N]`` each, what the score changed by the rounding in ``features`` (filter and
             descriptors), ``scaler`` and ``head``; their sum is ``rounded - exact``.
         scaled: ``[N, K]``, scaled features in float64.
@@ -114,8 +114,9 @@ class Comparison:
 
     @property
     def error(self) -> Tensor:
-        """``[N]``, size of the score error; infinite where a score is not finite."""
-        return (self.rounded - self.exact).abs().nan_to_num(nan=math.inf, posinf=math.inf)
+        """``[N]``, size of the score error; infinite where one is not valid, 0 where none is."""
+        off = (self.rounded - self.exact).abs().nan_to_num(nan=math.inf, posinf=math.inf)
+        return off.masked_fill(self.rounded.isnan() & self.exact.isnan(), 0.0)
 
     @property
     def flips(self) -> Tensor:
@@ -151,10 +152,11 @@ def compare(
 
 
 def _compared(double: SlipDetector, single: SlipDetector, samples: Tensor) -> dict[str, Tensor]:
-    exact = double.predict_raw(samples.double()).score  # as a program calls them
-    rounded, is_valid, *_ = single.predict_raw(samples.float())
-    features, scaled = _tapped(double, samples.double())
-    features32, scaled32 = _tapped(single, samples.float())
+    rounded, is_valid, *_ = single.predict_raw(samples.float())  # as a program calls it
+    # the same channels are lost in both: those that float32 does not resolve
+    features, scaled, is_known = _tapped(double, samples.double())
+    features32, scaled32, _ = _tapped(single, samples.float())
+    exact = torch.where(is_known, double.head(scaled), torch.nan)
     by_features = double.head(double.scaler(features32.double()))
     by_scaler = double.head(scaled32.double())
     return {
@@ -170,17 +172,17 @@ def _compared(double: SlipDetector, single: SlipDetector, samples: Tensor) -> di
     }
 
 
-def _tapped(detector: SlipDetector, samples: Tensor) -> tuple[Tensor, Tensor]:
-    """What the scaler was given, and what the head was given."""
+def _tapped(detector: SlipDetector, samples: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What the scaler was given, what the head was given, and which scores are valid."""
     taken: list[Tensor] = []
     stages = (detector.scaler, detector.head)
     hooks = [m.register_forward_pre_hook(lambda _, given: taken.extend(given)) for m in stages]
     try:
-        detector.predict_raw(samples)
+        found = detector.predict_raw(samples, given=torch.float32)
     finally:
         for hook in hooks:
             hook.remove()
-    return taken[0], taken[1]
+    return taken[0], taken[1], found.is_valid
 
 
 class Certificate(NamedTuple):
@@ -232,7 +234,7 @@ def certify(
     given = {name: _with_digits(bins, generator) for name, bins in given.items()}
     sets = {name: compare(double, single, bins, name) for name, bins in given.items()}
     base = sets["calibration"]
-    sd = score_sd(base.exact)
+    sd = score_sd(base.exact[base.is_valid | base.exact.isfinite()])
     size = (extremes, *calibration.shape[1:])
     kinds = {
         kind: compare(double, single, extreme_bins(kind, size, generator, torch.float32), kind)
@@ -388,7 +390,7 @@ def _set_facts(
         "bins": len(inside),
         "invalid": int((~compared.is_valid).sum()),
         "outside_range": int(_is_outside(compared.covers, detector, known).sum()),
-        "not_finite": int((~compared.rounded.isfinite()).sum()),
+        "not_finite": int((compared.exact.isfinite() & ~compared.rounded.isfinite()).sum()),
         "error": error_facts(compared.error, sd),
         "error_of_valid": error_facts(compared.error[compared.is_valid], sd),
         "stages": {name: error_facts(x.abs(), sd) for name, x in compared.stages.items()},
