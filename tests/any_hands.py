@@ -124,6 +124,9 @@ HANDS = {
     ),
     "one fast": AnyHand({("PVDF", "fast"): 1}, 2000.0, 100, 20, {"PVDF": 11}),
     "one slow": AnyHand({("force", "slow"): 1}, 50.0, 16, 8, {"force": None}, num_features=6),
+    "bins of 5 samples": AnyHand(
+        {("force", "slow"): 3}, 40.0, 5, 2, {"force": 3}, "haar", num_features=9, offset=1.0
+    ),
     "five slow": AnyHand(
         {("SG", "slow"): 3, ("force", "slow"): 2}, 500.0, 50, 25, {"SG": 7, "force": None}
     ),

@@ -7,6 +7,7 @@ from tactslip_torch.analysis.certificate import certify
 from tactslip_torch.deploy.check import simulated_stream
 from tactslip_torch.features.groups import JUMPING
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.sensing import Sensing
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
@@ -25,12 +26,14 @@ HAND = HandLayout.from_rows(
 NUM_FEATURES = 12
 
 
-def raw_bins(num_bins: int, seed: int = 0, offset: float = 1.0) -> torch.Tensor:
+def raw_bins(
+    num_bins: int, seed: int = 0, offset: float = 1.0, num_samples: int = 150
+) -> torch.Tensor:
     """Noise of several sizes in volts, the gauges on an offset."""
     rng = np.random.default_rng(seed)
     size = 10 ** rng.uniform(-2, 0, (num_bins, 1, 1))
     away = np.where(np.arange(4) < 2, offset, 0.0)[:, None]
-    return torch.from_numpy(size * rng.standard_normal((num_bins, 4, 150)) + away)
+    return torch.from_numpy(size * rng.standard_normal((num_bins, 4, num_samples)) + away)
 
 
 def small_detector(
@@ -65,6 +68,14 @@ def small_detector(
         machine = QuadraticForm(bend + bend.T, linear, middle)
     facts = {"simulated": True}
     return SlipDetector(pool, channel_filter, selected, scaler, machine, facts, backend=backend)
+
+
+def with_floors(detector: SlipDetector, min_alive: int, stuck_samples: int = 150) -> SlipDetector:
+    """The detector with what such bins tell of channels that work."""
+    num = detector.pool.bin_samples + 2 * detector.channel_filter.context
+    spans = detector.predict_raw(raw_bins(64, seed=99, num_samples=num)).span
+    detector.sensing = Sensing.fit(spans, min_alive, stuck_samples)
+    return detector
 
 
 def alarming_detector(seed: int = 0) -> SlipDetector:

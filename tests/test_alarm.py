@@ -191,7 +191,7 @@ def recounted(detector, settings, scene):
         decider = Decider(settings, RATE_HZ, 100, detector.look_ahead)
         bins = decider.decide(scores.score, scores.is_valid)
         made = decider.join(bins, left_out[recording.material].score_recording(samples))
-        stream = alarm.Stream(recording, source.timeline(recording), none, none, none, none)
+        stream = alarm.Stream(recording, source.timeline(recording), none, none, none)
         found = recording_events(alarm.watched(stream, made), EventRules(), latency)
         alarms, hours = alarms + len(found.false_alarms_s), hours + found.quiet_s / 3600
     return alarms, hours
@@ -309,7 +309,7 @@ def stream_of(
     score = torch.as_tensor(score, dtype=torch.float32)
     valid, recording = torch.ones(len(score)) > 0, RecordingId("a", number, scene)
     hops = torch.as_tensor(onset, dtype=torch.float64)
-    return alarm.Stream(recording, times_of(slides, duration_s, **times), score, valid, valid, hops)
+    return alarm.Stream(recording, times_of(slides, duration_s, **times), score, valid, hops)
 
 
 def knocked(number: int) -> np.ndarray:

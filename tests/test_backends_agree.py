@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from engine_bins import KINDS, bins_of
-from small_detector import HAND, alarming_detector, raw_bins
+from small_detector import HAND, alarming_detector, raw_bins, with_floors
 from test_onnx import run_on
 
 from tactslip_torch.analysis.certificate import certify
@@ -26,16 +26,18 @@ SOME_SLOW = [k if k in HOSTILE else pytest.param(k, marks=pytest.mark.slow) for 
 
 
 @cache
-def detectors():
+def detectors(has_floors):
     """By the native engine, and the same by torch."""
     made = alarming_detector()
+    if has_floors:
+        with_floors(made, 3)
     parts = made.pool, made.channel_filter, made.selected, made.scaler, made.head
-    return made, SlipDetector(*parts, backend="torch")
+    return made, SlipDetector(*parts, sensing=made.sensing, backend="torch")
 
 
 @cache
 def margin():
-    return certify(detectors()[0], raw_bins(200), simulated=True).content["margin"]["score"]
+    return certify(detectors(False)[0], raw_bins(200), simulated=True).content["margin"]["score"]
 
 
 def bins_by(kind, shape, dtype, beside):
@@ -56,14 +58,15 @@ def bins_by(kind, shape, dtype, beside):
 
 
 def assert_agree(found, expected, what, rows=slice(None)):
-    """Flags are the same, and decisions where both are valid and outside the margin."""
-    score, is_valid = (np.asarray(each) for each in found)
-    own, is_own_valid = (np.asarray(each)[rows] for each in expected)
-    np.testing.assert_array_equal(is_valid, is_own_valid, err_msg=f"flags by {what}")
-    is_clear = is_valid & is_own_valid & (np.abs(own) > margin())
+    """Flags are the same, and decisions where they are valid and outside the margin."""
+    score, is_valid, *flags = (np.asarray(each) for each in found)
+    own, is_own_valid, *own_flags = (np.asarray(each)[rows] for each in expected)
+    for each, wanted in zip((is_valid, *flags), (is_own_valid, *own_flags), strict=True):
+        np.testing.assert_array_equal(each, wanted, err_msg=f"flags by {what}")
+    is_clear = is_valid & (np.abs(own) > margin())
     turned = (score >= 0) != (own >= 0)
     assert not (turned & is_clear).any(), f"{what}: {score[turned & is_clear]}"
-    assert np.isfinite(score).all()
+    np.testing.assert_array_equal(np.isfinite(score), is_valid)
 
 
 def joined(parts):
@@ -71,23 +74,26 @@ def joined(parts):
 
 
 @pytest.mark.onnx
+@pytest.mark.parametrize("has_floors", [False, True])
 @pytest.mark.parametrize("beside", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", SOME_SLOW)
-def test_every_kind_of_input_is_decided_alike(kind, beside):
+def test_every_kind_of_input_is_decided_alike(kind, beside, has_floors):
     num, dtype = 24, torch.float64 if beside else torch.float32
-    native, by_torch = detectors()
+    native, by_torch = detectors(has_floors)
     bins = bins_by(kind, (num, len(HAND), 150), dtype, beside)
-    expected = native.predict_raw(bins)[:2]
+    expected = native.predict_raw(bins)[:4]
     graph = run_on(native, str(dtype).removeprefix("torch."), bins)
-    assert_agree((graph["score"], graph["valid"]), expected, "onnx")
-    assert_agree(by_torch.predict_raw(bins)[:2], expected, "torch")
+    of_graph = [graph[name] for name in ("score", "valid", "in_range", "channels_lost")]
+    assert_agree(of_graph, expected, "onnx")
+    assert_agree(by_torch.predict_raw(bins)[:4], expected, "torch")
     few = range(0, num, num // 8)
     for name, made in (("native", native), ("torch", by_torch)):
-        alone = joined(made.predict_raw(bins[i : i + 1])[:2] for i in few)
+        alone = joined(made.predict_raw(bins[i : i + 1])[:4] for i in few)
         assert_agree(alone, expected, f"{name}, alone", list(few))
     whole = bins_by(kind, (1, len(HAND), 1500), dtype, beside)[0]
-    offline = score_stream(native, whole, 20)[:2]
-    assert_agree(score_stream(by_torch, whole, 20)[:2], offline, "torch, offline")
+    offline = score_stream(native, whole, 20)[:4]
+    assert_agree(score_stream(by_torch, whole, 20)[:4], offline, "torch, offline")
     stream = StreamingDetector(native, dtype=dtype)
     parts = [*map(stream.push, whole.T.split(37)), stream.flush()]
-    assert_agree(joined((each.score, each.is_valid) for each in parts), offline, "stream")
+    of_stream = joined((x.score, x.is_valid, x.in_range, x.channels_lost) for x in parts)
+    assert_agree(of_stream, offline, "stream")

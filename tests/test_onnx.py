@@ -14,7 +14,7 @@ from contract.names import STREAM_OUTPUTS
 from engine_bins import some_hand
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_detector import HAND, alarming_detector, raw_bins
+from small_detector import HAND, alarming_detector, raw_bins, with_floors
 from streams import detector_of, onset_of, signal
 from test_detector import VARIANTS, noise, random_detector
 from test_predictions import with_imputation
@@ -38,7 +38,7 @@ from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.decisions import KEY, AlarmSettings, score_stream
 from tactslip_torch.onset.evidence import OnsetStream
-from tactslip_torch.onset.rules import Cusum, KOfN
+from tactslip_torch.onset.rules import Cusum, KOfN, most_lost
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -66,14 +66,15 @@ def run_on(detector, precision, samples, mask=None):
 def assert_scores(detector, precision, samples, mask=None, spread=None):
     """Scores are those of torch in float64, flags those of torch in the graph's precision."""
     given = samples.to(getattr(torch, precision))
-    expected = detector.predict_raw(given.double(), masked_channels=mask)
+    expected = detector.predict_raw(given.double(), given=given.dtype, masked_channels=mask)
     got = run_on(detector, precision, given, mask)
     assert got["score"].dtype == precision
-    spread = float(expected.score.std()) if spread is None else spread
-    error = np.abs(got["score"] - expected.score.numpy())
-    assert error.max(initial=0.0) <= CLOSE[precision] * spread
-    is_valid = detector.predict_raw(given, masked_channels=mask).is_valid
-    np.testing.assert_array_equal(got["valid"], is_valid)
+    spread = np.nanstd(expected.score) if spread is None else spread
+    np.testing.assert_allclose(got["score"], expected.score, rtol=0, atol=CLOSE[precision] * spread)
+    for found in (expected, detector.predict_raw(given, masked_channels=mask)):
+        np.testing.assert_array_equal(got["valid"], found.is_valid)
+        np.testing.assert_array_equal(got["in_range"], found.in_range)
+        np.testing.assert_array_equal(got["channels_lost"], found.channels_lost)
     return got
 
 
@@ -137,33 +138,45 @@ def test_every_head_and_scaler_comes_through(variant, precision):
         samples[row, needed[row % len(needed)], 30 + 7 * row] = value
     samples[20, needed[0]] = 1.0  # dead
     samples[21] = NAN
-    valid = assert_scores(detector, precision, samples)["valid"]
-    assert 0 < valid.sum() < len(valid) - 13
+    got = assert_scores(detector, precision, samples)
+    assert np.flatnonzero(~got["valid"]).tolist() == [21]
+    assert np.flatnonzero(got["channels_lost"].any(-1)).tolist() == [*range(12), 20, 21]
 
 
 # Missing channels and probabilities ------------------------------------------------------------
 
 
 def broken_bins():
-    """Bins some of which miss one or two sensors, or all, neighbours the same or others."""
-    samples = raw_bins(24)
+    """Bins some of which miss or have silent one or two sensors, or all, neighbours or others."""
+    samples = raw_bins(32)
     samples[3, 2, 60] = samples[4, 2, 80] = NAN
     samples[5, 0, 60] = samples[5, 3, 90] = INF
     samples[9] = NAN
     samples[10, 2, 70] = -INF
+    samples[12:16, 3] = 0.25  # dead
+    samples[14:20, 1] = 1.0 + 1e-4 * (samples[14:20, 1] - 1.0)  # moves too little, by floors alone
+    samples[18:22] *= 1e-4
+    samples[22:25] *= 1e4
     return samples
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("min_alive", [None, 1, 3, 4], ids="min_alive {}".format)
 @pytest.mark.parametrize("lost", [None, [2], [0, 3], [0, 1, 2, 3]], ids=str)
-def test_scores_without_channels_are_those_of_torch(precision, lost):
+def test_scores_without_channels_are_those_of_torch(precision, min_alive, lost):
     detector = with_imputation()
-    mask = None if lost is None else torch.zeros(4).bool().index_fill(0, torch.tensor(lost), True)
     spread = float(detector.predict_raw(raw_bins(24)).score.std())
+    if min_alive is not None:
+        with_floors(detector, min_alive)
+    mask = None if lost is None else torch.zeros(4).bool().index_fill(0, torch.tensor(lost), True)
     got = assert_scores(detector, precision, broken_bins(), mask, spread)
     if lost is not None and len(lost) == 4:
         assert not got["valid"].any()
-        assert np.ptp(got["score"]) == 0  # nothing is known of any bin
+        assert np.isnan(got["score"]).all()
+    elif lost is None and min_alive is not None:
+        assert not got["channels_lost"][22:25].any()
+        assert not got["in_range"][22:25].any()
+        assert got["channels_lost"][18:22].all()
 
 
 # The file --------------------------------------------------------------------------------------
@@ -240,6 +253,10 @@ def holds_nan(samples):
     return samples.isnan().flatten(1).any(1)
 
 
+def is_all_nan(samples):
+    return samples.isnan().flatten(1).all(1)
+
+
 def behind_nan(samples):
     """Whole bins in one batch with broken ones."""
     return ~holds_nan(samples) & holds_nan(samples).any()
@@ -263,11 +280,19 @@ WRONG = [
     ("bin", changed("score", lambda x: x[::-1]), "score differs from torch by"),
     ("bin", at(one_bin, "valid", False), "differs from torch at 1 of 256, the first is number 3"),
     ("bin", at(constant, "valid", True), r"\(constant\): valid differs from torch at 16"),
-    ("bin", at(holds_nan, "valid", True), r"\(nan\): valid differs"),
+    ("bin", at(holds_nan, "valid", True), r"\(all nan\): valid differs"),
+    (
+        "bin",
+        at(holds_nan, "channels_lost", False),
+        r"\(nan\): channels_lost differs .* at 16 of 16",
+    ),
+    ("bin", changed("in_range", np.zeros_like), "simulated bins: in_range differs"),
+    ("bin", at(is_all_nan, "score", 0.0), "scores are not finite, or valid without a score"),
     ("bin", at(behind_nan, "score", 0.123), "simulated bins behind a degenerate one"),
     ("stream", without_on, "it gives on missing, expected on bool"),
     ("stream", changed("alarm", never_early), "alarm differs from torch at .*, the first"),
     ("stream", changed("valid", np.ones_like), "broken channels: valid differs from torch"),
+    ("stream", changed("channels_lost", np.zeros_like), "channels: channels_lost differs"),
     ("stream", changed("onset_s", lambda x: x - 0.01), "onset_s differs from torch by 1.0e-02 s"),
     ("stream", changed("score", lambda x: x * np.float32(1.01)), "score differs from torch"),
     ("joint", changed("onset_score", lambda x: x + 1e-8), "onset_score differs from torch by 1.0e"),
@@ -362,12 +387,21 @@ STREAM_CLOSE = {"float64": 1e-9, "float32": 1e-3}  # of scores, in standard devi
 
 @cache
 def watching(
-    kind="all", align="centred", rule="k_of_n", hop=20, threshold=1.0, isotonic=False, onset=None
+    kind="all",
+    align="centred",
+    rule="k_of_n",
+    hop=20,
+    threshold=1.0,
+    isotonic=False,
+    onset=None,
+    floors=False,
 ):
     """A detector, and settings by which about half of its decisions speak for slip."""
     detector = detector_of("all" if kind == "long" else kind, align)
     if kind == "long":
         detector.channel_filter = ChannelFilter([151, 51, 11, 3], align=align)
+    if floors:
+        with_floors(detector, int(detector.counted.sum()) - 1)
     scores = score_stream(detector, signal(900, 99), 20).score  # of no stream below
     middle, spread = float(scores.median()), float(scores.std())
     calibration = Platt(2 / spread, -2 * middle / spread)
@@ -375,7 +409,7 @@ def watching(
         knots = tuple(middle + spread * x for x in (-2.0, -0.5, 0.0, 0.5, 1.0))
         calibration = Isotonic(knots, (-3.0, -2.0, -0.5, 1.0, 2.5))
     times = {"rearm_s": 0.02, "refractory_s": 0.05, "lead_s": 0.03}
-    more = {"target_per_hour": 1.0, "slip_share": 0.3, "onset": onset, **times}
+    more = {"target_per_hour": 1.0, "slip_share": 0.3, "onset": onset, "hold_s": 0.05, **times}
     settings = AlarmSettings(hop, calibration, RULES[rule], threshold, **more)
     return detector, settings, spread
 
@@ -410,7 +444,8 @@ def assert_same_stream(samples, cuts=(), precision="float64", **options):
     atol = {"score": close * spread, "probability": 9 * close, "statistic": 9 * close}
     atol |= {"onset_s": 1e-12, "onset_score": 1e-9}
     rtol = {"probability": close, "statistic": close, "onset_score": 1e-7}
-    names = STREAM_OUTPUTS | {name: name for name in ("by_onset", "onset_score") if settings.onset}
+    names = STREAM_OUTPUTS | {name: name for name in ("in_range", "channels_lost")}
+    names |= {name: name for name in ("by_onset", "onset_score") if settings.onset}
     places = [0, *sorted(min(cut, samples.shape[-1]) for cut in cuts), samples.shape[-1]]
     for start, stop in pairwise(places):
         piece = samples[:, start:stop].T.to(dtype)
@@ -424,25 +459,39 @@ def assert_same_stream(samples, cuts=(), precision="float64", **options):
         assert (host.tail.dtype, host.state.dtype) == (host.dtype, np.float64)
 
 
+LOSSES = st.tuples(
+    st.integers(0, 3999),  # begins
+    st.sampled_from([1, 30, 160, 400]),  # samples; the hold is 100, a channel is stuck from 151 on
+    st.sampled_from([(0,), (1, 2), (2,), (3,), (2, 3), (0, 1, 2, 3)]),
+    st.sampled_from([NAN, INF, 0.25]),
+)
+
+
+def with_losses(samples, losses):
+    samples = samples.clone()
+    for start, num, channels, value in losses:
+        samples[list(channels), start % samples.shape[1] :][:, :num] = value
+    return samples
+
+
 @given(
-    num_samples=st.integers(0, 900),
-    cuts=st.lists(st.integers(0, 900), max_size=30),
+    num_samples=st.integers(0, 1200),
+    cuts=st.lists(st.integers(0, 1200), max_size=30),
     kind=st.sampled_from(KINDS),
     align=st.sampled_from(ALIGNMENTS),
     rule=st.sampled_from(list(RULES)),
     isotonic=st.booleans(),
     hop=st.sampled_from([7, 20, 120]),
+    floors=st.booleans(),
     seed=st.integers(0, 20),
-    bad=st.lists(st.tuples(st.integers(0, 899), st.sampled_from([np.nan, np.inf])), max_size=3),
+    losses=st.lists(LOSSES, max_size=4),
 )
 def test_any_cut_gives_what_the_detector_gives(
-    num_samples, cuts, kind, align, rule, isotonic, hop, seed, bad
+    num_samples, cuts, kind, align, rule, isotonic, hop, floors, seed, losses
 ):
-    samples = signal(900, seed)
-    for place, value in bad:
-        samples[place % 4, place] = value
+    samples = with_losses(signal(1200, seed), losses)
     options = {"kind": kind, "align": align, "rule": rule, "isotonic": isotonic, "hop": hop}
-    assert_same_stream(samples[:, :num_samples], cuts, **options)
+    assert_same_stream(samples[:, :num_samples], cuts, floors=floors, **options)
 
 
 @given(
@@ -451,33 +500,35 @@ def test_any_cut_gives_what_the_detector_gives(
     kind=st.sampled_from(KINDS),
     rule=st.sampled_from(list(RULES)),
     hop=st.sampled_from([7, 20, 120]),
+    floors=st.booleans(),
     precision=st.sampled_from(list(STREAM_CLOSE)),
-    bad=st.lists(st.tuples(st.integers(0, 3999), st.sampled_from([np.nan, np.inf])), max_size=2),
+    losses=st.lists(LOSSES, max_size=4),
 )
 @settings(max_examples=20)
 def test_fast_evidence_in_any_cut_is_that_of_the_detector(
-    num_samples, cuts, kind, rule, hop, precision, bad
+    num_samples, cuts, kind, rule, hop, floors, precision, losses
 ):
-    samples = signal(4000, 6)
-    for place, value in bad:
-        samples[place % 4, place] = value
-    options = {"kind": kind, "rule": rule, "hop": hop, "onset": ONSET}
+    samples = with_losses(signal(4000, 6), losses)
+    options = {"kind": kind, "rule": rule, "hop": hop, "onset": ONSET, "floors": floors}
     assert_same_stream(samples[:, :num_samples], cuts, precision, **options)
 
 
+@pytest.mark.parametrize("num_lost", [30, 200])
 @pytest.mark.parametrize("kinds", ["F", "FF", "GF", "GGF"])
-def test_onset_scores_of_any_hand_with_channels_missing(kinds):
+def test_onset_scores_of_any_hand_with_channels_missing(kinds, num_lost):
     hand = some_hand(kinds)
     names = [{"G": 0, "F": 2}[kind] + i % 2 for i, kind in enumerate(kinds)]
     samples = signal(4000, 6)[names]
     samples[-1, 3500:] = samples[-1, 3500]  # stuck
-    classifier = onset_of(samples[:, :3400], hand)
+    classifier = onset_of(samples[:, :2400], hand)
+    samples[:, 2500 : 2500 + num_lost] = NAN
     for masked in ([False] * len(hand), [False, *[True] * (len(hand) - 1)]):
         graph = Graph()
         x, memory = graph.input("x", F64, ("n", len(hand))), graph.input("memory", F64, ("m",))
         places = graph.input("places", I64, ("k",))
         known = onset_memory(memory, 0, classifier.evidence)
-        score, after = onset_scores(x, places, known, classifier)
+        most = most_lost(classifier.evidence.context + 10, 100, 10)
+        score, after = onset_scores(x, places, known, classifier, most)
         for name, value in zip("sm", (score, graph.concat(*after, axis=0)), strict=True):
             graph.output(name, value, ("j",))
         run, evidence = runner(session_of(graph.model())), classifier.evidence
@@ -490,7 +541,7 @@ def test_onset_scores_of_any_hand_with_channels_missing(kinds):
             made = run({"x": piece, "places": np.arange(stop - start), "memory": memory})
             found.append(made["s"])
             memory = made["m"]
-        expected = OnsetStream(classifier).push(samples, torch.tensor(masked))
+        expected = OnsetStream(classifier, 100).push(samples, torch.tensor(masked))
         np.testing.assert_allclose(np.concatenate(found), expected, rtol=0, atol=1e-9)
 
 

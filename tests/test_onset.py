@@ -1,6 +1,7 @@
 """Evidence of onsets against plain loops over the definition; a stream of it in any pieces."""
 
 import json
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -28,7 +29,7 @@ from tactslip_torch.onset.baselines import (
     largest_detail,
 )
 from tactslip_torch.onset.decisions import AlarmSettings
-from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence, OnsetStream
+from tactslip_torch.onset.evidence import Blocks, OnsetClassifier, OnsetEvidence, OnsetStream
 from tactslip_torch.onset.rules import NOTHING_YET, KOfN
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.onset import OnsetTraining, kinds_of
@@ -199,24 +200,62 @@ def in_pieces(stream, samples, cuts, masked=None):
 )
 def test_any_cut_gives_the_scores_of_the_recording(cuts, dtype, backend):
     samples = getattr(SAMPLES, dtype)()
-    found = in_pieces(OnsetStream(CLASSIFIER, backend), samples, cuts)
+    found = in_pieces(OnsetStream(CLASSIFIER, backend=backend), samples, cuts)
     torch.testing.assert_close(found, CLASSIFIER.score_recording(samples), rtol=0, atol=1e-8)
 
 
+def scored_without_lost_blocks(classifier, samples, masked, most):
+    """The classifier on the blocks that are known, as if the others had not been."""
+    evidence = classifier.evidence
+    power, mean = evidence.blocks_of_recording(samples)
+    first = samples.shape[-1] // evidence.hop_samples - power.shape[-1]
+    listened = [not masked[c] for c in evidence.hand.fast]
+    is_lost = power.isfinite().all(1)[listened].sum(0) < evidence.min_alive
+    found = torch.full((first + len(is_lost),), NOTHING_YET, dtype=torch.float64)
+    known, scores, num_lost = [], [math.nan, math.nan], 0
+    for block in range(len(is_lost)):
+        num_lost += int(is_lost[block])
+        if is_lost[block]:
+            continue
+        known = [] if num_lost > most else known
+        num_lost = 0
+        known = [*known, block][-evidence.memory :]
+        score = math.nan
+        if len(known) == evidence.memory:
+            own = Blocks(power[..., known], mean[..., known])
+            score = float(classifier.score(own, masked))
+        scores = [*scores[-2:], score]
+        found[first + block] = np.nan_to_num(np.mean(scores), nan=NOTHING_YET)
+    return found
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("kinds", ["GFFGFG", "FGF", "FF", "F"])
-def test_backends_agree_on_any_hand_with_channels_missing(kinds, backend):
+@pytest.mark.parametrize(
+    ("kinds", "changes"),
+    [
+        ("GFFGFG", {"min_alive": 3}),
+        ("GFFGFG", {"least_rms": ((2.0,) * 4, (0.05,) * 4, (0.0,) * 4)}),
+        ("FGF", {}),
+        ("FF", {"min_alive": 2}),
+        ("F", {}),
+    ],
+    ids=str,
+)
+def test_backends_agree_on_any_hand_with_channels_lost(kinds, changes, backend):
     classifier = classifier_of(evidence_of(kinds, comb_periods=4), linear=kinds == "FF")
-    samples, evidence = samples_of(classifier.evidence, 3.0, seed=4), classifier.evidence
-    samples[-1, 2500], samples[0, 4000:] = torch.inf, 1.5
-    for masked in (None, torch.arange(len(kinds)) == len(kinds) - 1):
-        found = in_pieces(OnsetStream(classifier, backend), samples.T.clone().T, [7, 4001], masked)
-        alone = torch.full((600 + 2,), torch.nan, dtype=torch.float64)
-        known = classifier.score(evidence.blocks_of_recording(samples), masked)
-        alone[evidence.first_hop + 2 :] = known
-        expected = alone.unfold(0, 3, 1).mean(-1).nan_to_num(NOTHING_YET)
-        torch.testing.assert_close(found, expected, rtol=0, atol=1e-8)
-        assert (kinds == "F" and masked is not None) or (found > NOTHING_YET).any()
+    classifier = replace(classifier, evidence=replace(classifier.evidence, **changes))
+    samples = samples_of(classifier.evidence, 4.0, seed=4)
+    samples[-1, 2500], samples[0, 5000:] = torch.inf, 1.5
+    samples[1 % len(kinds) :, 2900 : 2900 + 800] = torch.nan  # longer than the hold
+    for masked in (torch.zeros(len(kinds)).bool(), torch.arange(len(kinds)) == len(kinds) - 1):
+        for hold in (500, 2000):
+            stream = OnsetStream(classifier, hold, backend)
+            found = in_pieces(stream, samples.T.clone().T, [7, 3103, 5001], masked)
+            most = -(-(classifier.evidence.context + 10 + hold) // 10)
+            expected = scored_without_lost_blocks(classifier, samples, masked, most)
+            torch.testing.assert_close(found, expected, rtol=0, atol=1e-8)
+        is_deaf = kinds in ("F", "FF") and bool(masked.any())
+        assert bool((found > NOTHING_YET).any()) != is_deaf
 
 
 # As plain data, and what is refused --------------------------------------------------------------
@@ -315,17 +354,20 @@ def test_a_baseline_scores_filtered_bins(name, rng):
     assert detector.needed_index.tolist() == films
     assert detector.look_ahead == 5  # half the films' frame, not the gauges' 25
     samples = raw_bins(20)
-    score, is_valid, is_missing, _ = detector.predict_raw(samples)
+    score, is_valid, in_range, is_lost, span = detector.predict_raw(samples)
     assert torch.equal(score, SCORES[name](ChannelFilter([51, 51, 11, 11]).valid(samples), films))
-    assert is_valid.all()
-    assert not is_missing.any()
+    assert (is_valid & in_range).all()
+    assert not is_lost.any()
+    filtered = ChannelFilter([51, 51, 11, 11]).valid(samples)[:, films]
+    assert torch.equal(span[:, films], filtered.amax(-1) - filtered.amin(-1))
+    assert span[:, :2].isnan().all()
     in_32 = detector.predict_raw(samples, given=torch.float32)
     assert in_32.score.dtype == torch.float32
     torch.testing.assert_close(in_32.score.double(), score, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", SCORES)
-def test_a_missing_film_is_flagged_and_counts_as_silent(name):
+def test_a_lost_film_counts_as_silent_and_without_films_there_is_no_score(name):
     detector = baseline(name)
     samples = raw_bins(5)
     whole = detector.predict_raw(samples)
@@ -334,11 +376,13 @@ def test_a_missing_film_is_flagged_and_counts_as_silent(name):
     samples[3, 3] = 0.1  # a dead film
     samples[4] = torch.nan
     found = detector.predict_raw(samples)
-    assert found.score.isfinite().all()
-    assert found.is_valid.tolist() == [True, False, True, False, False]
-    assert found.is_missing.sum(-1).tolist() == [0, 1, 0, 0, 2]
-    other = SCORES[name](ChannelFilter([51, 51, 11, 11]).valid(samples)[1:2], [3])
-    torch.testing.assert_close(found.score[1:2], other)
+    assert found.is_valid.tolist() == found.in_range.tolist() == [True, True, True, True, False]
+    assert torch.equal(found.score.isfinite(), found.is_valid)
+    assert found.channels_lost.sum(-1).tolist() == [0, 1, 0, 1, 2]
+    filtered = ChannelFilter([51, 51, 11, 11]).valid(samples)
+    for row, film in ((1, 3), (3, 2)):
+        other = SCORES[name](filtered[row : row + 1], [film])
+        torch.testing.assert_close(found.score[row : row + 1], other)
     torch.testing.assert_close(found.score[[0, 2]], whole.score[[0, 2]])
 
 

@@ -94,10 +94,21 @@ def test_dead_channels_are_left_out_of_their_pools(detector, recording):
     columns = detector.columns(features, mask.expand(len(bins), -1))
     wanted = detector.head(detector.scaler(columns))
     torch.testing.assert_close(judged.score, wanted, rtol=1e-10, atol=1e-12)
-    assert not judged.is_valid.any()
+    assert judged.is_valid.all()
+    assert torch.equal(judged.channels_lost, mask.expand(len(bins), -1))
     holed = bins.clone()
     holed[:, mask, 7] = torch.nan
     torch.testing.assert_close(detector.predict(holed).score, judged.score, rtol=1e-10, atol=1e-12)
+
+
+def test_a_hand_that_says_nothing_has_no_score(detector, recording):
+    """Unplugged, it is zeros or a volt of offset and the converter's noise; once, that was slip."""
+    quiet = 0.01 * torch.tensor(detector.sensing.rest_span).double()[:, None]
+    for samples in (recording * 0.0, recording * torch.nan, 1.0 + quiet * noise_like(recording, 1)):
+        found = score_stream(detector, samples, HOP)
+        assert found.score.isnan().all()
+        assert found.channels_lost.all()
+        assert not (found.is_valid | found.in_range).any()
 
 
 # Commands ----------------------------------------------------------------------------------------

@@ -58,22 +58,6 @@ def test_every_value_is_finite_and_ratios_of_energies_add_up_to_one(dtype, backe
     assert (ratios[~is_zero] - 1).abs().max() <= slack
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@settings(max_examples=10)
-@given(data=st.data())
-def test_validity_is_its_rule(dtype, data):
-    """In longdouble, where neither the span nor 64 eps of the magnitude is rounded."""
-    bins = data.draw(batches(16, dtype)).bins.clone()
-    bins[0, 5, 3], bins[1, 20, 99], bins[2, 0, 0] = math.nan, math.inf, -math.inf
-    bins[:, 7] = 1  # with spans of 56 to 71 eps
-    bins[:, 7, 50] = 1 - torch.arange(56, 72) * torch.finfo(dtype).eps
-    exact = bins.numpy().astype(np.longdouble)
-    with np.errstate(invalid="ignore"):  # the NaN and Inf just put there
-        span, size = np.ptp(exact, axis=-1), np.abs(exact).max(-1)
-    expected = np.isfinite(size) & (span > 64 * np.longdouble(torch.finfo(dtype).eps) * size)
-    assert np.array_equal(POOL.validity(bins).numpy(), expected)
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 @settings(max_examples=10)
 @given(data=st.data())
@@ -149,45 +133,29 @@ def vibrations(kind, num_bins, rng):
 
 @pytest.mark.parametrize("vibration", [1e-2, 1e-3])
 @pytest.mark.parametrize("kind", ["noise", "tone"])
-def test_float32_is_right_or_flagged_at_an_offset_of_1e3(kind, vibration, rng):
+def test_float32_is_right_or_silent_at_an_offset_of_1e3(kind, vibration, rng):
     """Against float64 on the same float32 input; a tone leaves branches of rounding alone."""
     wide = 1e3 + vibration * vibrations(kind, 40, rng)
     bins = torch.from_numpy(wide).float()
     single, double = POOL(bins).double(), POOL(bins.double())
-    flagged = ~POOL.validity(bins)
+    least = 64 * torch.finfo(torch.float32).eps * bins.abs().amax(-1)
+    silent = bins.amax(-1) - bins.amin(-1) <= least
     channel = torch.tensor([POOL.hand.names.index(name.channel) for name in POOL.names])
-    excused = flagged[:, channel]
+    excused = silent[:, channel]
     error = (single - double).abs() / double.abs().clamp(min=torch.finfo(torch.float32).tiny)
     for descriptors, limit in ((("std",), 0.01), (SHAPES, 0.05)):
         mine = torch.tensor([name.descriptor in descriptors for name in POOL.names])
         assert mine.any()
         assert bool(((error < limit) | excused | ~mine).all())
     if vibration == 1e-2:
-        assert not flagged.any()
+        assert not silent.any()
 
 
-def test_a_branch_far_smaller_than_its_bin_is_kept_or_flagged():
+def test_a_branch_far_smaller_than_its_bin_is_kept():
     """Its span is below 16 eps32 of the offset; branches are float64 in either arithmetic."""
     t = torch.arange(100) / 2000
     bins = (1e3 + 1e-2 * torch.sin(2 * torch.pi * 50 * t)).expand(24, 100).float()
     branch = next(i for i, n in enumerate(POOL.names) if str(n) == "PVDF1 D1 time std")
     assert POOL(bins)[branch] > 0
-    assert POOL.validity(bins).all()
     native = FeaturePool(POOL.hand, arithmetic="native")
-    films = list(native.hand.indices("PVDF"))
     torch.testing.assert_close(native(bins)[branch], POOL(bins)[branch])
-    assert not native.validity(bins)[films].any()
-    assert native.validity(bins)[list(native.hand.indices("SG"))].all()
-    assert native.validity(bins - 1e3)[films].all()
-    assert native.validity(bins.double()).all()
-
-
-def test_what_leaves_float64_on_its_way_counts_as_missing():
-    """Rail to rail at its end: the samples are finite, their branches are not."""
-    bins = torch.full((2, 24, 100), torch.finfo(torch.float64).max, dtype=torch.float64)
-    bins[:, :, ::2] *= -1
-    bins[1] /= 64
-    assert POOL.is_missing(bins).all(-1).tolist() == [True, False]
-    assert POOL.validity(bins).all(-1).tolist() == [False, True]
-    assert POOL(bins[1]).isfinite().all()
-    assert POOL.validity(torch.full((24, 100), 3e38).cumsum(-1).clamp(max=3.4e38)).all()

@@ -183,9 +183,13 @@ def test_the_latch_equals_its_definition_in_any_pieces(values, threshold, how, c
     assert end == state
 
 
-def test_what_is_no_number_is_neither_above_nor_below() -> None:
-    alarms, _, _ = latch([2, 0, math.nan, 0, 2, 0, 0, 2], 1.0, rearm=2, refractory=0)
-    assert np.flatnonzero(alarms).tolist() == [0, 7]
+def test_what_is_no_number_moves_nothing_but_the_time_since_an_alarm() -> None:
+    values, nan = [2, 0, math.nan, 0, 2, 0, math.nan, 2], math.nan
+    alarms, standing, _ = latch(values, 1.0, rearm=2, refractory=0)
+    assert np.flatnonzero(alarms).tolist() == [0, 4]
+    assert np.flatnonzero(standing).tolist() == [0, 1, 2, 4, 5, 6, 7]
+    assert latch([2, 0, nan, 2], 1.0, rearm=1, refractory=3)[0] == [True, False, False, True]
+    assert latch([nan, nan], -math.inf, rearm=1, refractory=0)[:2] == ([False] * 2, [False] * 2)
     values = [-math.inf, math.inf, -math.inf, math.inf]
     assert latch(values, math.inf, rearm=1, refractory=0)[0] == [False, True] * 2
 

@@ -13,18 +13,20 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from streams import detector_of, onset_of, signal
-from test_rules import by_hand
+from test_rules import ORACLES, by_hand
 
+from tactslip_torch.features.sensing import without_stuck
 from tactslip_torch.model.calibration import Platt
+from tactslip_torch.native import why_not
 from tactslip_torch.onset.decisions import (
     AlarmSettings,
     Decider,
-    Decisions,
-    is_usable,
+    joined_decisions,
     score_stream,
     stream_statistic,
 )
-from tactslip_torch.onset.rules import Cusum, KOfN
+from tactslip_torch.onset.evidence import OnsetStream
+from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN
 from tactslip_torch.onset.streaming import StreamingDetector
 
 HOP = 20
@@ -51,26 +53,25 @@ def stream_of(detector=DETECTOR, settings=None, dtype=torch.float64, **options):
     return StreamingDetector(detector, settings or settings_of(), dtype=dtype, **options)
 
 
-def joined(parts):
-    return Decisions(*(torch.cat(entries) for entries in zip(*parts, strict=True)))
-
-
 def in_pieces(stream, samples, cuts=()):
     places = [0, *sorted(min(cut, samples.shape[-1]) for cut in cuts), samples.shape[-1]]
     parts = [stream.push(samples[:, a:b].T) for a, b in pairwise(places)]
-    return joined([*parts, stream.flush()])
+    return joined_decisions([*parts, stream.flush()])
 
 
 def offline(detector, settings, samples, masked=None):
     """Decisions on a whole recording, all at once."""
-    scores = score_stream(detector, samples, settings.hop_samples)
-    decider = Decider(settings, RATE, 100, detector.look_ahead, 51 if settings.onset else 0)
-    tells = is_usable(scores.score, scores.is_missing, detector.needed_index)
-    bins = decider.decide(scores.score, scores.is_valid, tells)
+    found, names = score_stream(detector, samples, settings.hop_samples), detector.pool.hand.names
+    before = max(detector.channel_filter.reaches[c][0] for c in detector.needed_index)
+    options = {"context_before": before, "channels": names}
+    frame = 51 if settings.onset else 0
+    decider = Decider(settings, RATE, 100, detector.look_ahead, frame, **options)
+    bins = decider.decide(*found[:-1])
     if settings.onset is None:
         return bins
     evidence = settings.onset.evidence
     alone = torch.full((samples.shape[-1] // 10 + 2,), torch.nan, dtype=torch.float64)
+    samples = without_stuck(samples, detector.sensing.stuck_samples)
     known = settings.onset.score(evidence.blocks_of_recording(samples), masked)
     alone[evidence.first_hop + 2 :] = known
     return decider.join(bins, alone.unfold(0, 3, 1).mean(-1).nan_to_num(-1e30))
@@ -81,8 +82,10 @@ def assert_same(found, expected):
     close = SPREAD * (1e-9 if expected.score.dtype == torch.float64 else 1e-4)
     for name in ("score", "llr", "probability", "statistic"):
         pair = getattr(found, name), getattr(expected, name)
-        torch.testing.assert_close(*pair, rtol=0, atol=close, msg=lambda m, name=name: name + m)
-    for name in ("number", "available_s", "onset_s", "is_valid", "is_alarm", "is_on"):
+        how = {"rtol": 0, "atol": close, "equal_nan": True}
+        torch.testing.assert_close(*pair, **how, msg=lambda m, name=name: name + m)
+    exact = ("number", "available_s", "onset_s", "is_valid", "in_range", "channels_lost")
+    for name in (*exact, "is_alarm", "is_on"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
@@ -154,6 +157,27 @@ def test_fast_evidence_leaves_out_channels_that_are_masked(masked):
     assert bool((found > -1e30).any()) == (len(masked) < 2)
 
 
+@pytest.mark.parametrize("backend", ["native", "torch"])
+def test_fast_evidence_that_is_lost_is_as_if_it_had_not_been(backend):
+    """Up to ``hold_s`` of samples; beyond, the next second has none, as at the beginning."""
+    if backend == "native" and why_not():
+        pytest.skip(why_not())
+    onset, hop = WITH_ONSET.onset, 10
+    samples = signal(9000, 6)
+    for num_lost, is_kept in ((1, True), (500, True), (560, False)):
+        holed = samples.clone()
+        holed[2:, 4000 : 4000 + num_lost] = torch.nan
+        lost = range(400, -(-(4000 + num_lost + onset.evidence.context) // hop))
+        found = OnsetStream(onset, backend=backend).push(holed)
+        assert (found[list(lost)] == NOTHING_YET).all()
+        expected = onset.score_recording(samples)[:400]
+        torch.testing.assert_close(found[:400], expected, rtol=0, atol=1e-8)
+        after = found[lost.stop :]
+        first = 0 if is_kept else onset.evidence.memory - 1 + 2
+        assert (after[:first] == NOTHING_YET).all()
+        assert (after[first:] > NOTHING_YET).all()
+
+
 # Times ------------------------------------------------------------------------------------------
 
 
@@ -168,28 +192,28 @@ def test_times_shift_what_comes_out_and_change_nothing_else(each, start_s):
     plain = in_pieces(stream_of(), samples)
     assert stream.num_gaps == 0
     assert len(plain.alarms) > 0
-    assert_same_but_times(joined([*parts, stream.flush()]), plain, start_s)
+    assert_same_but_times(joined_decisions([*parts, stream.flush()]), plain, start_s)
 
 
 @pytest.mark.parametrize("cuts", [[], [500, 1300, 1400, 2000, 2500]], ids=len)
 def test_a_long_gap_ends_the_stream_and_begins_another(cuts, caplog):
     samples = signal(3000, 6)
     times = np.arange(3000) / RATE
-    times[1300:] += 101 / RATE
+    times[1300:] += 501 / RATE  # one more than are filled up
     times[2000:] += 3600.0
     fresh, expected = stream_of(), []
     for a, b in ((0, 1300), (1300, 2000), (2000, 3000)):
         expected += [fresh.push(samples[:, a:b].T, float(times[a])), fresh.flush()]
-    expected, stream = joined(expected), stream_of()
+    expected, stream = joined_decisions(expected), stream_of()
     caplog.set_level(logging.WARNING)
     pushed = [stream.push(samples[:, a:b].T, times[a:b]) for a, b in pairwise([0, *cuts, 3000])]
-    found = joined([*pushed, stream.flush()])
+    found = joined_decisions([*pushed, stream.flush()])
     assert_same_but_times(found, expected, 0.0)
     assert (found.number == 0).sum() == 3
     assert stream.num_gaps == 2
     assert [record.getMessage() for record in caplog.records] == [
-        "the stream begins anew at 0.7005 s, behind a gap",
-        "the stream begins anew at 3601.0505 s, behind a gap",
+        "the stream begins anew at 0.9005 s, behind a gap",
+        "the stream begins anew at 3601.2505 s, behind a gap",
     ]
     stream.reset()
     assert stream.num_gaps == 0
@@ -205,7 +229,7 @@ def test_times_that_go_back_are_refused_and_change_nothing(times):
     before = stream.push(samples[:, :500].T, 0.0)
     with pytest.raises(ValueError, match=r"^time_s goes back: sample \d of these is at .*s, .*$"):
         stream.push(samples[:, 500:503].T, times)
-    found = joined([before, stream.push(samples[:, 500:].T, 0.25), stream.flush()])
+    found = joined_decisions([before, stream.push(samples[:, 500:].T, 0.25), stream.flush()])
     assert_same_but_times(found, in_pieces(stream_of(), samples), 0.0)
 
 
@@ -218,7 +242,7 @@ def test_a_clock_of_its_own_and_jitter_make_no_gaps(rng):
         time_s = 1.7e9 + first * period + rng.uniform(-0.2, 0.2) / RATE
         found.append(stream.push(samples, time_s))
     assert stream.num_gaps == 0
-    found = joined(found)
+    found = joined_decisions(found)
     assert found.is_valid.all()
     exact = 1.7e9 + (found.number.double() * 2000 + 125) * period
     assert (found.available_s - exact).abs().max() < 0.25 / RATE
@@ -245,7 +269,7 @@ def test_samples_may_come_in_any_form(form):
     samples = signal(700, 6, torch.float32).double()
     expected = in_pieces(stream_of(), samples)
     stream = stream_of()
-    found = joined([stream.push(FORMS[form](samples.T)), stream.flush()])
+    found = joined_decisions([stream.push(FORMS[form](samples.T)), stream.flush()])
     assert_same(found, expected)
     assert not found.score.requires_grad
 
@@ -253,8 +277,7 @@ def test_samples_may_come_in_any_form(form):
 def test_what_cannot_be_set_is_refused():
     for options, message in [
         ({"dtype": torch.float16}, r"dtype must be torch.float32 or torch.float64, got .*float16"),
-        ({"max_gap_s": -1.0}, r"max_gap_s must be finite and not negative, got -1.0"),
-        ({"max_gap_s": float("nan")}, r"max_gap_s must be"),
+        ({"masked_channels": ["PVDF3"]}, r"the channel 'PVDF3', which this hand does not have"),
     ]:
         with pytest.raises(ValueError, match=message):
             StreamingDetector(DETECTOR, settings_of(), **options)
@@ -273,11 +296,11 @@ def test_a_copy_of_a_running_stream_goes_on_by_itself(copied, rule):
     stream = stream_of(settings=settings_of(rule))
     before = [stream.push(samples[:, :1011].T, 7.0), stream.push(samples[:, 1011:1015].T)]
     twin = copied(stream)
-    rest = [joined([x.push(samples[:, 1015:].T), x.flush()]) for x in (stream, twin)]
+    rest = [joined_decisions([x.push(samples[:, 1015:].T), x.flush()]) for x in (stream, twin)]
     assert_same(rest[1], rest[0])
     assert torch.equal(rest[1].score, rest[0].score)
     whole = offline(DETECTOR, settings_of(rule), samples)
-    assert torch.equal(joined([*before, rest[0]]).is_alarm, whole.is_alarm)
+    assert torch.equal(joined_decisions([*before, rest[0]]).is_alarm, whole.is_alarm)
 
 
 # Gradients -------------------------------------------------------------------------------------
@@ -322,6 +345,66 @@ def test_gradients_of_a_stream_are_slopes(rng):
         torch.testing.assert_close((pull * way).sum(), slope, rtol=1e-4, atol=1e-6)
 
 
+# Decisions that are not valid -------------------------------------------------------------------
+
+
+def by_hand_with_gaps(rule, llrs, threshold, most, rearm, refractory):
+    """Statistic, alarms, what stands, and numbers where runs began, one after the other."""
+    known, lost, is_on, below, last_alarm, run = [], 0, False, 0, -math.inf, 0
+    rows = []
+    for number, llr in enumerate(llrs):
+        statistic, is_alarm = math.nan, False
+        if math.isnan(llr):
+            lost += 1
+            if lost > most:
+                known, is_on, below, run = [], False, 0, number + 1
+        else:
+            lost = 0
+            known.append(llr)
+            statistic = ORACLES[rule.name](rule, known)[-1]
+            below = below + 1 if statistic < threshold else 0
+            is_on = is_on and below < max(rearm, 1)
+            is_alarm = not is_on and below == 0 and number - last_alarm >= refractory
+            if is_alarm:
+                is_on, last_alarm = True, number
+            run = run if llr > 0 else number + 1
+        rows.append((statistic, is_alarm, is_on, min(run, number)))
+    return list(zip(*rows, strict=True))
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
+@given(
+    gaps=st.lists(st.tuples(st.integers(0, 199), st.integers(1, 20)), max_size=6),
+    cuts=st.lists(st.integers(0, 200), max_size=6),
+    hold_s=st.sampled_from([0.0, 0.02, 0.05]),
+    seed=st.integers(0, 2**20),
+)
+def test_decisions_that_are_not_valid_move_nothing_until_the_hold_is_over(
+    rule, gaps, cuts, hold_s, seed
+):
+    rng = np.random.default_rng(seed)
+    llrs = np.repeat(rng.normal(0.3, 1.5, 100), 2)
+    for start, num in gaps:
+        llrs[start : start + num] = math.nan
+    settings = replace(settings_of(rule), calibration=Platt(1.0, 0.0), hold_s=hold_s)
+    decider = Decider(settings, RATE, 100, 25, context_before=15)
+    score = torch.from_numpy(llrs)
+    is_valid = score.isfinite()
+    places = [0, *sorted(cuts), 200]
+    spoilt = torch.where(is_valid, score, 7.0)  # what a score says there does not count
+    found = joined_decisions(
+        [decider.decide(spoilt[a:b], is_valid[a:b]) for a, b in pairwise(places)]
+    )
+    most = -(-(100 + 25 + 15 + round(hold_s * RATE)) // HOP)
+    expected = by_hand_with_gaps(rule, llrs.tolist(), 1.0, most, rearm=2, refractory=5)
+    np.testing.assert_allclose(found.statistic, expected[0], rtol=1e-12)
+    assert found.is_alarm.tolist() == list(expected[1])
+    assert found.is_on.tolist() == list(expected[2])
+    assert torch.equal(found.score.isnan(), ~is_valid)
+    began_s = (np.array(expected[3]) * HOP + 125) / RATE - settings.lead_s
+    np.testing.assert_allclose(found.onset_s, began_s, rtol=0, atol=1e-12)
+
+
 # Decider.join ----------------------------------------------------------------------------------
 
 
@@ -346,11 +429,11 @@ def test_joined_decisions_by_a_plain_loop(rule, bin_hop, hop, frame):
         by_onset.append(float(onset[i]) >= settings.onset.threshold)
         high.append(by_onset[i] or bool(known and bins.statistic[known[-1]] >= settings.threshold))
         assert float(found.available_s[i]) == end / RATE
-        expected = (0.0, 0.5, False)
-        if known:
-            of_bins = (bins.score, bins.probability, bins.is_valid)
-            expected = tuple(float(x[known[-1]]) for x in of_bins)
-        assert (found.score[i], found.probability[i], found.is_valid[i]) == expected
+        for name in ("score", "probability", "llr", "statistic"):
+            wanted = getattr(bins, name)[known[-1]] if known else math.nan
+            np.testing.assert_equal(float(getattr(found, name)[i]), float(wanted), name)
+        assert found.is_valid[i]  # there is fast evidence always
+        assert bool(found.in_range[i]) == bool(known)
         began_s = end / RATE - (0.012 if by_onset[i] else 0.0)
         if known and not by_onset[i]:
             began_s = min(float(bins.onset_s[known[-1]]), end / RATE)

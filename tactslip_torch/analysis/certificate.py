@@ -94,13 +94,16 @@ class Comparison:
     """Bins scored in float32 and in float64.
 
     Args:
-        exact: ``[N]``, scores in float64.
-        rounded: ``[N]``, scores in float32.
+        exact: ``[N]``, scores in float64 of the channels that float32 resolves, NaN: not valid.
+        rounded: ``[N]``, scores in float32, likewise.
         stages: ``[N]`` each, what the score changed by the rounding in ``features`` (filter and
-            descriptors), ``scaler`` and ``head``; their sum is ``rounded - exact``.
+            descriptors), ``scaler`` and ``head``; their sum is ``rounded - exact``, 0 where
+            not valid.
         scaled: ``[N, K]``, scaled features in float64.
         scaled_error: ``[N, K]``, how far those in float32 are off.
-        is_valid: ``[N]``, bool, as the float32 pipeline flags it.
+        is_valid: ``[N]``, bool, as the float32 pipeline flags it, and the same channels are lost
+            in float64.
+        is_enough: ``[N]``, bool, whether enough channels are alive; else neither score is valid.
         covers: ``[N, C, 4]``, what each bin covers of the input (``coverage``).
     """
 
@@ -110,12 +113,14 @@ class Comparison:
     scaled: Tensor
     scaled_error: Tensor
     is_valid: Tensor
+    is_enough: Tensor
     covers: Tensor
 
     @property
     def error(self) -> Tensor:
-        """``[N]``, size of the score error; infinite where a score is not finite."""
-        return (self.rounded - self.exact).abs().nan_to_num(nan=math.inf, posinf=math.inf)
+        """``[N]``, size of the score error; infinite where one is not valid, 0 where none is."""
+        off = (self.rounded - self.exact).abs().nan_to_num(nan=math.inf, posinf=math.inf)
+        return off.masked_fill(~self.is_enough, 0.0)
 
     @property
     def flips(self) -> Tensor:
@@ -151,36 +156,46 @@ def compare(
 
 
 def _compared(double: SlipDetector, single: SlipDetector, samples: Tensor) -> dict[str, Tensor]:
-    exact = double.predict_raw(samples.double()).score  # as a program calls them
-    rounded, is_valid, *_ = single.predict_raw(samples.float())
-    features, scaled = _tapped(double, samples.double())
-    features32, scaled32 = _tapped(single, samples.float())
-    by_features = double.head(double.scaler(features32.double()))
-    by_scaler = double.head(scaled32.double())
-    return {
-        "exact": exact,
-        "rounded": rounded.double(),
-        "features": by_features - double.head(double.scaler(features)),
+    rounded, is_valid, *_ = single.predict_raw(samples.float())  # as a program calls it
+    # channels are lost in both that float32 does not resolve
+    features, scaled, lost = _tapped(double, samples.double())
+    features32, scaled32, lost32 = _tapped(single, samples.float())
+    is_valid &= (lost32 == lost).all(-1)
+    plain, by_scaler = double.predict_raw(samples.double()), double.head(scaled32.double())
+    is_same = (plain.channels_lost == lost).all(-1)
+    is_enough = (~lost).double() @ double.counted >= double.sensing.min_alive
+    by_features, of_features = (
+        double.head(double.imputed(double.scaler(x.double()), lost)) for x in (features32, features)
+    )
+    stages = {
+        "features": by_features - of_features,
         "scaler": by_scaler - by_features,
         "head": rounded.double() - by_scaler,
+    }
+    exact = torch.where(is_same, plain.score, double.head(scaled))
+    return {
+        "exact": torch.where(is_enough, exact, torch.nan),
+        "rounded": rounded.double(),
+        **{name: torch.where(is_valid, x, 0.0) for name, x in stages.items()},
         "scaled": scaled,
         "scaled_error": (scaled32.double() - scaled).abs(),
         "is_valid": is_valid,
+        "is_enough": is_enough,
         "covers": coverage(samples, double.channel_filter.valid(samples.double())),
     }
 
 
-def _tapped(detector: SlipDetector, samples: Tensor) -> tuple[Tensor, Tensor]:
-    """What the scaler was given, and what the head was given."""
+def _tapped(detector: SlipDetector, samples: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What the scaler was given, what the head was given, and which channels were lost."""
     taken: list[Tensor] = []
     stages = (detector.scaler, detector.head)
     hooks = [m.register_forward_pre_hook(lambda _, given: taken.extend(given)) for m in stages]
     try:
-        detector.predict_raw(samples)
+        found = detector.predict_raw(samples, given=torch.float32)
     finally:
         for hook in hooks:
             hook.remove()
-    return taken[0], taken[1]
+    return taken[0], taken[1], found.channels_lost
 
 
 class Certificate(NamedTuple):
@@ -232,7 +247,7 @@ def certify(
     given = {name: _with_digits(bins, generator) for name, bins in given.items()}
     sets = {name: compare(double, single, bins, name) for name, bins in given.items()}
     base = sets["calibration"]
-    sd = score_sd(base.exact)
+    sd = score_sd(base.exact[base.is_enough])
     size = (extremes, *calibration.shape[1:])
     kinds = {
         kind: compare(double, single, extreme_bins(kind, size, generator, torch.float32), kind)
@@ -388,7 +403,7 @@ def _set_facts(
         "bins": len(inside),
         "invalid": int((~compared.is_valid).sum()),
         "outside_range": int(_is_outside(compared.covers, detector, known).sum()),
-        "not_finite": int((~compared.rounded.isfinite()).sum()),
+        "not_finite": int((compared.is_enough & ~compared.rounded.isfinite()).sum()),
         "error": error_facts(compared.error, sd),
         "error_of_valid": error_facts(compared.error[compared.is_valid], sd),
         "stages": {name: error_facts(x.abs(), sd) for name, x in compared.stages.items()},

@@ -212,7 +212,7 @@ def check_bins(run: Run, detector: SlipDetector, precision: Precision) -> dict[s
     length, unit = RawBin.of(detector).length, _unit_of(detector)
     slip = unit * simulated_bins(hand, detector.pool.sample_rate_hz, _SIMULATED, length, dtype)
     exact = copy.deepcopy(detector).double()
-    sd = float(_predicted(exact, slip.double()).score.std()) or 1.0
+    sd = _deviation(_predicted(exact, slip.double()).score.numpy())
     compare = _BinComparison(run, precision, exact, sd)
     worst = compare(slip, "simulated bins")
     for seed, batch in enumerate(_BATCHES):
@@ -362,7 +362,7 @@ def check_stream(run: Run, detector: SlipDetector, precision: Precision) -> dict
     samples = _unit_of(detector) * slip.T[torch.arange(num) % slip.shape[1]]
     exact = copy.deepcopy(detector).double()
     usual = _decided(exact, samples, settings)
-    sd = float(np.nanstd(usual["score"])) or 1.0
+    sd = _deviation(usual["score"])
     compare = _StreamComparison(run, precision, exact, sd)
     generator = np.random.default_rng(0)
     anyhow = np.cumsum(generator.integers(0, 400, num) * (generator.random(num) < 0.8))
@@ -378,7 +378,7 @@ def check_stream(run: Run, detector: SlipDetector, precision: Precision) -> dict
         middling = replace(settings, threshold=_middle_threshold(usual["statistic"]))
     else:
         known = usual["onset_score"][usual["onset_score"] > NOTHING_YET]
-        onset = replace(settings.onset, threshold=_middle_threshold(known) if len(known) else 0.0)
+        onset = replace(settings.onset, threshold=_middle_threshold(known))
         middling = replace(settings, onset=onset)
     compare(samples, middling, by_hop, "another threshold")
     broken = _broken(samples, detector.needed_index.tolist())
@@ -492,8 +492,17 @@ def _off(got: NDArray[Any], expected: NDArray[Any]) -> NDArray[Any]:
     return np.where(none | (got == expected), 0.0, np.nan_to_num(off, nan=np.inf))
 
 
+def _deviation(score: NDArray[Any]) -> float:
+    """Standard deviation of the scores of valid decisions; 1 if they do not differ."""
+    known = score[np.isfinite(score)]
+    return float(known.std()) or 1.0 if len(known) else 1.0
+
+
 def _middle_threshold(statistic: NDArray[Any]) -> float:
     """A threshold that the statistic crosses, in the widest gap between its middling values."""
+    statistic = statistic[np.isfinite(statistic)]
+    if not len(statistic):
+        return 0.0
     low, high = np.quantile(statistic, [0.5, 0.95])
     values = np.unique(statistic[(low <= statistic) & (statistic <= high)])
     if len(values) < 2:

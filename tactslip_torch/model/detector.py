@@ -332,8 +332,10 @@ class SlipDetector(nn.Module):
         """Scaled columns, which the head takes; shapes as ``columns`` has them."""
         columns = self.columns(saturating(features, self.scaler.minimum.dtype), is_lost)
         scaled: Tensor = self.scaler(columns).to(self.imputation.dtype)
-        if is_lost is None:
-            return scaled
+        return scaled if is_lost is None else self.imputed(scaled, is_lost)
+
+    def imputed(self, scaled: Tensor, is_lost: Tensor) -> Tensor:
+        """Scaled columns ``[*, K]`` with imputation values in those of lost channels ``[*, C]``."""
         pooled = torch.zeros_like(is_lost[..., :1])  # a pooled column is of the other channels
         is_filled = torch.cat([is_lost, pooled], -1).index_select(-1, self.channel_index)
         return torch.where(is_filled, self.imputation, scaled)

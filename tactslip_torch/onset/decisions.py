@@ -631,7 +631,7 @@ def _walk(
                 state.run = runs[-1]
         else:
             if state.lost > most and settings is not None:
-                state.rule = settings.rule.start(torch.zeros(())).tolist()
+                state.rule = settings.rule.start(torch.zeros(()).double()).tolist()
             state.lost, statistic = 0, own
             if settings is not None:
                 statistic, state.rule = settings.rule.scan_row(own, state.rule, one)

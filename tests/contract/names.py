@@ -97,7 +97,8 @@ ALARM_INFO = "alarm"  # in the detector's info
 TRAINING_RECORDINGS = "train_recordings"  # in the detector's info
 
 # Graphs: inputs and outputs
-BIN_INPUT, BIN_OUTPUTS = "samples", ("score", "probability", "valid")
+BIN_INPUT = "samples"
+BIN_OUTPUTS = ("score", "probability", "valid", "in_range", "channels_lost")
 STREAM_INPUTS = ("samples", "tail", "state", "threshold")
 STREAM_HANDED_ON = {"tail": "next_tail", "state": "next_state"}
 STREAM_OUTPUTS = {

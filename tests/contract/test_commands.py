@@ -135,7 +135,8 @@ def test_detect_does_without_masked_channels(command, selected, recordings, tmp_
     command.well(tmp_path, "detect", *told, *masked)
     (one,) = read(tmp_path / "run" / names.ONSETS[0])["recordings"]
     assert list((tmp_path / "run").glob("*.png"))
-    assert one["decisions"]["invalid"] == one["decisions"]["number"] > 100
+    assert one["decisions"]["number"] > 100
+    assert one["decisions"]["invalid"] == 0  # the others are enough
 
 
 # Data, generate ----------------------------------------------------------------------------------

@@ -26,13 +26,16 @@ def test_a_saved_detector_scores_as_before(trained, bins, tmp_path):
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_broken_channel_is_flagged_and_the_score_stays_finite(trained, bins, bad):
+def test_a_broken_channel_is_left_out_and_a_broken_hand_has_no_score(trained, bins, bad):
     x = bins.clone()
     x[3, 2, 40] = bad
-    predicted = trained.detector.predict_raw(x)
-    assert predicted.score.isfinite().all()
-    assert not predicted.is_valid[3]
-    assert predicted.is_valid[torch.arange(len(x)) != 3].all()
+    x[4, :, 40] = bad
+    predicted, usual = trained.detector.predict_raw(x), trained.detector.predict_raw(bins)
+    assert torch.equal(predicted.score.isfinite(), predicted.is_valid)
+    assert predicted.is_valid.tolist() == [row != 4 for row in range(len(x))]
+    assert predicted.channels_lost[3].nonzero().tolist() == [[2]]
+    is_whole = ~predicted.channels_lost.any(-1)
+    torch.testing.assert_close(predicted.score[is_whole], usual.score[is_whole])
 
 
 def test_scores_have_gradients_to_the_volts(trained, bins):

@@ -46,6 +46,7 @@ def kinds_of_bin(detector):
     broken = plain.copy()
     broken[::2, 1, 60] = np.nan
     broken[1::2, 2, 70] = np.inf
+    broken[3::7, :, 80] = np.nan
     absent = plain.copy()
     absent[:, NAMES.index(detector.pool.hand.names[detector.needed_index[0]])] = np.nan
     shapes = [np.where(time < 75, 0.0, 5.0), np.where(time % 2 == 0, -5.0, 5.0), time / 100.0]
@@ -68,17 +69,26 @@ def test_the_bin_graph_scores_as_the_detector(exported, kind):
     kinds = kinds_of_bin(detector)
     session, bins = session_of(folder / BIN_GRAPH), kinds[kind].astype(precision)
     found = dict(zip(BIN_OUTPUTS, session.run(BIN_OUTPUTS, {BIN_INPUT: bins}), strict=True))
-    expected = detector.predict_raw(torch.from_numpy(bins).double())
+    given = torch.from_numpy(bins)
+    expected = detector.predict_raw(given.double(), given=given.dtype)
     ordinary = detector.predict_raw(torch.from_numpy(kinds["ordinary"]).double()).score
     scores = expected.score.numpy()
-    bound = CLOSE[precision] * (float(ordinary.std()) + np.abs(scores))
-    assert (np.abs(found["score"] - scores) <= bound).all()
+    valid = expected.is_valid.numpy()
+    bound = CLOSE[precision] * (float(ordinary.std()) + np.abs(scores[valid]))
+    assert (np.abs(found["score"] - scores)[valid] <= bound).all()
     assert found["score"].dtype == precision
-    assert np.array_equal(found["valid"], expected.is_valid.numpy())
-    assert (found["probability"] >= 0).all()
-    assert (found["probability"] <= 1).all()
-    assert found["valid"].all() or kind in ("broken", "without a channel", "shapes")
-    assert not found["valid"].any() or kind != "without a channel"
+    for name, flags in (("valid", valid), ("channels_lost", expected.channels_lost)):
+        assert np.array_equal(found[name], flags), name
+    for name in ("score", "probability"):
+        assert np.array_equal(np.isfinite(found[name]), valid), name
+    assert (found["probability"][valid] >= 0).all()
+    assert (found["probability"][valid] <= 1).all()
+    assert valid.all() == (kind not in ("broken", "shapes"))
+    assert found["channels_lost"].any(-1).all() or kind != "without a channel"
+
+
+LOST = {False: {()}, True: {(), tuple(NAMES[1:3]), tuple(NAMES)}}
+"""Some of the channels that are lost together, in a whole stream and in a broken one."""
 
 
 class Fed:
@@ -108,13 +118,15 @@ def test_the_stream_graph_decides_as_the_stream(exported, cuts, is_broken):
     samples = samples_of("D", 1)[1000:5000].copy()
     if is_broken:
         samples[2000:2010, 1:3] = np.nan
+        samples[3000:3010] = np.nan
     graph = Fed(folder / STREAM_GRAPH, precision)
     parts = [graph.push(samples[a:b]) for a, b in pairwise([0, *cuts, len(samples)])]
     stream = names.StreamingDetector(detector, dtype=torch.float64)
     expected = stream.push(samples)
     assert expected.is_alarm.any()
     assert expected.is_valid.all() != is_broken
-    spread = {"score": float(expected.score.std()), "statistic": float(expected.statistic.std())}
+    assert {expected.names_lost(i) for i in range(len(expected.score))} >= LOST[is_broken]
+    spread = {name: np.nanstd(getattr(expected, name)) for name in ("score", "statistic")}
     for name, field in names.STREAM_OUTPUTS.items():
         values = np.concatenate([part[name] for part in parts])
         truth = getattr(expected, field).numpy()
