@@ -365,21 +365,85 @@ _OF_BINS = ("onset_s", "score", "llr", "probability", "statistic", "is_valid", "
 Channels that are lost come behind."""
 
 
-@dataclass
-class _Row:
-    """What is remembered of one stream between two decisions.
+class _Walked(NamedTuple):
+    """What a rule makes of decisions of one stream; a list each.
 
     Attributes:
-        rule: memory of the rule.
-        latch: of its alarm.
-        run: number of the decision with which the unbroken run of positive ratios began.
-        lost: decisions in a row that are not valid.
+        statistic: NaN where not valid.
+        alarms: which raise one.
+        standing: whether one stands after each.
+        runs: number of the decision with which the unbroken run of positive ratios began.
     """
 
-    rule: list[float]
-    latch: Latch = Latch()  # noqa: RUF009  # a tuple: armed, with no alarm before
-    run: int = 0
-    lost: int = 0
+    statistic: list[float]
+    alarms: list[bool]
+    standing: list[bool]
+    runs: list[int]
+
+
+class _StreamRule:
+    """The rule and the latch of one stream, and what they remember.
+
+    Args:
+        rule: from ratios to statistics; ``None``: they are statistics.
+        threshold: of the statistic.
+        latch_times: of the latch.
+        most: decisions in a row that may be lost until all begins anew.
+    """
+
+    def __init__(
+        self, rule: Rule | None, threshold: float, latch_times: Mapping[str, int], most: int
+    ) -> None:
+        self._rule, self._threshold, self._most = rule, threshold, most
+        self._latch_times, self._latch = latch_times, Latch()
+        self._run, self._lost, self._memory = 0, 0, list[float]()
+        self._begin()
+
+    def walk(self, ratios: Array, number: int) -> _Walked:
+        """The next decisions ``[m]``, NaN where not valid; the number of the first of them."""
+        lost, found = np.isnan(ratios), _Walked([], [], [], [])
+        for part in np.split(np.arange(len(ratios)), np.flatnonzero(np.diff(lost)) + 1):
+            if not len(part):
+                continue
+            if lost[part[0]]:
+                kept = max(self._most - self._lost, 0)  # decisions that change nothing
+                self._lost += len(part)
+                runs = np.full(len(part), self._run)
+                parts = [self._latched(ratios[part[:kept]].tolist())]
+                if len(part) > kept:
+                    self._latch = self._latch._replace(is_on=False, below=0)
+                    parts.append(self._latched(ratios[part[kept:]].tolist()))
+                    runs[kept:] = number + part[kept:] + 1
+                statistic = ratios[part].tolist()
+            else:
+                if self._lost > self._most:
+                    self._begin()
+                self._lost, statistic = 0, ratios[part].tolist()
+                if self._rule is not None:
+                    statistic, self._memory = self._rule.scan_row(
+                        statistic, self._memory, ratios.dtype.type
+                    )
+                parts = [self._latched(statistic)]
+                began = np.where(ratios[part] > 0, self._run, number + part + 1)
+                runs = np.maximum.accumulate(began)
+            self._run = int(runs[-1])
+            found.statistic.extend(statistic)
+            found.runs.extend(runs.tolist())
+            for alarms, standing in parts:
+                found.alarms.extend(alarms)
+                found.standing.extend(standing)
+        return found
+
+    def _begin(self) -> None:
+        """Forget all that the rule gathered."""
+        if self._rule is not None:
+            self._memory = self._rule.start(torch.zeros(()).double()).tolist()
+
+    def _latched(self, statistic: list[float]) -> tuple[list[bool], list[bool]]:
+        alarms, standing, self._latch = latch(
+            statistic, self._threshold, **self._latch_times, state=self._latch
+        )
+        return alarms, standing
 
 
 class Decider:
@@ -437,11 +501,11 @@ class Decider:
     def reset(self) -> None:
         """Forget everything; the next decision is number 0 of a stream that begins at 0."""
         self._number = 0  # Python's integers do not end
-        self._rows: list[_Row] | None = None
+        self._rules: list[_StreamRule] | None = None
         self._hop = 0  # of the next onset score
         self._known: Array | None = None  # of bins, those that count from the next hop on
         self._first_known = -1  # number of the first of them
-        self._alarm_rows: list[_Row] = []
+        self._alarm_rules: list[_StreamRule] = []
 
     def decide(
         self,
@@ -469,23 +533,19 @@ class Decider:
         num = score.shape[-1]
         ratios = llr.numpy().reshape(math.prod(score.shape[:-1]), num)
         one = ratios.dtype.type
-        if self._rows is None:
-            start = settings.rule.start(llr.new_zeros(())).tolist()
-            self._rows = [_Row(list(start)) for _ in ratios]
-        most = most_lost(self._window, self._hold, settings.hop_samples)
-        threshold = float(one(settings.threshold))
+        if self._rules is None:
+            threshold = float(one(settings.threshold))
+            self._rules = self._rules_of(
+                settings.rule, threshold, settings.hop_samples, len(ratios)
+            )
         walked = [
-            _walk(row, of_row, settings, self._latch_times, threshold, self._number, most, one)
-            for row, of_row in zip(ratios, self._rows, strict=True)
+            rule.walk(row, self._number) for row, rule in zip(ratios, self._rules, strict=True)
         ]
-        statistic: Array
-        alarms: Array
-        standing: Array
-        runs: Array
-        statistic, alarms, standing, runs = (
+        columns: list[Array] = [
             np.array([of[part] for of in walked], kind).reshape(score.shape)
             for part, kind in enumerate((one, bool, bool, np.int64))
-        )
+        ]
+        statistic, alarms, standing, runs = columns
         number = np.arange(self._number, self._number + num)
         self._number += num
         samples = number * settings.hop_samples + self._first
@@ -529,8 +589,9 @@ class Decider:
         if known is None:  # before all bins, number -1
             says_nothing = [math.inf, *[math.nan] * 4, 0.0, 0.0, *[0.0] * len(self._channels)]
             known = np.multiply.outer(says_nothing, np.ones((*scores.shape[:-1], 1)))
-            num_streams = int(np.prod(scores.shape[:-1]))
-            self._first_known, self._alarm_rows = -1, [_Row([]) for _ in range(num_streams)]
+            num_streams, hop = math.prod(scores.shape[:-1]), onset.evidence.hop_samples
+            self._first_known = -1
+            self._alarm_rules = self._rules_of(None, 1.0, hop, num_streams)
         if bins.score.shape[-1]:
             lost = bins.channels_lost.movedim(-1, 0).numpy()
             made = [*(getattr(bins, name).numpy() for name in _OF_BINS), *lost]
@@ -551,12 +612,8 @@ class Decider:
             is_high = by_onset | (of_bin[3] >= of_bin.dtype.type(settings.threshold))
         is_valid = (said[5] > 0) | (scores > NOTHING_YET)
         rows = np.where(is_valid, is_high * 1.0, np.nan)
-        rows = rows.reshape(len(self._alarm_rows), len(number))
-        most = most_lost(self._window, self._hold, onset.evidence.hop_samples)
-        walked = [
-            _walk(row, of_row, None, self._latch_times, 1.0, 0, most, float)
-            for row, of_row in zip(rows, self._alarm_rows, strict=True)
-        ]
+        rows = rows.reshape(len(self._alarm_rules), len(number))
+        walked = [rule.walk(row, 0) for row, rule in zip(rows, self._alarm_rules, strict=True)]
         alarms, standing = (
             np.array([of[part] for of in walked], bool).reshape(scores.shape) for part in (1, 2)
         )
@@ -580,72 +637,12 @@ class Decider:
             self._channels,
         )
 
-    @property
-    def _hold(self) -> int:
-        """Lost samples in a row up to which rules keep their state."""
-        return round(self.settings.hold_s * self._rate)
-
-
-def _walk(
-    ratios: Array,
-    state: _Row,
-    settings: AlarmSettings | None,
-    latch_times: Mapping[str, int],
-    threshold: float,
-    number: int,
-    most: int,
-    one: Any,
-) -> tuple[list[float], list[bool], list[bool], list[int]]:
-    """Statistics, alarms, whether one stands, and where runs began, of one stream.
-
-    Args:
-        ratios: of the next decisions, NaN where not valid.
-        state: updated.
-        settings: with the rule; None: ratios are statistics.
-        latch_times: of the latch.
-        threshold: of the statistic.
-        number: of the first decision.
-        most: decisions in a row that may be lost until all begins anew.
-        one: dtype of the ratios.
-    """
-    lost = np.isnan(ratios)
-    edges = np.flatnonzero(lost[1:] != lost[:-1]) + 1
-    found: tuple[list[Any], list[Any], list[Any], list[Any]] = [], [], [], []
-    for part in np.split(np.arange(len(ratios)), edges) if len(ratios) else ():
-        own = ratios[part].tolist()
-        if lost[part[0]]:
-            statistic = own
-            kept = max(most - state.lost, 0)  # decisions that change nothing
-            alarms, standing, state.latch = latch(
-                own[:kept], threshold, **latch_times, state=state.latch
-            )
-            runs = [state.run] * len(alarms)
-            state.lost += len(own)
-            if num := len(own) - len(alarms):
-                state.latch = state.latch._replace(is_on=False, below=0)
-                more, off, state.latch = latch(
-                    own[kept:], threshold, **latch_times, state=state.latch
-                )
-                alarms, standing = alarms + more, standing + off
-                runs += (number + part[-num:] + 1).tolist()
-                state.run = runs[-1]
-        else:
-            if state.lost > most and settings is not None:
-                state.rule = settings.rule.start(torch.zeros(()).double()).tolist()
-            state.lost, statistic = 0, own
-            if settings is not None:
-                statistic, state.rule = settings.rule.scan_row(own, state.rule, one)
-            alarms, standing, state.latch = latch(
-                statistic, threshold, **latch_times, state=state.latch
-            )
-            numbers = number + part
-            began = np.where(ratios[part] > 0, state.run, numbers + 1)
-            runs = np.maximum.accumulate(began).tolist()
-            state.run = runs[-1]
-        made: tuple[list[Any], ...] = statistic, alarms, standing, runs
-        for whole, more_of in zip(found, made, strict=True):
-            whole.extend(more_of)
-    return found
+    def _rules_of(
+        self, rule: Rule | None, threshold: float, hop_samples: int, num: int
+    ) -> list[_StreamRule]:
+        """As many as there are streams, of decisions a hop apart."""
+        most = most_lost(self._window, round(self.settings.hold_s * self._rate), hop_samples)
+        return [_StreamRule(rule, threshold, self._latch_times, most) for _ in range(num)]
 
 
 class StreamStatistic(NamedTuple):
