@@ -14,10 +14,10 @@ from tactslip_torch.features.sensing import (
     Sensing,
     StuckChannels,
     least_alive,
+    level_message,
     level_ratio,
     longest_runs,
     most_stuck_samples,
-    told_of_levels,
 )
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, joined_decisions
@@ -229,9 +229,9 @@ def test_levels_are_told_in_a_line():
     sensing = Sensing((1.0, 2.0, 0.0), (9.0, 9.0, 9.0), 1, 200)
     span = torch.tensor([1.0, 2.0, 5.0]).expand(20, 3)
     assert level_ratio(span, sensing) == 1.0
-    assert not told_of_levels(level_ratio(0.3 * span, sensing), "V")
-    assert told_of_levels(level_ratio(1e-3 * span, sensing), "V").endswith("is the unit V?")
-    assert "40 times" in told_of_levels(level_ratio(40 * span, sensing), "V")
+    assert not level_message(level_ratio(0.3 * span, sensing), "V")
+    assert level_message(level_ratio(1e-3 * span, sensing), "V").endswith("is the unit V?")
+    assert "40 times" in level_message(level_ratio(40 * span, sensing), "V")
     assert level_ratio(torch.full((4, 3), torch.nan), sensing) is None
 
 

@@ -24,7 +24,7 @@ from tactslip_torch.data.file_recordings import FileRecordings, Inspected
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest, write_template
 from tactslip_torch.data.manifest import Problem
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.features.sensing import level_ratio, told_of_levels, without_stuck
+from tactslip_torch.features.sensing import level_message, level_ratio, without_stuck
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.report.recordings import (
@@ -215,7 +215,7 @@ def _levels(config: DictConfig, source: FileRecordings) -> list[Problem]:
     def one(recording: RecordingId) -> str:
         samples = source.load(recording).samples[:, : round(_LEVELS_S * pool.sample_rate_hz)]
         found = score_stream(detector, without_stuck(samples, stuck), pool.bin_samples)
-        return told_of_levels(level_ratio(found.span, detector.sensing), source.units)
+        return level_message(level_ratio(found.span, detector.sensing), source.units)
 
     told = in_processes(one, source.ids, "comparing levels", "recording", config.num_workers)
     return [

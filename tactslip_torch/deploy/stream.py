@@ -502,8 +502,8 @@ def onset_scores(
     if hop >= FEWEST_BLOCK_SAMPLES:
         own = frames.slice(context, END, 1)
         moves = moves & ~(own - own.slice(0, 1, 1)).abs().amax(1).eq(0.0)
-    is_told = graph.constant(evidence.silence.isinf().all(0).numpy(), BOOL)
-    alive = of_fast.sum(1).isfinite() & (moves | is_told)
+    never_silent = graph.constant(evidence.silence.isinf().all(0).numpy(), BOOL)
+    alive = of_fast.sum(1).isfinite() & (moves | never_silent)
     is_known = alive.cast(F64).sum(1) >= float(evidence.min_alive or 1)  # [k]
     longest, num_floor = evidence.windows[-1], evidence.memory - evidence.windows[-1]
 

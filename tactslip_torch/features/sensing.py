@@ -293,7 +293,7 @@ def level_ratio(span: Tensor, sensing: Sensing) -> float | None:
     return float(ratio.median()) if len(ratio) else None
 
 
-def told_of_levels(ratio: float | None, unit: str) -> str:
+def level_message(ratio: float | None, unit: str) -> str:
     """One line on levels that are far from those of training; empty where they are not."""
     if ratio is None or 1 / LEVEL_FACTOR <= ratio <= LEVEL_FACTOR:
         return ""

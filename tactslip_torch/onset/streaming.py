@@ -8,6 +8,7 @@ to the scores it is one call of the native engine, where that can be used.
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from tactslip_torch.features.sensing import StuckChannels, level_ratio, told_of_levels
+from tactslip_torch.features.sensing import StuckChannels, level_message, level_ratio
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.prediction import ChannelMask, Prediction, masked_names
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, Decisions, joined_decisions
@@ -31,6 +32,7 @@ Array = NDArray[Any]
 
 _LEVELS_S = 2.0  # of stream, from which levels at rest are taken
 _MOST_NAMES = 6  # in an event
+_MOST_EVENTS = 1000  # that wait
 
 
 class StreamEvent(NamedTuple):
@@ -96,7 +98,7 @@ class StreamingDetector:
         self.settings = AlarmSettings.of(detector) if settings is None else settings
         self.dtype = dtype
         self.num_gaps = 0
-        self._events: list[StreamEvent] = []
+        self._events = deque[StreamEvent](maxlen=_MOST_EVENTS)
         self.masked_channels = masked_names(masked_channels, pool.hand.names)
         self._clock = SampleClock(pool.sample_rate_hz)
         self._max_gap = round(self.settings.hold_s * pool.sample_rate_hz)
@@ -214,10 +216,11 @@ class StreamingDetector:
     def take_events(self) -> list[StreamEvent]:
         """What happened to the hand since the last call, for people to read.
 
-        Decisions that are no longer valid, and valid again; channels that are lost for longer than
-        ``settings.hold_s``, and back; levels that are far from those of training.
+        Decisions that are not valid for longer than ``settings.hold_s``, and valid again; channels
+        that are lost for longer than that, and back; levels that are far from those of training.
         """
-        events, self._events[:] = list(self._events), []
+        events = list(self._events)
+        self._events.clear()
         return events
 
     def reset(self) -> None:
@@ -230,7 +233,7 @@ class StreamingDetector:
         self._decider.reset()
         self._held = np.empty((len(self.detector.pool.hand), 0), _NUMPY[self._wide])
         self._stuck = StuckChannels(self.detector.sensing.stuck_samples)
-        self._watch = _Watch(self.detector, self.settings, self._events)
+        self._hand_events = _HandEvents(self.detector, self.settings, self._events)
         self._start_of_held = 0  # its first sample's place in the stream
         self._number = 0  # of the next decision on a bin
         onset, backend = self.settings.onset, self.detector.extractor.backend
@@ -326,7 +329,7 @@ class StreamingDetector:
                 windows, given=self.dtype, masked_channels=self._masked_channels or None
             )
             decisions = self._decider.decide(*found[:-1])
-            self._watch.take(found, decisions)
+            self._hand_events.take(found, decisions)
         self._number += count
         self._drop()
         return decisions
@@ -421,20 +424,20 @@ def _times(time_s: ArrayLike | Tensor | None, num: int) -> Array:
     return stamps.reshape(-1)[:num].astype(np.float64)
 
 
-class _Watch:
-    """Tells what happens to the channels of a stream (``StreamingDetector.take_events``)."""
+class _HandEvents:
+    """Reports what happens to the channels of a stream (``StreamingDetector.take_events``)."""
 
     def __init__(
-        self, detector: SlipDetector, settings: AlarmSettings, events: list[StreamEvent]
+        self, detector: SlipDetector, settings: AlarmSettings, events: deque[StreamEvent]
     ) -> None:
         rate_hz, hop = detector.pool.sample_rate_hz, settings.hop_samples
         self._detector, self._events = detector, events
         self._hold = max(round(settings.hold_s * rate_hz) // hop, 1)  # decisions
         self._spans: list[Tensor] | None = []
         self._num_spans = max(round(_LEVELS_S * rate_hz) // hop, 1)
-        self._is_valid = True
-        self._changed = np.zeros(len(detector.pool.hand), np.int64)  # decisions in a row
-        self._lost = np.zeros(len(detector.pool.hand), bool)  # as it was told
+        # which channels are lost and, behind them, whether decisions are not valid
+        self._reported = np.zeros(len(detector.pool.hand) + 1, bool)
+        self._changed = np.zeros(len(self._reported), np.int64)  # decisions in a row
 
     def take(self, found: Prediction, decisions: Decisions) -> None:
         """What is found of the next bins."""
@@ -442,33 +445,26 @@ class _Watch:
         if self._spans is not None:
             self._spans.append(found.span)
             if sum(map(len, self._spans)) >= self._num_spans:
-                info = self._detector.info
                 ratio = level_ratio(torch.cat(self._spans), self._detector.sensing)
-                self._tell(time_s[-1], told_of_levels(ratio, info.get("units", "V")))
+                text = level_message(ratio, self._detector.info.get("units", "V"))
+                self._events.extend([StreamEvent(time_s[-1], text)] if text else [])
                 self._spans = None
-        valid, lost = found.is_valid.tolist(), found.channels_lost.numpy()
-        if all(valid) and self._is_valid and not lost.any() and not self._lost.any():
-            self._changed[:] = 0
-            return
-        names = self._detector.pool.hand.names
-        for own_s, is_valid, own in zip(time_s, valid, lost, strict=True):
-            if is_valid != self._is_valid:
-                what = "valid again" if is_valid else f"not valid: {_listed(names, own)} lost"
-                self._tell(own_s, f"decisions are {what}")
-                self._is_valid = is_valid
-            self._changed = np.where(own != self._lost, self._changed + 1, 0)
-            is_told = self._changed > self._hold
-            if not is_told.any():
-                continue
-            for lost_now, what in ((True, "lost"), (False, "back")):
-                if (which := is_told & (own == lost_now)).any():
-                    self._tell(own_s, f"channels {what}: {_listed(names, which)}")
-            self._lost = np.where(is_told, own, self._lost)
-            self._changed[is_told] = 0
+        states = np.concatenate([found.channels_lost, ~found.is_valid[:, None]], 1)
+        for own_s, state in zip(time_s, states, strict=True):
+            self._changed = np.where(state != self._reported, self._changed + 1, 0)
+            if (is_new := self._changed > self._hold).any():
+                self._report(own_s, state, is_new)
+                self._reported[is_new], self._changed[is_new] = state[is_new], 0
 
-    def _tell(self, time_s: float, text: str) -> None:
-        if text:
-            self._events.append(StreamEvent(time_s, text))
+    def _report(self, time_s: float, state: Array, is_new: Array) -> None:
+        names, texts = self._detector.pool.hand.names, []
+        if is_new[-1]:
+            lost = f"not valid: {_listed(names, state[:-1])} lost"
+            texts.append(f"decisions are {lost if state[-1] else 'valid again'}")
+        for is_lost, what in ((True, "lost"), (False, "back")):
+            if (which := is_new[:-1] & (state[:-1] == is_lost)).any():
+                texts.append(f"channels {what}: {_listed(names, which)}")
+        self._events.extend(StreamEvent(time_s, text) for text in texts)
 
 
 def _listed(names: Sequence[str], which: Array) -> str:
