@@ -62,7 +62,7 @@ def test_a_repr_tells_what_it_is_in_a_line() -> None:
         assert len(repr(thing)) < 300
     found = detector.predict_raw(raw_bins(6))
     slip = int((found.score >= 0).sum())
-    assert f"6 bins: {slip} slip, {6 - slip} non-slip; 6 valid" in repr(found)
+    assert f"6 bins: {slip} slip, {6 - slip} non-slip, 0 not valid; 0 with lost" in repr(found)
 
 
 def test_a_detector_tells_probabilities_of_raw_and_of_filtered_bins() -> None:

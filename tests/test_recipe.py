@@ -261,7 +261,7 @@ def told_apart(rng, pool):
     statistics = TrainingStatistics(len(pool.names), 50)
     for group in "ab":
         is_slip = torch.arange(60) % 2 == 0
-        features = torch.from_numpy(rng.standard_normal((60, len(pool.names))))
+        features = 10.0 + torch.from_numpy(rng.standard_normal((60, len(pool.names))))  # spans too
         features += torch.from_numpy(rng.random(len(pool.names))) * is_slip[:, None]
         statistics.update(group, group, features.float(), is_slip)
     return statistics

@@ -31,7 +31,7 @@ from tactslip_torch.hand import HandLayout
 SILENT_FRACTION = 0.1
 """Of the smallest span at rest in training, below which a channel is silent."""
 FEWEST_SAMPLES = 16
-"""Of a bin that may be silent."""
+"""Of a bin whose span can tell that a channel is silent."""
 RANGE_FACTOR = 3.0
 """By which a span may lie outside those of training and still count as in range."""
 LEVEL_FACTOR = 10.0
