@@ -23,7 +23,6 @@ COMMANDS = {
     "importance": "which sensors matter",
     "crossval": "every choice of held-out materials",
     "pareto": "the most accurate detector within a deadline",
-    "certify": "what float32 does to a detector",
     "calibrate-simulator": "set the free parameters of the simulator",
     "hosts": "copy a program that runs an exported detector: python, c, node or web",
 }

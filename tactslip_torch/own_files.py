@@ -461,12 +461,6 @@ SCHEMAS: Mapping[str, Wanted] = {
         "detector_sha256": str,
         "calibration?": _CALIBRATION,
         "check": {"worst_sd": _number(0, 1e300), "*": object},
-        "certificate?": {
-            "holds": bool,
-            "simulated?": bool,
-            "margin": _number(0, 1e300),
-            "*": object,
-        },
         "*": object,
     },
     CHECKPOINT: _CHECKPOINT,
