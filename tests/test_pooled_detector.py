@@ -156,7 +156,7 @@ def test_sensors_select_nothing_anew_where_all_is_pooled(override, pooled_run, t
         sensors_of(pooled_run, tmp_path, override)
 
 
-@pytest.mark.parametrize("what", ["statistics=true", "tuning=gradient"])
+@pytest.mark.parametrize("what", ["tuning=gradient"])
 def test_what_needs_channel_features_says_so(what, tmp_path):
     said = f"^{what.removesuffix('=gradient')} needs a machine of degree 2.* take recipe=robust or "
     with pytest.raises(ValueError, match=said) as caught:

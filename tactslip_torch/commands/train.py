@@ -32,8 +32,6 @@ from tactslip_torch.onset.decisions import KEY, Scorer, calibration_of
 from tactslip_torch.own_files import read_checkpoint
 from tactslip_torch.report.results import print_results, tuning_figure, write_results
 from tactslip_torch.runtime import is_first_process, whole_file
-from tactslip_torch.training.adaptation import FILE as STATISTICS
-from tactslip_torch.training.adaptation import Statistics
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
 from tactslip_torch.training.datamodule import SlipDataModule, training_origin
 from tactslip_torch.training.experiment import (
@@ -82,12 +80,10 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     tuning: Tuning | None = instantiate(config.tuning, _convert_="all") or None
     if config.trainer.get("fast_dev_run"):
         tuning = None  # a batch has no materials to hold out
-    if config.statistics:
-        recipe.check_quadratic("statistics=true")
-    if config.ckpt_path is not None and (config.statistics or tuning):
+    if config.ckpt_path is not None and tuning:
         raise ValueError(
-            f"{'statistics=true' if config.statistics else 'tuning'} needs the first pass, which "
-            "ckpt_path skips; train without ckpt_path (features come from the cache)"
+            "tuning needs the first pass, which ckpt_path skips; train without ckpt_path "
+            "(features come from the cache)"
         )
     if tuning is not None:
         for fold in folds:
@@ -293,8 +289,6 @@ def _run_fold(
     told = time.perf_counter()
     if trainer.is_global_zero:
         detector.save(folder / "detector.pt")
-        if config.statistics:
-            _save_statistics(config, learner, detector, data.split, folder / STATISTICS)
         onnx = export_fold(detector, folder) if config.export else {}
     seconds = dict(learner.seconds)
     seconds["test_pass"] = tested - started
@@ -319,15 +313,6 @@ def _run_fold(
         "timing_s": seconds,
         "worker_s": learner.worker_seconds,
     }
-
-
-def _save_statistics(
-    config: DictConfig, learner: SlipLearner, detector: SlipDetector, fold: Split, path: Path
-) -> None:
-    """What ``adapt`` solves again from, beside the detector."""
-    materials = {str(recording): recording.material for recording in fold.having("train")}
-    labels = {str(key): value for key, value in config.labels.items() if key != "_target_"}
-    Statistics.of_training(*learner.gathered, materials, labels, detector).save(path)
 
 
 def _origin(config: DictConfig, data: SlipDataModule) -> dict[str, Any]:
@@ -394,7 +379,7 @@ def _checkpoint(given: str | None, fold: Split) -> Path | None:
 def _saved(config: DictConfig, folder: Path, again: str) -> str:
     """What a stopped run leaves, and how to go on."""
     kept = sorted(folder.rglob("last.ckpt"))
-    if kept and not config.statistics and not config.tuning:
+    if kept and not config.tuning:
         where = ", ".join(str(path) for path in kept)
         return f"the first pass is saved in {where}; resume it: {again} ckpt_path={folder}"
     where = "lost" if config.cache in ("off", False) else "in the cache"
