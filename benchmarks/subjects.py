@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 from torch import Tensor
 
-from benchmarks.harness import trained
 from benchmarks.selection import kept_selection
 from tactslip_torch import AlarmSettings, FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.commands.configuration import checked
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split
-from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
@@ -204,43 +202,6 @@ def features_of_some(
             maker, Split("benchmark", dict.fromkeys(chosen, "unseen")), config.num_workers
         )
         yield from bar(data.loader(["unseen"]), what, "recording", total=len(chosen))
-
-
-@dataclass(frozen=True, eq=False)
-class Trained:
-    """A detector that ``tactslip_torch.train`` has left, and how to its recordings' features."""
-
-    folder: Path
-    detector: SlipDetector = field(repr=False)
-    recipe: Recipe
-    split: Split
-    maker: FeatureMaker = field(repr=False)
-    metrics: dict[str, Any] = field(repr=False)
-
-    @classmethod
-    def by(cls, overrides: Sequence[str], folder: Path, cache_folder: Path) -> Trained:
-        """Train, or take what this very code trained in the folder.
-
-        Raises:
-            RuntimeError: if the training fails.
-        """
-        metrics = trained(overrides, folder, cache_folder)
-        config = composed("train", overrides)
-        source, rule = instantiate(config.data, _convert_="all"), instantiate(config.labels)
-        (split,) = instantiate(config.split, _convert_="all")(source.ids)
-        maker = feature_maker(source, rule, **config.features)
-        maker.cache = FeatureCache(cache_folder)
-        recipe = instantiate(config.recipe, _convert_="all")
-        detector = SlipDetector.load(folder / "detector.pt")
-        return cls(folder, detector, recipe, split, maker, metrics)
-
-    def recordings(self, role: str, material: str | None = None) -> list[RecordingId]:
-        """Those of a role and, if it is given, of a material."""
-        return [one for one in self.split.having(role) if material in (None, one.material)]
-
-    def materials(self, role: str) -> list[str]:
-        """Of the recordings of a role, ascending."""
-        return sorted({one.material for one in self.recordings(role)})
 
 
 @dataclass(frozen=True, eq=False)

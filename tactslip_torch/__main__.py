@@ -19,11 +19,9 @@ COMMANDS = {
     "generate": "write simulated recordings as files",
     "data": "check, describe and convert recordings in files",
     "export": "write a detector as ONNX",
-    "adapt": "add a material to a detector, or take it out",
     "importance": "which sensors matter",
     "crossval": "every choice of held-out materials",
     "pareto": "the most accurate detector within a deadline",
-    "certify": "what float32 does to a detector",
     "calibrate-simulator": "set the free parameters of the simulator",
     "hosts": "copy a program that runs an exported detector: python, c, node or web",
 }

@@ -387,18 +387,8 @@ _CHECKPOINT = {
     },
     "*": object,
 }
-_TENSOR = {"tensor": str}
-_BINS = {"material": str, "z": _TENSOR, "is_slip": _TENSOR, "key?": str}
-_SUMS = {
-    "num_features": _number(1, 10**5, whole=True),
-    "degree?": _one_of(1, 2),
-    "about?": {"*": object},
-}
-DETECTOR, SUMS, STATISTICS = (
-    "tactslip_torch detector 4",
-    "tactslip_torch sums 2",
-    "tactslip_torch statistics 4",
-)
+DETECTOR = "tactslip_torch detector 4"
+SUMS = "tactslip_torch sums 2"
 SIDECAR = "tactslip_torch onnx 2"
 SCHEMAS: Mapping[str, Wanted] = {
     DETECTOR: {
@@ -414,39 +404,11 @@ SCHEMAS: Mapping[str, Wanted] = {
         "sensing": _SENSING,
         "info": _INFO,
     },
-    SUMS: {**_SUMS, "batches": {"*": str}},
-    STATISTICS: {
-        "sums": {
-            **_SUMS,
-            "seen_batches": {"*": str},
-            "sums": _TENSOR,
-            "count": _TENSOR,
-        },
-        "machine": {
-            "penalty": _number(1e-300, math.inf),
-            "offset": _number(0, 1e100),
-            "balance": _one_of("weights", "none"),
-        },
-        "labels": {"*": object},
-        "rehearsal": {
-            **dict.fromkeys(("z", "is_slip", "weight", "sample_weight", "recording"), _TENSOR),
-            "recordings": _names,
-            "materials": _names,
-        },
-        "detector": str,
-        "bins": {"*": _BINS},
-        "weights": {"*": _number(0, 1e300)},
-        "steps": [
-            {
-                "entry": {"*": object},
-                "weights": {"*": _number(0, 1e300)},
-                "changed": {"*": _number(0, 1e300)},
-                "replaced": {"*": _BINS},
-                "detector": str,
-                "file": _TENSOR,
-            },
-            10**4,
-        ],
+    SUMS: {
+        "num_features": _number(1, 10**5, whole=True),
+        "degree?": _one_of(1, 2),
+        "about?": {"*": object},
+        "batches": {"*": str},
     },
     SIDECAR: {
         "format": _one_of(SIDECAR),
@@ -461,12 +423,6 @@ SCHEMAS: Mapping[str, Wanted] = {
         "detector_sha256": str,
         "calibration?": _CALIBRATION,
         "check": {"worst_sd": _number(0, 1e300), "*": object},
-        "certificate?": {
-            "holds": bool,
-            "simulated?": bool,
-            "margin": _number(0, 1e300),
-            "*": object,
-        },
         "*": object,
     },
     CHECKPOINT: _CHECKPOINT,

@@ -1,9 +1,8 @@
-"""A detector of four channels that nobody trained, and bins for it: quick to certify."""
+"""A detector of four channels that nobody trained, and bins for it."""
 
 import numpy as np
 import torch
 
-from tactslip_torch.analysis.certificate import certify
 from tactslip_torch.deploy.check import simulated_stream
 from tactslip_torch.features.groups import JUMPING
 from tactslip_torch.features.pool import FeaturePool
@@ -41,15 +40,13 @@ def small_detector(
     *,
     head: str = "quadratic",
     arithmetic: str = "double",
-    gain: float = 1.0,
     backend: BackendName = "auto",
-    jumps: bool = False,
 ) -> SlipDetector:
-    """Of random features; with ``jumps`` also of those that the least rounding moves far."""
+    """Of random features, without those that the least rounding moves far."""
     rng = np.random.default_rng(seed)
     pool = FeaturePool(HAND, arithmetic=arithmetic)  # type: ignore[arg-type]
     channel_filter = ChannelFilter([51, 51, 11, 11])
-    steady = [i for i, n in enumerate(pool.names) if jumps or n.descriptor not in JUMPING]
+    steady = [i for i, n in enumerate(pool.names) if n.descriptor not in JUMPING]
     of_gauges = rng.choice([i for i in steady if i < 26], 4, replace=False)
     of_films = rng.choice([i for i in steady if i >= 26], NUM_FEATURES - 4, replace=False)
     selected = [int(i) for i in (*of_gauges, *of_films)]
@@ -60,8 +57,8 @@ def small_detector(
         weights = torch.from_numpy(rng.standard_normal(30))
         machine: QuadraticForm | KernelSum = KernelSum(support, weights, Polynomial(3, 0.5))
     else:
-        bend = gain * torch.from_numpy(rng.standard_normal((NUM_FEATURES, NUM_FEATURES)))
-        linear = gain * torch.from_numpy(rng.standard_normal(NUM_FEATURES))
+        bend = torch.from_numpy(rng.standard_normal((NUM_FEATURES, NUM_FEATURES)))
+        linear = torch.from_numpy(rng.standard_normal(NUM_FEATURES))
         centre = scaler(features)
         machine = QuadraticForm(bend + bend.T, linear, torch.tensor(0.0, dtype=torch.float64))
         middle = -machine(centre).median()  # so that both decisions occur
@@ -94,28 +91,3 @@ def alarming_detector(seed: int = 0) -> SlipDetector:
     )
     made.info[KEY] = settings.to_dict()
     return made
-
-
-class Lying(QuadraticForm):
-    """Its float32 score has the other sign where the first feature is above ``threshold``."""
-
-    threshold = 0.0
-
-    def forward(self, z):
-        score = super().forward(z)
-        lies = (z[..., 0] > self.threshold) & (z.dtype == torch.float32)
-        return torch.where(lies, -score, score)
-
-
-def lying_detector(threshold):
-    detector = small_detector()
-    head = detector.head
-    detector.head = Lying(head.quadratic, head.linear, head.constant)
-    detector.head.threshold = threshold
-    detector.head.register_forward_pre_hook(lambda *_: None)  # so that forward is called at all
-    return detector
-
-
-def certified(detector, num_bins=48, held_out=None, **options):
-    options = {"simulated": True, "extremes": 6, "boundary": 20} | options
-    return certify(detector, raw_bins(num_bins), held_out, **options)

@@ -24,7 +24,6 @@ ARROWS = {
 }
 """Importer: what it may import beside itself, ``runtime`` and ``own_files``; others may all."""
 KNOWN = (
-    ("analysis.certificate", "simulation."),
     ("data.file_recordings", "signals.resampling"),
     ("deploy.check", "simulation."),
 )

@@ -101,7 +101,7 @@ def test_every_option_composes_and_its_keys_are_described(number):
     groups = {k: own[number] for k, own in OPTIONS.items() if k not in ALONE and number < len(own)}
     config = described("train", *(f"{group}={option}" for group, option in groups.items()))
     for group, option in groups.items():
-        assert config[group] or (option == "none" and group in ("onset", "tuning"))
+        assert config[group] or (option == "none" and group == "onset")
         if config[group] and group != "features":  # plain values, for ``feature_maker``
             assert callable(get_object(config[group]._target_))
     for option in OPTIONS["extra_scenes"][number : number + 1]:

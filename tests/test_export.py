@@ -6,14 +6,13 @@ import json
 import onnxruntime
 import pytest
 import torch
-from small_detector import HAND, alarming_detector, certified, small_detector
+from small_detector import HAND, alarming_detector, small_detector
 from test_commands import composed
 
 from tactslip_torch.commands.export import export as export_command
 from tactslip_torch.commands.train import export_fold
 from tactslip_torch.deploy import export
 from tactslip_torch.deploy.export import (
-    CERTIFICATE_FORMAT,
     export_detector,
     read_sidecar,
     stale_graphs,
@@ -64,7 +63,6 @@ def test_a_model_says_of_itself_what_its_sidecar_says(detector, exported):
         worst_sd = metadata["check"]["worst_sd"]
         assert 0 < worst_sd < 1e-3
         assert f"{worst_sd:.1e} score deviations" in summary(path)
-        assert "no certificate" in summary(path)
     sidecar = exported[1].with_name("stream.onnx.json").read_text()
     lines = [line.strip(" ,") for line in sidecar.splitlines()]
     for name, value in read_sidecar(exported[1]).items():  # a scalar a line: for hosts in C
@@ -103,34 +101,6 @@ def test_a_calibration_of_training_and_a_curve_are_told_and_what_json_has_not_is
     (path,) = export_detector(made, tmp_path, ["stream"])
     assert read_sidecar(path)["threshold"] is None
     assert read_sidecar(path)["threshold_curve"] == curve["threshold_curve"]
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_the_certificate_of_this_detector_is_handed_on_and_no_other(tmp_path):
-    made, source = small_detector(), tmp_path / "detector.pt"
-    made.save(source)
-    digest = hashlib.sha256(source.read_bytes()).hexdigest()
-    content = certified(made, 16, extremes=2).content
-    content |= {"format": CERTIFICATE_FORMAT, "detector": {"sha256": digest}}
-    margin = content["margin"]["score"]
-
-    def exported_with(text):
-        (tmp_path / "certificate.json").write_text(text)
-        (path,) = export_detector(made, tmp_path, ["bin"], source=source)
-        assert read_sidecar(path)["detector_sha256"] == digest
-        return read_sidecar(path)["certificate"], summary(path)
-
-    told, line = exported_with(json.dumps(content))
-    assert (told["holds"], told["margin"]) == (content["holds"], margin)
-    assert told["sets"]["calibration"]["bins"] == 16
-    assert f"certified but where |score| is below {margin:.1e} (simulated data)" in line
-    assert "does not hold" in exported_with(json.dumps(content | {"holds": False}))[1]
-    hollow = {"format": CERTIFICATE_FORMAT, "detector": {"sha256": digest}}
-    others = [content | {"detector": {"sha256": "0" * 64}}, content | {"format": "x"}, hollow, []]
-    for text in (*map(json.dumps, others), "{"):
-        told, line = exported_with(text)
-        assert told is None
-        assert "no certificate" in line
 
 
 # What is wrong ---------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ from test_commands import TINY, composed, run_train
 
 from tactslip_torch import SlipDetector
 from tactslip_torch.commands.importance import sensors
-from tactslip_torch.commands.train import train
 from tactslip_torch.onset.decisions import score_stream
 
 HOP = 50
@@ -165,11 +164,3 @@ def test_sensors_select_nothing_anew_where_all_is_pooled(override, pooled_run, t
     said = "leave out num_features and reselect, or train with"
     with pytest.raises(ValueError, match=said):
         sensors_of(pooled_run, tmp_path, override)
-
-
-@pytest.mark.parametrize("what", ["statistics=true", "tuning=gradient"])
-def test_what_needs_channel_features_says_so(what, tmp_path):
-    said = f"^{what.removesuffix('=gradient')} needs a machine of degree 2.* take recipe=robust or "
-    with pytest.raises(ValueError, match=said) as caught:
-        train(composed(*TINY, "cache=off", what), tmp_path)
-    assert "\n" not in str(caught.value)

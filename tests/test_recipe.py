@@ -1,6 +1,5 @@
 """Recipes, plans and passes: what is chosen, and that neither order nor workers matter."""
 
-import json
 from dataclasses import astuple, replace
 
 import numpy as np
@@ -8,20 +7,15 @@ import pytest
 import torch
 from scipy.stats import ttest_ind
 from small_set import SMALL_HAND, SmallSet, refitted_scores, small_maker, small_recipe
-from test_commands import TINY, composed
-from torch.nn.functional import binary_cross_entropy_with_logits
 
-from tactslip_torch import SlipDetector
 from tactslip_torch.analysis.pareto import ParetoSearch
-from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.splits import unseen4
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.groups import matching
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.calibration import Platt, calibration_from_dict, fit_platt
+from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.training import plan as planning
@@ -34,13 +28,6 @@ from tactslip_torch.training.recipe import (
     sample_weight,
     scene_weights,
     select_features,
-)
-from tactslip_torch.training.tuning import (
-    Tuning,
-    grid_points,
-    grouped_loss,
-    least_loss,
-    tuning_bins,
 )
 
 NUM = 30
@@ -140,18 +127,13 @@ BAD_RECIPES = [
     ({"feature_filter": {"kinds": "SG"}}, r"recipe.feature_filter: unknown 'kinds', expected"),
     ({"feature_filter": {"kind": 3}}, r"feature_filter.kind must be a name or several, got 3"),
     ({"feature_filter": "SG"}, r"recipe.feature_filter must be like .*, got 'SG'"),
-    ({"degree": 3}, "^tuning needs recipe.kernel=polynomial recipe.degree=2, got Polynomial"),
-    ({"kernel": "rbf", "gamma": 0.1}, "needs recipe.kernel=polynomial recipe.degree=2"),
-    ({"validation": "nested"}, "needs a machine of degree 2 .* recipe=paper does not always"),
-    ({"penalties": float("inf")}, "needs finite recipe.penalties, got inf"),
 ]
 
 
 @pytest.mark.parametrize(("change", "message"), BAD_RECIPES, ids=str)
 def test_bad_recipes_are_refused(change, message):
-    Recipe().check_quadratic("tuning")
     with pytest.raises(ValueError, match=message):
-        Recipe(**change).check_quadratic("tuning")
+        Recipe(**change)
 
 
 # Plans -----------------------------------------------------------------------------------------
@@ -442,132 +424,3 @@ def test_scenes_have_the_weight_that_is_asked_for(rng):
 def test_one_group_cannot_be_left_out(rng):
     with pytest.raises(ValueError, match="needs two with bins of both classes, got 1"):
         chosen(sample_of(rng, ("M1",)))
-
-
-RANGES = {"compress": True, "tail": 0.01}
-RECIPE = Recipe(num_features=6, penalties=(0.01, 0.1, 1.0), balance="weights", **RANGES)
-
-
-@pytest.fixture(scope="module")
-def small():
-    """A maker, the sample and the plan of its training recordings, and their split."""
-    maker = small_maker(SmallSet(materials=("a", "b", "c", "d"), cycles=3))
-    split = unseen4(maker.source.ids, seen=["a", "b", "c"], unseen=["d"], train_fraction=0.7)[0]
-    statistics = TrainingStatistics(len(maker.pool.names), 60)
-    for recording in split.having("train"):
-        made = maker(recording, split)
-        statistics.update(str(recording), recording.material, made.features, made.is_slip)
-    return maker, statistics.sample.bins(), planning.plan_detector(RECIPE, statistics), split
-
-
-def tuned_by(small, sample, tuning):
-    maker, _, plan, _ = small
-    return tuning(plan, sample, [str(name) for name in maker.pool.names])
-
-
-def test_loss_is_the_mean_over_groups_and_classes_by_the_slope_of_least_loss(rng):
-    is_slip, groups = torch.arange(600) % 3 == 0, torch.arange(600) // 250
-    scores = torch.where(is_slip, 0.5, -0.5) + torch.from_numpy(rng.standard_normal(600)) + 0.3
-    found = grouped_loss(scores, is_slip, groups, Platt(1.7, -0.3))
-    losses, recalls = [], []
-    for group in range(3):
-        for kind in (True, False):
-            own = (groups == group) & (is_slip == kind)
-            truth = torch.full_like(scores[own], float(kind))
-            losses.append(binary_cross_entropy_with_logits(1.7 * scores[own] - 0.3, truth))
-            recalls.append(float(((scores[own] >= 0) == kind).double().mean()))
-    assert float(found.loss) == pytest.approx(float(torch.stack(losses).mean()), rel=1e-12)
-    assert found.balanced_accuracy == pytest.approx(sum(recalls) / 6)
-    fitted = grouped_loss(scores, is_slip, groups)
-    assert fitted.calibration.offset == 0
-    for factor in (0.9, 1.1):
-        other = Platt(factor * fitted.calibration.slope, 0.0)
-        assert grouped_loss(scores, is_slip, groups, other).loss > fitted.loss
-    assert grouped_loss(scores + 1.0, is_slip, groups).loss > fitted.loss + 0.05  # decides at 0
-
-
-def test_grid_is_of_refits_without_the_group(small):
-    recipe = replace(RECIPE, penalties=(0.1, 1.0), offsets=(0.5, 2.0))
-    _, sample, plan, _ = small
-    scaler = plan.selection.scaler
-    bins = tuning_bins(sample, plan.selection.selected, sample_weight(RECIPE, sample), 12)
-    points = grid_points(scaler, bins, recipe)
-    assert [point[:2] for point in points] == [(0.1, 0.5), (1.0, 0.5), (0.1, 2.0), (1.0, 2.0)]
-    training = TrainingBins(scaler(bins.features), bins.is_slip, bins.weights)
-    scores = refitted_scores(training, bins.group, 1.0, Polynomial(2, 2.0))
-    expected = grouped_loss(scores, bins.is_slip, bins.group)
-    assert points[3].loss == pytest.approx(float(expected.loss), rel=1e-6)
-    assert least_loss(points).loss == min(point.loss for point in points)
-    two = bins.where(bins.group != 2)
-    backwards = two._replace(is_slip=two.is_slip ^ (two.group == 1))  # wrong of the other group
-    with pytest.raises(ValueError, match="tuning has no place to start: at every C and c"):
-        grid_points(scaler, backwards, recipe)
-
-
-def test_the_step_taken_is_that_of_least_mean_loss_of_held_out_groups(small):
-    tuned = tuned_by(small, small[1], Tuning(bins=10, steps=4, patience=2))
-    found = tuned.metadata
-    held = torch.tensor([[row["held_loss"] for row in group["history"]] for group in found["held"]])
-    assert found["steps"] == int(held.mean(0).argmin())
-    assert len(found["history"]) == held.shape[1]
-    for place, group in enumerate(found["held"]):
-        losses = [row["loss"] for row in group["history"]]
-        assert min(losses) < losses[0]
-        steps = int(torch.cat([held[:place], held[place + 1 :]]).mean(0).argmin())
-        assert group["tuned"]["steps"] == steps
-        assert group["tuned"]["loss"] == group["history"][steps]["held_loss"]
-        assert group["grid"]["loss"] == group["history"][0]["held_loss"]
-    assert {group["held"] for group in found["held"]} == {"a", "b", "c"}
-    assert (found["penalty"], found["offset"]) == (tuned.penalty, tuned.offset)
-
-
-def test_a_held_out_group_does_not_change_its_descent(small):
-    sample = small[1]
-    features = sample.features.clone()
-    features[sample.group == 2] *= 1.03
-    tuning = Tuning(learn=["penalty", "scales"], bins=8, steps=2, patience=3)
-    first, second = (
-        tuned_by(small, replace(sample, features=x), tuning).metadata["held"][2]["history"]
-        for x in (sample.features, features)
-    )
-    assert [row["loss"] for row in first] == [row["loss"] for row in second]
-    assert first[0]["held_loss"] != second[0]["held_loss"]
-
-
-NO_TUNING = [
-    ({"learn": ["bias"]}, {}, "tuning.learn must be a list of some of penalty, offset"),
-    ({"steps": 0}, {}, "tuning.steps must be a positive whole number, got 0"),
-    ({"bins": "abc"}, {}, "tuning.bins must be a positive whole number, got 'abc'"),
-    ({"rate": float("nan")}, {}, "tuning.rate must be a positive finite number, got nan"),
-    ({}, {"degree": 3}, "needs recipe.kernel=polynomial recipe.degree=2"),
-    ({}, {"offsets": 0.0}, r"needs recipe\.offsets above 0"),
-    ({}, {}, "needs three groups to hold some out, got a, b"),
-]
-
-
-@pytest.mark.parametrize(("values", "changes", "message"), NO_TUNING, ids=str)
-def test_what_could_not_be_tuned_is_refused_beforehand(small, values, changes, message):
-    split = small[3]
-    Tuning().check(replace(RECIPE, group_by="cycle"), split)
-    two = {r: role for r, role in split.roles.items() if changes or r.material != "c"}
-    with pytest.raises(ValueError, match=message):
-        Tuning(**values).check(replace(RECIPE, **changes), replace(split, roles=two))
-
-
-@pytest.mark.slow
-def test_training_tunes_and_keeps_the_detectors_that_it_began_with(tmp_path):
-    options = ("recipe=robust", "recipe.num_features=6", "recipe.group_by=cycle", "data.seed=0")
-    quick = ("baselines=false", "export=false", "cache=off")
-    tuning = ("tuning=gradient", "tuning.bins=6", "tuning.steps=2", "tuning.learn=[penalty]")
-    train(composed(*TINY, *options, *quick, *tuning), tmp_path)
-    metrics = json.loads((tmp_path / "metrics.json").read_text())
-    found = metrics["tuning"]
-    assert found["learned"] == ["penalty"]
-    assert metrics["penalty"] == pytest.approx(found["penalty"])
-    assert set(found["splits"]) == {"recipe", "grid"}
-    for name, penalty in (("start", found["start"]["penalty"]), ("detector", found["penalty"])):
-        detector = SlipDetector.load(tmp_path / f"{name}.pt")
-        assert detector.info["penalty"] == pytest.approx(penalty)
-    assert detector.info["tuned"]["steps"] == found["steps"]
-    assert (tmp_path / "grid.pt").exists()
-    assert (tmp_path / "tuning.png").stat().st_size > 10_000

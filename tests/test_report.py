@@ -111,25 +111,6 @@ CHOICES = [
 RBF = choice(60, 0.3, M1=0.5, M2=None, M3=0.4) | {"kernel": {"kind": "rbf", "gamma": 1}}
 
 
-def tuning():
-    """Of two groups held out in turn, one step each."""
-    won = {"loss": 0.2, "balanced_accuracy": 0.9}
-    history = [{"held_loss": 0.3, "loss": 0.4}, {"held_loss": 0.2, "loss": 0.3}]
-    ways = {"recipe": won, "grid": won, "tuned": won | {"steps": 1}}
-    held = [{"held": name, "history": history, **ways} for name in ("M1", "M2")]
-    recipe = {"test": split_metrics([[9, 1], [2, 8]])}
-    start, found = {"penalty": 1.0, "offset": 0.5}, {"penalty": 2.0, "offset": 0.25}
-    told = {"steps": 1, "bins": 40, "seconds": 3.0, "fit_s": 1.0, **found}
-    told |= {
-        "held": held,
-        "history": history,
-        "splits": {"recipe": recipe, "grid": recipe},
-        "start": start,
-    }
-    told |= {"learned": ["penalty", "offset", "scales"]}
-    return told | {"scales": {f"f{i}": 1 + i / 10 for i in range(8)}}
-
-
 # Tables ----------------------------------------------------------------------------------------
 
 
@@ -163,15 +144,6 @@ def test_the_papers_numbers_stand_beside_its_own_scenes_alone(drawn, tmp_path, s
         )
         expected += [f"scene {scene}" for scene in scenes]
     assert sorted(rows_of(line)[0][-6] for line in lines[2:]) == sorted(expected)
-
-
-def test_tuning_says_what_was_learned():
-    metrics = metrics_of(tuning=tuning())
-    metrics["splits"] = {"test": metrics["splits"]["test"]}
-    (text,) = results.tuning_tables(metrics)
-    assert "tuned by gradient" in text
-    assert "1 steps from C=1, c=0.5 to C=2, c=0.25; learned: penalty, offset, scales" in text
-    assert results.tuning_tables(metrics_of()) == []
 
 
 def test_reliability_has_a_row_for_each_role():
@@ -232,10 +204,6 @@ EVENTS = {
 ABSENT = {str(i): split_metrics([[0, 0], [i, 5]]) for i in range(5)}  # many, without a class
 
 
-def tuning_of(metrics, path):
-    results.tuning_figure(tuning(), path, simulated=metrics["simulated"])
-
-
 def features_of(metrics, path):
     results.selected_features_figure(features(), path, simulated=metrics["simulated"])
 
@@ -246,7 +214,6 @@ FIGURES = [
     (results.validation_figure, {"validation": [*CHOICES, RBF]}),
     (results.reliability_figure, {"alarm": {"reliability": BY_ROLE}}),
     (results.events_figure, {"events": EVENTS}),
-    (tuning_of, {}),
     (features_of, {}),
 ]
 

@@ -1,8 +1,6 @@
 """What ``detect`` and ``stream`` leave for viewers: read back by the viewers' own libraries."""
 
-import importlib.util
 import json
-import sys
 from contextlib import suppress
 
 import numpy as np
@@ -25,11 +23,9 @@ from test_detect import (  # noqa: F401
     volts,
 )
 
-from tactslip_torch import SlipDetector
 from tactslip_torch.data.formats import FORMATS, Reading, open_file
 from tactslip_torch.live import Block
 from tactslip_torch.live.mcap_log import McapLog
-from tactslip_torch.live.rerun_log import channel_shares
 
 
 @pytest.fixture(scope="module")
@@ -101,58 +97,6 @@ def test_the_layout_draws_what_is_in_the_file(run):
             drawn.append(path["label"])
             assert np.isscalar(data[int(field.strip("[]"))] if field else data)
     assert set(HAND.names) < set(drawn)
-
-
-def test_the_rerun_recording_holds_the_same(run, model):  # noqa: F811
-    chunk = pytest.importorskip("rerun.chunk")
-    place, content = run
-    options = ("rerun=true", "decisions=true", "figure=false")
-    detected(model, place / "a.npz", place / "rerun", *options)
-    found = {}
-    for part in chunk.RrdReader(place / "rerun" / "a.rrd").stream():
-        rows = part.to_record_batch().to_pydict()
-        name = next((n for n in rows if n.endswith(":scalars") or n.endswith(":text")), None)
-        if name and "time" in rows:
-            pairs = zip(rows["time"], rows[name], strict=True)
-            found.setdefault(part.entity_path, []).extend(pairs)
-    found = {name: sorted(rows) for name, rows in found.items()}
-    known = FORMATS["npz"].load(place / "a.npz").recording.samples
-    for kind in HAND.kinds:
-        values = np.array([row for _, row in found[f"/tactile/{kind}"]])
-        np.testing.assert_array_equal(values.T, known[list(HAND.indices(kind))])
-    decided = rows_of(place / "rerun" / "a_decisions.csv")
-    values = [row[0] for _, row in found["/slip/probability"]]
-    np.testing.assert_allclose(values, [float(row["probability"]) for row in decided], rtol=1e-6)
-    alarms = content["recordings"][0]["alarms"]
-    times = [time.total_seconds() for time, _ in found["/slip/events"]]
-    np.testing.assert_allclose(times, [alarm["alarm_s"] for alarm in alarms], atol=1e-6)
-    detector = SlipDetector.load(model)
-    whole = detector.context_before + detector.pool.bin_samples + detector.context_after
-    end = round(found["/slip/shares"][20][0].total_seconds() * RATE_HZ) + 1
-    first = end - whole + detector.context_after - detector.look_ahead
-    shares = channel_shares(detector, known[None, :, first : first + whole].double())
-    np.testing.assert_allclose([found["/slip/shares"][20][1]], shares, rtol=1e-9)
-
-
-def test_a_share_is_what_a_channel_adds_to_the_score(model):  # noqa: F811
-    detector = SlipDetector.load(model)
-    whole = detector.context_before + detector.pool.bin_samples + detector.context_after
-    bins = volts(1.0, ()).double()[:, : 3 * whole].unflatten(-1, (3, whole)).movedim(1, 0)
-    found = channel_shares(detector, bins)
-    score = detector.score_raw(bins)
-    for place, name in enumerate(HAND.names):
-        without = detector.predict_raw(bins, masked_channels=[name]).score
-        torch.testing.assert_close(found[:, place], score - without)
-    assert found.abs().max() > 0.01
-
-
-def test_without_rerun_it_is_one_line(run, model, monkeypatch):  # noqa: F811
-    place, _ = run
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "rerun" else find(n))
-    with pytest.raises(ValueError, match=r"needs rerun, .*tactslip-torch\[rerun\]"):
-        detected(model, place / "a.npz", place / "none", "rerun=true", "figure=false")
 
 
 def logged(path, blocks, **options):

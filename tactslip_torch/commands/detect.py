@@ -29,7 +29,6 @@ from tactslip_torch.data.formats import Reading, open_file, pieces
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.features.cache import versions
 from tactslip_torch.live.mcap_log import McapLog
-from tactslip_torch.live.rerun_log import RerunLog
 from tactslip_torch.live.sinks import Block, Sink
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.prediction import masked_names
@@ -101,12 +100,10 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
         FileNotFoundError: if there is no such detector or recording.
     """
     started = time.perf_counter()
-    for key in ("mcap", "rerun"):
-        if type(config[key]) is not bool:
-            raise ValueError(
-                f"{key} must be true or false, got {config[key]!r}; files are called as their "
-                "recordings"
-            )
+    if type(config.mcap) is not bool:
+        raise ValueError(
+            f"mcap must be true or false, got {config.mcap!r}; files are called as their recordings"
+        )
     detector = SlipDetector.load(config.model, backend=config.backend)
     reading = Reading.of(plain_section(config.reading))
     context = _DetectionContext(detector, settings_of(config, detector), reading, config, folder)
@@ -175,10 +172,6 @@ def _detect_in(
                 dtype=samples.dtype,
             )
             logs.append(stack.enter_context(mcap))
-        if config.rerun:
-            place = context.folder / f"{name}.rrd"
-            rerun = RerunLog(place, detector, context.settings, recording=truth)
-            logs.append(stack.enter_context(rerun))
 
         def take(decisions: Decisions) -> None:
             of = {column: getattr(decisions, column).numpy() for column in columns}

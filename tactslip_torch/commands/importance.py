@@ -111,11 +111,6 @@ def sensors(config: DictConfig, folder: Path) -> dict[str, Any]:
     )
     content["timing_s"] = {"total": time.perf_counter() - started}
     sensors_csv(content, folder / "sensors.csv")
-    if "tuned" in trained.detector.info:
-        print(
-            "\nthe detector was tuned: machines without sensors are fitted with its filters, but "
-            "with ranges and C of the recipe"
-        )
     tables = sensors_table(content), best_table(content)
     leave_results(folder, "sensors", content, sensors_figure, *tables)
     return content

@@ -25,7 +25,6 @@ from tactslip_torch.data.formats import Reading
 from tactslip_torch.live.frames import Frames
 from tactslip_torch.live.mcap_log import McapLog
 from tactslip_torch.live.pump import watch
-from tactslip_torch.live.rerun_log import RerunLog
 from tactslip_torch.live.ros2 import RosTopic
 from tactslip_torch.live.server import PageServer, page_facts
 from tactslip_torch.live.sinks import Callback, Counts, Event, JsonLines, LineServer, Sink, Source
@@ -120,8 +119,6 @@ def _logs(config: DictConfig, watching: StreamingDetector, source: Source) -> li
         pool, units = detector.pool, str(detector.info.get("units", "V"))
         parts = (Path(str(config.mcap)), pool.hand, pool.sample_rate_hz, settings)
         sinks.append(McapLog(*parts, units=units, dtype=watching.dtype, **about))
-    if config.rerun is not None:
-        sinks.append(RerunLog(Path(str(config.rerun)), detector, settings, **about))
     return sinks
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -30,10 +29,8 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.decisions import KEY, Scorer, calibration_of
 from tactslip_torch.own_files import read_checkpoint
-from tactslip_torch.report.results import print_results, tuning_figure, write_results
+from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process, whole_file
-from tactslip_torch.training.adaptation import FILE as STATISTICS
-from tactslip_torch.training.adaptation import Statistics
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
 from tactslip_torch.training.datamodule import SlipDataModule, training_origin
 from tactslip_torch.training.experiment import (
@@ -46,8 +43,7 @@ from tactslip_torch.training.experiment import (
     write_tensorboard,
 )
 from tactslip_torch.training.learner import SlipLearner
-from tactslip_torch.training.recipe import FeatureSelection, Recipe
-from tactslip_torch.training.tuning import Tuning
+from tactslip_torch.training.recipe import Recipe
 
 log = logging.getLogger(__name__)
 
@@ -79,19 +75,6 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     recipe.check_pool(len(pool.names))
     alarming: CalibratedAlarm | DebouncedAlarm | None
     alarming = instantiate(config.onset, _convert_="all") or None
-    tuning: Tuning | None = instantiate(config.tuning, _convert_="all") or None
-    if config.trainer.get("fast_dev_run"):
-        tuning = None  # a batch has no materials to hold out
-    if config.statistics:
-        recipe.check_quadratic("statistics=true")
-    if config.ckpt_path is not None and (config.statistics or tuning):
-        raise ValueError(
-            f"{'statistics=true' if config.statistics else 'tuning'} needs the first pass, which "
-            "ckpt_path skips; train without ckpt_path (features come from the cache)"
-        )
-    if tuning is not None:
-        for fold in folds:
-            tuning.check(recipe, fold)
     if isinstance(alarming, CalibratedAlarm) and len(folds) > 1:
         raise ValueError(
             f"onset=alarms sets the alarm of one detector, this split makes {len(folds)}; take "
@@ -113,10 +96,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
                 recipe,
                 with_baselines=config.baselines,
             )
-            found: dict[str, Any] | None = None
-            if tuning is not None:
-                learner, found = _tune_fold(config, place, data, learner, tuning)
-            fold_metrics[fold.name] = _run_fold(config, place, data, learner, alarming, found)
+            fold_metrics[fold.name] = _run_fold(config, place, data, learner, alarming)
     metrics = common_metadata(source, pool, config) | _combined(
         fold_metrics, by_fold=have_same_bins(folds)
     )
@@ -181,71 +161,12 @@ class _SaveAfterFirstPass(Checkpoint):
                 trainer.save_checkpoint(self._folder / "last.ckpt")
 
 
-def _tune_fold(
-    config: DictConfig, folder: Path, data: SlipDataModule, first: SlipLearner, tuning: Tuning
-) -> tuple[SlipLearner, dict[str, Any]]:
-    """Fit as the recipe says, and learn from there: the second fit's learner, and what was found.
-
-    Detectors of the recipe's choice and of the grid's least loss are evaluated as the tuned one
-    will be, and kept as ``grid.pt`` and ``start.pt``: what is beyond the latter is due to the
-    gradient.
-    """
-    started = time.perf_counter()
-    trainer = make_trainer(config.trainer, folder / "grid")
-    if trainer.world_size > 1:
-        raise ValueError(
-            f"tuning runs in one process, the trainer has {trainer.world_size}; leave out "
-            "trainer.devices and trainer.num_nodes, or take tuning=none"
-        )
-    trainer.fit(first, datamodule=data)
-    found: dict[str, Any] = {"fit_s": time.perf_counter() - started}
-    plan, (_, sample) = first.plan, first.gathered
-    tuned = tuning(plan, sample, [str(name) for name in data.maker.pool.names])
-    found |= tuned.metadata
-    start = found["start"]
-    by_loss = _settled(first, data, plan.selection, start["penalty"], start["offset"])
-    other = make_trainer(config.trainer, folder / "start")
-    other.fit(by_loss, datamodule=data)
-    found["splits"] = {}
-    tests = (("grid", "recipe", trainer, first), ("start", "grid", other, by_loss))
-    for name, way, tester, learner in tests:
-        tester.test(learner, datamodule=data, verbose=False)
-        found["splits"][way] = learner.metrics["splits"]
-        if learner.detector is not None:
-            learner.detector.info |= _origin(config, data)
-            learner.detector.save(folder / f"{name}.pt")
-    simulated = data.maker.source.is_simulated
-    tuning_figure(found, folder / "tuning.png", simulated=simulated)
-    found["validation"] = first.metadata["validation"]
-    return _settled(first, data, tuned.selection, tuned.penalty, tuned.offset), found
-
-
-def _settled(
-    first: SlipLearner,
-    data: SlipDataModule,
-    selection: FeatureSelection,
-    penalty: float,
-    offset: float,
-) -> SlipLearner:
-    """A learner like the first with nothing left to choose."""
-    size = len(selection.selected)
-    recipe = replace(first.recipe, num_features=size, penalties=penalty, offsets=offset)
-    return SlipLearner(
-        data.maker.pool,
-        data.maker.channel_filter,
-        recipe,
-        selection=selection,
-        with_baselines=first.with_baselines,
-    )
-
-
 def _run_fold(
     config: DictConfig,
     folder: Path,
     data: SlipDataModule,
     learner: SlipLearner,
     alarming: CalibratedAlarm | DebouncedAlarm | None,
-    tuned: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Fit, test, set the alarm of, save and export one fold; what it found.
 
@@ -255,7 +176,6 @@ def _run_fold(
         data: of the fold.
         learner: of its detector.
         alarming: the stage after the fit.
-        tuned: what tuning found, if it did.
     """
     trainer = make_trainer(config.trainer, folder, [_SaveAfterFirstPass(folder)])
     checkpoint = _checkpoint(config.ckpt_path, data.split)
@@ -272,9 +192,6 @@ def _run_fold(
     tested = time.perf_counter()
     detector = learner.detector
     detector.info |= _origin(config, data)
-    if tuned is not None:
-        kept = ("learned", "steps", "bins", "start")
-        detector.info["tuned"] = {name: tuned[name] for name in kept}
     onnx: dict[str, dict[str, float] | str] = {}
     alarm: dict[str, Any] = {}
     if getattr(trainer, "fast_dev_run", False):
@@ -293,8 +210,6 @@ def _run_fold(
     told = time.perf_counter()
     if trainer.is_global_zero:
         detector.save(folder / "detector.pt")
-        if config.statistics:
-            _save_statistics(config, learner, detector, data.split, folder / STATISTICS)
         onnx = export_fold(detector, folder) if config.export else {}
     seconds = dict(learner.seconds)
     seconds["test_pass"] = tested - started
@@ -308,7 +223,6 @@ def _run_fold(
         **({"alarm": alarm} if alarm else {}),
         "recording_events": learner.events,  # for _combined
         **learner.metadata,
-        **({} if tuned is None else {"tuning": tuned, "validation": tuned.pop("validation")}),
         "selected": [str(name) for name in detector.selected_names],
         "trained_on": {
             "materials": detector.info["train_materials"],
@@ -319,15 +233,6 @@ def _run_fold(
         "timing_s": seconds,
         "worker_s": learner.worker_seconds,
     }
-
-
-def _save_statistics(
-    config: DictConfig, learner: SlipLearner, detector: SlipDetector, fold: Split, path: Path
-) -> None:
-    """What ``adapt`` solves again from, beside the detector."""
-    materials = {str(recording): recording.material for recording in fold.having("train")}
-    labels = {str(key): value for key, value in config.labels.items() if key != "_target_"}
-    Statistics.of_training(*learner.gathered, materials, labels, detector).save(path)
 
 
 def _origin(config: DictConfig, data: SlipDataModule) -> dict[str, Any]:
@@ -394,7 +299,7 @@ def _checkpoint(given: str | None, fold: Split) -> Path | None:
 def _saved(config: DictConfig, folder: Path, again: str) -> str:
     """What a stopped run leaves, and how to go on."""
     kept = sorted(folder.rglob("last.ckpt"))
-    if kept and not config.statistics and not config.tuning:
+    if kept:
         where = ", ".join(str(path) for path in kept)
         return f"the first pass is saved in {where}; resume it: {again} ckpt_path={folder}"
     where = "lost" if config.cache in ("off", False) else "in the cache"

@@ -6,7 +6,7 @@ that are broken or missing.
 
 Bins that real hands produce and textbooks do not: dead sensors, rails, offsets, lost tones.
 
-For the certificate and for tests: each kind is a corner in which sums of squares cancel, overflow
+Each kind is a corner in which sums of squares cancel, overflow
 or underflow, or a descriptor's definition ends.
 """
 

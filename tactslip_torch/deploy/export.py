@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, get_args
@@ -29,7 +29,6 @@ from tactslip_torch.own_files import SIDECAR as FORMAT
 from tactslip_torch.own_files import read_json
 from tactslip_torch.runtime import plain, whole_file
 
-CERTIFICATE_FORMAT = "tactslip_torch certificate 1"
 FILES: dict[GraphKind, str] = {"bin": "model.onnx", "stream": "stream.onnx"}
 """What the file of each graph is called."""
 
@@ -49,8 +48,7 @@ def export_detector(
         folder: for ``model.onnx`` and ``stream.onnx``.
         graphs: ``"bin"``, ``"stream"`` or both.
         precision: of samples and scores, ``"float32"`` or ``"float64"``.
-        source: file that the detector is kept in; by it a host knows which it has, and a
-            ``certificate.json`` beside it is handed on if it is this detector's.
+        source: file that the detector is kept in; by it a host knows which it has.
 
     Returns:
         The models' paths, in the order of ``graphs``.
@@ -65,7 +63,7 @@ def export_detector(
         raise ValueError(f"graphs must be {wanted}, or both, got {', '.join(graphs) or 'none'}")
     if "stream" in graphs:
         AlarmSettings.of(detector)  # says what is missing before there is anything to undo
-    origin = _origin(detector, source)
+    detector_sha256 = _detector_digest(detector, source)
     paths = tuple(Path(folder) / FILES[kind] for kind in graphs)
     with ExitStack() as files:
         for kind, path in zip(graphs, paths, strict=True):
@@ -79,7 +77,8 @@ def export_detector(
                 check = check_model(model, detector, kind, precision)
             except ValueError as error:
                 raise ValueError(f"{path} was not written: {error}") from error
-            metadata = plain({**host_metadata(detector, kind, precision), "check": check}) | origin
+            metadata = plain({**host_metadata(detector, kind, precision), "check": check})
+            metadata["detector_sha256"] = detector_sha256
             props = {name: json.dumps(value, allow_nan=False) for name, value in metadata.items()}
             helper.set_model_props(model, props)
             onnx.save(model, temporary)
@@ -91,49 +90,18 @@ def export_detector(
     return paths
 
 
-def _origin(detector: SlipDetector, source: str | os.PathLike[str] | None) -> dict[str, Any]:
-    """Digest of the detector's file, and what a host is told of its certificate."""
+def _detector_digest(detector: SlipDetector, source: str | os.PathLike[str] | None) -> str:
+    """Digest of the detector's file; without one, of the file that it would be saved as."""
     if source is not None:
-        digest = _digest(Path(source))
-        certificate = _certificate(Path(source).with_name("certificate.json"), digest)
-        return {"detector_sha256": digest, "certificate": certificate}
+        return _digest(Path(source))
     with tempfile.TemporaryDirectory(prefix="tactslip-") as folder:
         path = Path(folder) / "detector.pt"
         detector.save(path)  # the same detector gives the same bytes
-        return {"detector_sha256": _digest(path), "certificate": None}
+        return _digest(path)
 
 
 def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _certificate(path: Path, digest: str) -> dict[str, Any] | None:
-    """What a host is told of the certificate of the detector with this digest, if it is there."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content["format"] != CERTIFICATE_FORMAT or content["detector"]["sha256"] != digest:
-            return None
-        margin = content["margin"]
-        return {
-            "holds": content["holds"],
-            "simulated": content["simulated"],
-            "score_sd": content["score_sd"],
-            "margin": margin["score"],
-            "margin_sd": margin["sd"],
-            "rule": margin["rule"],
-            "head_bound": content["head"]["bound"],
-            "sets": {
-                name: {
-                    "bins": found["bins"],
-                    "worst_sd": found["error"]["worst_sd"],
-                    "share_inside_margin": found["inside_margin"]["share"],
-                    "flips_outside_margin": found["flips"]["outside_margin"],
-                }
-                for name, found in content["sets"].items()
-            },
-        }
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 # Files that are there --------------------------------------------------------------------------
@@ -170,20 +138,11 @@ def stale_graphs(source: Path) -> tuple[Path, ...]:
 
 
 def summary(path: Path) -> str:
-    """One line about a model: size, error, certificate."""
+    """One line about a model: size and error."""
     metadata = read_sidecar(path)
-    certificate: Mapping[str, Any] | None = metadata["certificate"]
-    if certificate is None:
-        trust = "no certificate (python -m tactslip_torch certify makes one)"
-    elif not certificate["holds"]:
-        trust = "its certificate does not hold"
-    else:
-        trust = f"certified but where |score| is below {certificate['margin']:.1e}"
-        trust += " (simulated data)" * bool(certificate["simulated"])
     return (
         f"{path}: {metadata['onnx_bytes'] / 1000:.0f} kB, {metadata['precision']}, within "
-        f"{metadata['check']['worst_sd']:.1e} score deviations of torch in float64 (simulated "
-        f"slip), {trust}"
+        f"{metadata['check']['worst_sd']:.1e} score deviations of torch in float64 (simulated slip)"
     )
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from statistics import mean
 from typing import Any
 
 import numpy as np
@@ -86,7 +85,6 @@ def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> N
         texts.append(selected_table(selected))
     if metrics.get("validation"):
         texts.append(validation_table(metrics))
-    texts += tuning_tables(metrics)
     if metrics.get("solve"):
         texts.append(solve_line(metrics["solve"]))
     if metrics.get("timing_s"):
@@ -475,103 +473,6 @@ def _structure(row: Mapping[str, Any]) -> tuple[str, ...]:
     if kernel["kind"] == "polynomial":
         said = f"degree {kernel['degree']}, c {kernel['offset']:g}"
     return (*([row["use"]] if "use" in row else []), str(row["num_features"] or "all"), said)
-
-
-_HELD_NOTE = (
-    "held-out: mean log loss (nats) and balanced accuracy of each training group under C, c "
-    "and scales that were chosen without it; ranking, ranges, K and, by way of the other "
-    "groups' descents, the number of steps have seen it. The detectors behind the other columns "
-    "choose by all groups, the first on more bins"
-)
-_WAYS = {
-    "recipe": "grid, by balanced accuracy",
-    "grid": "grid, by loss",
-    "tuned": "tuned by gradient",
-}
-
-
-def tuning_tables(metrics: _Metrics) -> list[str]:
-    """A table for each fold that was tuned: loss and accuracy of groups the choice did not see.
-
-    Behind them the accuracy of the detectors. Empty where nothing was tuned.
-
-    Args:
-        metrics: the content of ``metrics.json``.
-    """
-    texts = []
-    for name, fold in {"": metrics, **metrics.get("folds", {})}.items():
-        if not (tuning := fold.get("tuning")):
-            continue
-        rows: list[_Row] = []
-        for way, label in _WAYS.items():
-            loss, accuracy = (
-                mean(float(group[way][key]) for group in tuning["held"])
-                for key in ("loss", "balanced_accuracy")
-            )
-            cells: _Row = {f"tuning {name}".strip(): label, "held-out loss": f"{loss:.4f}"}
-            cells["held-out %"] = style.percent(accuracy)
-            detectors = fold["splits"] if way == "tuned" else tuning["splits"][way]
-            for role, of in fold["splits"].items():
-                if of["balanced_accuracy"] is not None:
-                    cells[f"{role} %"] = style.percent(detectors[role]["balanced_accuracy"])
-            rows.append(cells)
-        start = tuning["start"]
-        steps = (
-            f"{tuning['steps']} steps from C={start['penalty']:g}, c={start['offset']:g} to "
-            f"C={tuning['penalty']:.3g}, c={tuning['offset']:.3g}; learned: "
-            f"{', '.join(tuning['learned'])}; {tuning['bins']} bins; tuning took "
-            f"{tuning['seconds']:.0f} s, the first fit with its grid {tuning['fit_s']:.0f} s"
-        )
-        texts.append(style.marked(metrics["simulated"], style.table(rows), _HELD_NOTE, steps))
-    return texts
-
-
-@style.styled
-def tuning_figure(tuning: Mapping[str, Any], path: str | Path, *, simulated: bool) -> None:
-    """Write the descents of every held-out group, the one on all, and the learned scales.
-
-    Args:
-        tuning: ``metrics["tuning"]``.
-        path: the PNG to write, replaced as a whole if it exists.
-        simulated: whether the data is.
-    """
-    scales = tuning["scales"] if "scales" in tuning["learned"] else {}
-    figure = style.new_figure(
-        12.5 if scales else 7.5, 4.2, "Tuning through the fit", simulated=simulated
-    )
-    panels = figure.subplots(1, 1 + bool(scales), squeeze=False)[0]
-    axes = panels[0]
-    losses = np.array([[row["held_loss"] for row in group["history"]] for group in tuning["held"]])
-    for place, group in enumerate(tuning["held"]):
-        colour, steps = style.PALETTE[place % len(style.PALETTE)], group["tuned"]["steps"]
-        axes.plot(losses[place], color=colour, lw=1, label=group["held"])
-        axes.plot(steps, losses[place, steps], "o", color=colour, markersize=4)
-    axes.plot(losses.mean(axis=0), "k-", lw=2.5, label="their mean, which decides")
-    learning = [row["loss"] for row in tuning["history"]]
-    axes.plot(learning, "k--", lw=1.5, label="what is learned on")
-    axes.axvline(tuning["steps"], color=style.GREY, lw=1, label="steps taken")
-    axes.set_ylim(bottom=0)
-    axes.set(xlabel="steps", ylabel="held-out log loss, nats")
-    axes.set_title("groups held out; dots: steps chosen by the other groups")
-    axes.legend(**style.UPPER_LEFT_OUTSIDE)
-    if scales:
-        _draw_scales(panels[1], scales)
-    style.save(figure, path)
-
-
-def _draw_scales(axes: Axes, scales: Mapping[str, float]) -> None:
-    """Learned scales, the largest first; the first and last few are named."""
-    ordered = sorted(scales.items(), key=lambda item: -item[1])
-    axes.bar(range(len(ordered)), [value for _, value in ordered], color=style.BLUE, width=0.8)
-    axes.axhline(1, color=style.GREY, lw=1)
-    for x, side, heading, named in (
-        (0.02, "left", "largest", ordered[:3]),
-        (0.98, "right", "smallest", ordered[-3:][::-1]),
-    ):
-        text = "\n".join([f"{heading}:", *(f"{value:.2f}  {name}" for name, value in named)])
-        axes.text(x, 0.98, text, transform=axes.transAxes, va="top", ha=side, fontsize=7)
-    axes.set(ylim=(0, 1.5 * ordered[0][1]), xlabel="features, by scale")
-    axes.set(ylabel="scale in the kernel", title="learned scales: soft selection")
 
 
 # Confounders: scenes that have motion without slip, or slip without motion ------------------------

@@ -1,1 +1,1 @@
-"""Stages of training: the alarm of a detector, settings by gradient, adaptation."""
+"""Stages of training, from recordings to a detector with its alarm."""

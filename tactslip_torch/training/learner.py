@@ -69,7 +69,6 @@ from tactslip_torch.training.plan import (
     solve_metadata,
 )
 from tactslip_torch.training.recipe import (
-    FeatureSelection,
     FeatureThreshold,
     Recipe,
     best_threshold,
@@ -227,7 +226,6 @@ class SlipLearner(L.LightningModule):
         channel_filter: of those bins, kept with the detector.
         recipe: how the machine is made.
         detector: a finished one, to be evaluated only.
-        selection: features and ranges that were chosen elsewhere; by default the recipe finds them.
         with_baselines: fit baselines on the sample of training bins, to be evaluated beside.
 
     Attributes:
@@ -245,7 +243,6 @@ class SlipLearner(L.LightningModule):
         channel_filter: ChannelFilter,
         recipe: Recipe | None = None,
         detector: SlipDetector | None = None,
-        selection: FeatureSelection | None = None,
         *,
         with_baselines: bool = True,
     ) -> None:
@@ -255,7 +252,6 @@ class SlipLearner(L.LightningModule):
         self.channel_filter = channel_filter
         self.recipe = recipe or Recipe()
         self.recipe.allowed(pool)  # refused before any work
-        self._selection = selection
         self.detector = detector
         self.with_baselines = with_baselines
         self.baselines: Baselines | None = None
@@ -411,25 +407,12 @@ class SlipLearner(L.LightningModule):
         assert self._plan is not None  # fitted
         return self._plan
 
-    @property
-    def gathered(self) -> tuple[TrainingPass, SampledBins]:
-        """What the machine was solved from, and the first pass's sample of its bins."""
-        assert self._second is not None  # fitted
-        return self._second, self._statistics.sample.bins()
-
     def _fingerprint(self) -> str:
         data: SlipDataModule = self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning's
         return f"{data.fingerprint()} by {self.recipe}"
 
     def _planned(self) -> Plan:
-        return plan_detector(
-            self.recipe,
-            self._statistics,
-            self.pool,
-            self._selection,
-            is_settled=self._selection is not None,
-            show=True,
-        )
+        return plan_detector(self.recipe, self._statistics, self.pool, show=True)
 
     def _solve(self, gathered: TrainingPass) -> None:
         started = time.perf_counter()

@@ -92,7 +92,6 @@ def _choose_held(
     selection: FeatureSelection,
     sample: SampledBins,
     *,
-    is_settled: bool = False,
     show: bool = False,
 ) -> tuple[list[dict[str, Any]], int, Kernel, float]:
     """Rows of the validation, and the K, kernel and C of the best of them.
@@ -101,7 +100,6 @@ def _choose_held(
         recipe: what to choose from.
         selection: features ranked and scaled, as many as the largest K.
         sample: of the training bins.
-        is_settled: whether to validate a single choice too.
         show: a progress bar.
     """
     sizes = sorted({min(size, selection.size) for size in recipe.sizes})
@@ -111,7 +109,7 @@ def _choose_held(
         )
     penalties = recipe.penalties_ascending
     choices = list(itertools.product(sizes, recipe.kernels, penalties))
-    if len(sample.group_names) < 2 or not (len(choices) > 1 or is_settled):
+    if len(sample.group_names) < 2 or len(choices) == 1:
         # of the most features and the last kernel
         chosen = choices[len(choices) - len(penalties) + len(penalties) // 2]
         if len(choices) > 1:
@@ -767,14 +765,12 @@ def plan_detector(
     pool: FeaturePool | None = None,
     selection: FeatureSelection | None = None,
     *,
-    is_settled: bool = False,
     is_nested: bool = True,
     show: bool = False,
 ) -> Plan:
     """Choose the features and the machine by validation on held-out groups.
 
-    Of a recipe that leaves no choice nothing is validated, unless it ``is_settled``, by tuning:
-    then held-out scores are wanted for what follows from them, such as a calibration.
+    Of a recipe that leaves no choice nothing is validated.
 
     Args:
         recipe: what to choose from, and how.
@@ -782,7 +778,6 @@ def plan_detector(
         pool: of the features; only without it may every feature be selected whatever its name.
             Features that are pooled over channels need it.
         selection: features that were ranked and scaled elsewhere.
-        is_settled: whether to validate a single choice too.
         is_nested: whether to evaluate a nested choice itself.
         show: a progress bar.
 
@@ -813,9 +808,7 @@ def plan_detector(
             if isinstance(statistics, SampledBins):
                 raise ValueError("recipe.validation=held needs statistics of all training bins")
             selection = select_features(recipe, statistics, allowed)
-        rows, size, kernel, penalty = _choose_held(
-            recipe, selection, sample, is_settled=is_settled, show=show
-        )
+        rows, size, kernel, penalty = _choose_held(recipe, selection, sample, show=show)
         selection = selection.first(size)
     if num_bins > MOST_KEPT_BINS and not kernel.collapses:
         log.warning(

@@ -223,25 +223,6 @@ class Recipe:
                 f"most {num_features}"
             )
 
-    def check_quadratic(self, who: str) -> None:
-        """Refuse what does not always make a machine of degree 2, for ``who`` needs one.
-
-        Raises:
-            ValueError: if it is chosen nested, a kernel is another, or a penalty is not finite.
-        """
-        if self.validation == "nested":
-            raise ValueError(
-                f"{who} needs a machine of degree 2 on features of channels, which "
-                f"recipe={self.name} does not always make; take recipe=robust or recipe=paper"
-            )
-        for kernel in self.kernels:
-            if not isinstance(kernel, Polynomial) or kernel.degree != 2:
-                raise ValueError(
-                    f"{who} needs recipe.kernel=polynomial recipe.degree=2, got {kernel}"
-                )
-        if not math.isfinite(most := self.penalties_ascending[-1]):
-            raise ValueError(f"{who} needs finite recipe.penalties, got {most:g}")
-
     def allowed(self, pool: FeaturePool) -> Tensor | None:
         """Which features of a pool may be selected, ``[F]``, bool; ``None`` if all may.
 

@@ -15,9 +15,9 @@ from .running import Runner
 
 RECIPES = {
     "general": settings(recipe="general"),
-    "selected": settings(recipe="robust", statistics=True, num_features=12, penalties=[0.001, 0.1]),
+    "selected": settings(recipe="robust", num_features=12, penalties=[0.001, 0.1]),
 }
-"""The default, of statistics over channels; and one of few features, which can be adapted."""
+"""The default, of statistics over channels; and one of few features."""
 
 
 class Trained(NamedTuple):

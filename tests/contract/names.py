@@ -86,7 +86,6 @@ DECISIONS = "{}_decisions.csv"
 RUN_FILES = (DETECTOR, METRICS, CHECKPOINT, "config.yaml", "confusion.png", "selected_features.png")
 CONVERT = "convert"
 UNSEEN_EXPERIMENT, REAL_EXPERIMENT = "unseen4", "biotacsp_dos"
-ADD, LIST, FORGET = "add", "list", "forget"
 
 # metrics.json: the splits' names, and what the fit alone decides
 TRAIN, TEST, HELD_OUT = "train", "test", "unseen"

@@ -4,7 +4,6 @@ import csv
 import json
 import os
 import runpy
-import shutil
 import signal
 import time
 
@@ -23,7 +22,6 @@ from .recordings import (
     of_set,
     samples_of,
     split_of_set,
-    write_set,
 )
 from .running import ROOT
 
@@ -152,27 +150,6 @@ def test_converted_recordings_are_the_same_set(command, selected, recordings, tm
     splits = read(tmp_path / "run" / names.METRICS)[names.SPLITS]
     for name, scores in selected.metrics[names.SPLITS].items():
         assert splits[name][names.CONFUSION] == scores[names.CONFUSION], name
-
-
-# Adapt, certify, importance ----------------------------------------------------------------------
-
-
-def test_adapt_adds_a_material_and_takes_it_back(command, selected, cache, tmp_path):
-    run = tmp_path / "run"
-    shutil.copytree(selected.folder, run)
-    new = write_set(tmp_path / "new", {f"D/{trial}": 1 for trial in TRIALS})
-    model = settings(model=run / names.DETECTOR)
-    more = settings(recordings=new, channels=CHANNELS, materials=["D"], cache=cache)
-    command.well(tmp_path, "adapt", *model, *settings(action=names.ADD), *more)
-    added = SlipDetector.load(run / names.DETECTOR)
-    assert added.info["train_materials"] == [*SEEN, "D"]
-    assert (probe(added) - probe(selected.detector)).abs().max() > 1e-6
-    assert "D" in command.well(tmp_path, "adapt", *model, *settings(action=names.LIST))
-    which = settings(action=names.FORGET, material="D", cache=cache)
-    command.well(tmp_path, "adapt", *model, *which)
-    found = SlipDetector.load(run / names.DETECTOR)
-    assert found.info["train_materials"] == list(SEEN)
-    torch.testing.assert_close(probe(found), probe(selected.detector), rtol=1e-9, atol=1e-9)
 
 
 # A simulated set, and statistics in shards -------------------------------------------------------

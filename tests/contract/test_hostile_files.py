@@ -15,7 +15,6 @@ import warnings
 import zipfile
 import zlib
 from collections import Counter
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -39,14 +38,12 @@ from tactslip_torch.deploy.export import export_detector, read_sidecar, summary
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.own_files import (
     DETECTOR,
-    STATISTICS,
     SUMS,
     load_table,
     read_checkpoint,
     save_table,
 )
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.adaptation import RecordingBins, Statistics, Step
 from tactslip_torch.training.learner import SlipLearner
 from tactslip_torch.training.recipe import Recipe
 
@@ -361,13 +358,6 @@ def solve(path):
     SufficientStats.load(path).solve(1.0)
 
 
-def adapt(path):
-    statistics = Statistics.load(path)
-    assert statistics.known().material.min() >= 0
-    assert statistics.materials
-    statistics.sums.solve(statistics.machine.penalty, statistics.machine.offset)
-
-
 def resume(path):
     read_checkpoint(path)
     checkpoint = torch.load(path, weights_only=True)
@@ -386,7 +376,6 @@ def told(path):
 OWN = {  # what is forged, and what is done with it
     "detector.pt": (forged_table(DETECTOR), detect),
     "sums.pt": (forged_table(SUMS), solve),
-    "statistics.pt": (forged_table(STATISTICS), adapt),
     "last.ckpt": (forged_checkpoint, resume),
     "model.onnx.json": (forged_json, told),
     "manifest.csv": (None, listed),  # words of all kinds are among the damage
@@ -404,17 +393,14 @@ def own_file(folder, name, content):
 
 @pytest.fixture(scope="module")
 def own_files(selected, tmp_path_factory):
-    """A whole file of each kind, of a training and an adaptation."""
+    """A whole file of each kind."""
     folder = tmp_path_factory.mktemp("own")
     for name in (names.DETECTOR, names.CHECKPOINT):
         shutil.copy(selected.folder / name, folder)
-    statistics = Statistics.load(selected.folder / "statistics.pt")
-    statistics.sums.save(folder / "sums.pt")
-    known = statistics.rehearsal
-    bins = {"M2/0": RecordingBins("M2", known.z[:9], known.is_slip[:9], "key")}
-    step = Step({"action": "add"}, {}, {"M2/0": 0.0}, {}, "0" * 32, torch.zeros(9).byte())
-    statistics = replace(statistics, bins=bins, weights={"M2/0": 0.0}, steps=(step,))
-    statistics.save(folder / "statistics.pt")
+    z = torch.linspace(-1, 1, 480, dtype=torch.float64).view(40, 12)
+    sums = SufficientStats(12)
+    sums.update("M1/0", z, torch.arange(40) % 2 == 0)
+    sums.save(folder / "sums.pt")
     export_detector(selected.detector, folder, ["bin"])
     for name, text in MANIFESTS.items():
         (folder / name).write_text(text)

@@ -32,11 +32,6 @@ MISTAKES = {  # beside those of tests/test_command_line.py, which a page lists
         files(recipe="paper", num_features=9999),
         "recipe.num_features=9999 506",
     ),
-    "statistics of the wrong recipe": (
-        "train",
-        files(recipe="general", statistics=True),
-        "statistics recipe",
-    ),
     "channel of no column": (
         "train",
         files(channels=[CHANNELS[0] | {"name": "Z1"}, *CHANNELS[1:]]),
@@ -50,12 +45,6 @@ MISTAKES = {  # beside those of tests/test_command_line.py, which a page lists
         "precision float32 float64 'int8'",
     ),
     "export of no alarm": ("export", settings(model="{bare}", graph="stream"), "alarm onset"),
-    "adapt without statistics": (
-        "adapt",
-        settings(model="{bare}", recordings="{root}", channels=CHANNELS),
-        "statistics.pt statistics=true",
-    ),
-    "adapt by nothing": ("adapt", settings(model="{model}"), "recordings"),
     "crossval of too many": (
         "crossval",
         [*of_set("{root}"), *settings(num_held_out=4, workers=0)],

@@ -69,7 +69,7 @@ def test_a_training_recording_does_change_the_fit(selected, with_other_recording
 
 def test_a_killed_run_goes_on_behind_its_last_pass(command, selected, tmp_path):
     """Killed once the first pass is written; what is made then is the detector of a whole run."""
-    overrides = selected.again(statistics=False)  # which need the first pass in one go
+    overrides = selected.again()
     for attempt in ("1", "2", "3"):  # on a busy machine a run may end first
         run = tmp_path / attempt / "run"
         pid = command.start(tmp_path / attempt, "train", *overrides, *settings(folder="run"))
