@@ -9,7 +9,7 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import KEY, AlarmSettings, score_stream
@@ -35,7 +35,6 @@ def raw_bins(num_bins: int, seed: int = 0, offset: float = 1.0) -> torch.Tensor:
 def small_detector(
     seed: int = 0,
     *,
-    head: str = "quadratic",
     arithmetic: str = "double",
     backend: BackendName = "auto",
 ) -> SlipDetector:
@@ -49,17 +48,12 @@ def small_detector(
     selected = [int(i) for i in (*of_gauges, *of_films)]
     features = pool(channel_filter.valid(raw_bins(64, seed=99)))[:, selected]
     scaler = FeatureScaler.fit(features)
-    if head == "sum":
-        support = torch.from_numpy(rng.uniform(-1, 1, (30, NUM_FEATURES)))
-        weights = torch.from_numpy(rng.standard_normal(30))
-        machine: QuadraticForm | KernelSum = KernelSum(support, weights, Polynomial(3, 0.5))
-    else:
-        bend = torch.from_numpy(rng.standard_normal((NUM_FEATURES, NUM_FEATURES)))
-        linear = torch.from_numpy(rng.standard_normal(NUM_FEATURES))
-        centre = scaler(features)
-        machine = QuadraticForm(bend + bend.T, linear, torch.tensor(0.0, dtype=torch.float64))
-        middle = -machine(centre).median()  # so that both decisions occur
-        machine = QuadraticForm(bend + bend.T, linear, middle)
+    bend = torch.from_numpy(rng.standard_normal((NUM_FEATURES, NUM_FEATURES)))
+    linear = torch.from_numpy(rng.standard_normal(NUM_FEATURES))
+    centre = scaler(features)
+    machine = QuadraticForm(bend + bend.T, linear, torch.tensor(0.0, dtype=torch.float64))
+    middle = -machine(centre).median()  # so that both decisions occur
+    machine = QuadraticForm(bend + bend.T, linear, middle)
     facts = {"simulated": True}
     return SlipDetector(pool, channel_filter, selected, scaler, machine, facts, backend=backend)
 
