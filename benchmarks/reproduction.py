@@ -20,8 +20,8 @@ from omegaconf import OmegaConf
 
 from benchmarks import ROOT
 from benchmarks.harness import Benchmark, Job, put_between, trained
+from benchmarks.signal_checks import check_signals, filtered
 from benchmarks.tables import Report, Table, mean_sd, percent
-from tactslip_torch.analysis.signal_checks import check_signals, filtered
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.report import published

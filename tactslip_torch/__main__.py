@@ -22,7 +22,6 @@ COMMANDS = {
     "importance": "which sensors matter",
     "crossval": "every choice of held-out materials",
     "pareto": "the most accurate detector within a deadline",
-    "calibrate-simulator": "set the free parameters of the simulator",
     "hosts": "copy a program that runs an exported detector: python, c, node or web",
 }
 OF_THEIR_OWN = ("demo", "hosts")

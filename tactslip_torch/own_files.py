@@ -298,9 +298,8 @@ _POOL = {
 }
 _KERNEL = {
     "kind": str,
-    "degree?": _number(1, 100),
+    "degree?": _one_of(1, 2),
     "offset?": _number(0, 1e100),
-    "gamma?": _positive,
 }
 _CALIBRATION = {
     "kind": str,
@@ -378,7 +377,6 @@ _CHECKPOINT = {
         "kernel": _KERNEL,
         "penalty": _number(1e-300, math.inf),
         "fractions": [_share, 2],
-        "bin_weight": _number(0, 1e300),
         "num_bins": _count,
         "imputation": _tensor_of_finite,
         "selected": [_number(0, 10**7, whole=True), 10**6],

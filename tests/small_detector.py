@@ -10,7 +10,7 @@ from tactslip_torch.features.sensing import Sensing
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import KEY, AlarmSettings, score_stream
@@ -38,7 +38,6 @@ def raw_bins(
 def small_detector(
     seed: int = 0,
     *,
-    head: str = "quadratic",
     arithmetic: str = "double",
     backend: BackendName = "auto",
 ) -> SlipDetector:
@@ -52,17 +51,12 @@ def small_detector(
     selected = [int(i) for i in (*of_gauges, *of_films)]
     features = pool(channel_filter.valid(raw_bins(64, seed=99)))[:, selected]
     scaler = FeatureScaler.fit(features)
-    if head == "sum":
-        support = torch.from_numpy(rng.uniform(-1, 1, (30, NUM_FEATURES)))
-        weights = torch.from_numpy(rng.standard_normal(30))
-        machine: QuadraticForm | KernelSum = KernelSum(support, weights, Polynomial(3, 0.5))
-    else:
-        bend = torch.from_numpy(rng.standard_normal((NUM_FEATURES, NUM_FEATURES)))
-        linear = torch.from_numpy(rng.standard_normal(NUM_FEATURES))
-        centre = scaler(features)
-        machine = QuadraticForm(bend + bend.T, linear, torch.tensor(0.0, dtype=torch.float64))
-        middle = -machine(centre).median()  # so that both decisions occur
-        machine = QuadraticForm(bend + bend.T, linear, middle)
+    bend = torch.from_numpy(rng.standard_normal((NUM_FEATURES, NUM_FEATURES)))
+    linear = torch.from_numpy(rng.standard_normal(NUM_FEATURES))
+    centre = scaler(features)
+    machine = QuadraticForm(bend + bend.T, linear, torch.tensor(0.0, dtype=torch.float64))
+    middle = -machine(centre).median()  # so that both decisions occur
+    machine = QuadraticForm(bend + bend.T, linear, middle)
     facts = {"simulated": True}
     return SlipDetector(pool, channel_filter, selected, scaler, machine, facts, backend=backend)
 

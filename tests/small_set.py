@@ -17,7 +17,7 @@ from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel
+from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.recipe import Recipe
@@ -116,7 +116,7 @@ def small_recipe(**changes: Any) -> Recipe:
 
 
 def refitted_scores(
-    bins: TrainingBins, groups: torch.Tensor, penalty: float, kernel: Kernel = PAPER_KERNEL
+    bins: TrainingBins, groups: torch.Tensor, penalty: float, kernel: Polynomial = PAPER_KERNEL
 ) -> torch.Tensor:
     """Of each bin, by the machine that is fitted without its group."""
     scores = torch.full((len(groups),), torch.nan, dtype=torch.float64)

@@ -109,7 +109,6 @@ def test_a_sample_stands_for_all_bins_with_both_classes_of_one_weight(balance, r
 
 BAD_RECIPES = [
     ({"balance": "none"}, r"recipe.balance must be one of undersample, weights, got 'none'"),
-    ({"kernel": "rbf"}, r"recipe.kernel=rbf needs recipe.gamma"),
     ({"penalties": ()}, r"recipe.penalties must be positive, got \[\]"),
     ({"penalties": (0.1, float("inf"))}, r"validation needs finite values"),
     ({"num_features": 1.5}, r"num_features must be whole numbers of at least 1, got \[1.5\]"),
@@ -117,11 +116,10 @@ BAD_RECIPES = [
     ({"tail": "0.1"}, r"recipe.tail must lie in \[0, 0.5\), got '0.1'"),  # text is no number
     ({"most_correlation": 0.0}, r"recipe.most_correlation must lie in \(0, 1\]"),
     ({"sample_bins": 1}, r"recipe.sample_bins must be at least 2"),
-    ({"degree": 0}, r"degree of the kernel must be a whole number"),
+    ({"degree": 0}, r"degree of the kernel must be 1 or 2, got 0"),
+    ({"degree": 3}, r"degree of the kernel must be 1 or 2, got 3"),
     ({"use": "pooled", "pooling": None}, "needs statistics over channels"),
     ({"num_features": None}, "num_features=null needs recipe.validation=nested"),
-    ({"validation": "nested", "kernel": "rbf", "gamma": 1}, "needs recipe.kernel=polynomial"),
-    ({"validation": "nested", "degree": 3}, "of degree 1 or 2"),
     ({"tolerance": 1.0}, r"recipe.tolerance must lie in \[0, 1\), got 1.0"),
     ({"scene_weights": {"taps": 0.0}}, "scene_weights must be positive, got {'taps': 0.0}"),
     ({"feature_filter": {"kinds": "SG"}}, r"recipe.feature_filter: unknown 'kinds', expected"),
@@ -207,32 +205,6 @@ def test_neither_order_nor_sums_change_the_machine(bins, balance, rng):
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
     with pytest.raises(ValueError, match="already"):
         gathered.update(str(parts[0][0]), parts[0][1], parts[0][2])
-
-
-@pytest.mark.parametrize(
-    ("change", "balance"),
-    [({"degree": 3}, "undersample"), ({"kernel": "rbf", "gamma": 0.3}, "weights")],
-    ids=str,
-)
-def test_a_kernel_that_does_not_fold_keeps_some_bins_that_stand_for_all(
-    change, balance, rng, monkeypatch, caplog
-):
-    parts = make_parts(rng, cycles=5, bins=80, share=0.6)
-    recipe = Recipe(**FEW | {"penalties": 0.01}, balance=balance, **change)
-    whole = planned(recipe, parts)
-    assert not whole.adds_up
-    monkeypatch.setattr(planning, "MOST_KEPT_BINS", 300)
-    thinned = planned(recipe, parts)
-    assert (whole.bin_weight, thinned.num_bins) == (1.0, 300)
-    assert thinned.bin_weight == pytest.approx(whole.num_bins / 300, rel=1e-3)
-    assert "takes 300 of" in caplog.text
-    z = whole.selection(together(parts)[0])
-    full, few = (passed(plan, parts).solve()(z) for plan in (whole, thinned))
-    assert balanced_accuracy(full >= 0, together(parts)[1]) > 0.8
-    lighter = passed(replace(thinned, bin_weight=1.0), parts).solve()(z)
-    assert (few - full).square().mean() < 0.5 * (lighter - full).square().mean()
-    linear = planned(Recipe(**FEW, degree=1, balance="weights"), parts)  # folds: takes every bin
-    assert int(passed(linear, parts).stats.count.sum()) == linear.num_bins == 1200
 
 
 # A recipe that restricts the ranking -------------------------------------------------------------

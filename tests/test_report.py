@@ -108,7 +108,6 @@ CHOICES = [
     choice(60, 1.0, M1=0.8, M2=0.9, M3=None),
     choice(120, 0.1, M1=0.95, M2=0.75, M3=None),
 ]
-RBF = choice(60, 0.3, M1=0.5, M2=None, M3=0.4) | {"kernel": {"kind": "rbf", "gamma": 1}}
 
 
 # Tables ----------------------------------------------------------------------------------------
@@ -211,7 +210,7 @@ def features_of(metrics, path):
 FIGURES = [
     (results.confusion_figure, {}),
     (results.confusion_figure, {"splits": ABSENT}),
-    (results.validation_figure, {"validation": [*CHOICES, RBF]}),
+    (results.validation_figure, {"validation": CHOICES}),
     (results.reliability_figure, {"alarm": {"reliability": BY_ROLE}}),
     (results.events_figure, {"events": EVENTS}),
     (features_of, {}),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from tactslip_torch.analysis.signal_checks import (
+from benchmarks.signal_checks import (
     SIGNAL_CHECKS,
     Signals,
     check_signals,

@@ -13,8 +13,8 @@ import yaml
 from scipy.signal import butter, sosfiltfilt
 from test_signal_checks import BY_NAME, HAND, changed, shuffled
 
+from benchmarks.signal_checks import filtered
 from tactslip_torch import native
-from tactslip_torch.analysis.signal_checks import filtered
 from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.deploy.check import extreme_bins
 from tactslip_torch.simulation import (

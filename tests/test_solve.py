@@ -11,7 +11,7 @@ import torch
 
 from tactslip_torch.model import fit
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine, held_out_scores
-from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, RadialBasis
+from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial
 from tactslip_torch.model.solve import solve_symmetric
 
 
@@ -204,7 +204,7 @@ def test_a_light_bin_is_no_noise():
         solve_symmetric(twice, torch.tensor([1.0, -1.0, 1.0]).double(), np.inf, weights)
 
 
-CUBIC, RADIAL, LINE = Polynomial(3), RadialBasis(0.4), Polynomial(1, 0.7)
+LINE = Polynomial(1, 0.7)
 GROUPS = ("bins", "cycles", "materials", "mixed")
 
 
@@ -233,8 +233,6 @@ def grouped(rng, num_bins, kind):
 
 
 def gram(kernel, a, b):
-    if isinstance(kernel, RadialBasis):
-        return np.exp(-kernel.gamma * ((a[:, None] - b[None]) ** 2).sum(-1))
     return (a @ b.T + kernel.offset) ** kernel.degree
 
 
@@ -268,8 +266,6 @@ def assert_refits(bins, groups, penalty, kernel=PAPER_KERNEL):
     [
         (PAPER_KERNEL, 60, 12),  # the dual: 91 monomials
         (LINE, 40, 41),
-        (CUBIC, 60, 12),
-        (RADIAL, 60, 12),
         (Polynomial(2, 1.5), 80, 4),  # the primal: 15 monomials, groups of more and of fewer bins
         (LINE, 80, 4),
     ],
@@ -334,7 +330,6 @@ NOT_HELD_OUT = [
     (lambda b, g: HeldOut(b, 0 * g + 7), r"at least two groups, all 20 bins are in \[7\]"),
     (lambda b, g: HeldOut(b, with_all_of(True, b)), "without group 9 no slip bin is left"),
     (lambda b, g: HeldOut(b, with_all_of(False, b)), "without group 9 no non-slip bin is left"),
-    (lambda b, g: HeldOut(b, g, RADIAL, "primal"), r"RadialBasis.* has no primal"),
     (lambda b, g: held_out(b, g, 1.0, -0.5), r"offset .* at least 0, got -0.5"),
     (lambda b, g: held_out(b, g, 1.0, weights=torch.zeros(20)), "weights must be positive"),
     (lambda b, g: held_out(twice(b), g.repeat(2), 1e12), r"condition .*, wanted up to 1e\+10"),

@@ -23,7 +23,7 @@ from tactslip_torch.features.selection import rank_distinct
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import HeldOut, TrainingBins
-from tactslip_torch.model.kernels import Kernel
+from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import bar, in_parts
 from tactslip_torch.training.recipe import FeatureSelection
@@ -187,7 +187,7 @@ class Refit:
     weights: Tensor
     scored: Mapping[str, SampledBins]
     selection: FeatureSelection
-    kernel: Kernel
+    kernel: Polynomial
     penalties: Sequence[float]
     _known: dict[Any, tuple[Result, Any]] = field(default_factory=dict, repr=False, compare=False)
 

@@ -397,9 +397,7 @@ class ParetoSearch:
             )
         self.makers, self.fold, self.search = makers, fold, search
         self._offset = float(np.ravel(recipe.offsets)[0])
-        self.recipe = replace(
-            recipe, sample_bins=search.bins, kernel="polynomial", offsets=self._offset
-        )
+        self.recipe = replace(recipe, sample_bins=search.bins, offsets=self._offset)
         self.most_summed = most_summed
         self.training_statistics: dict[Align, TrainingStatistics] = {}
         self._samples: dict[Align, SampledBins] = {}

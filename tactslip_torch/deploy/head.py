@@ -11,7 +11,7 @@ from torch import Tensor
 from tactslip_torch.deploy.value import F32, F64, Value
 from tactslip_torch.features.pooling import over_channels
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernels import Head, KernelSum, Polynomial
+from tactslip_torch.model.kernels import Head, KernelSum
 from tactslip_torch.model.scaling import FeatureScaler
 
 _LARGEST = float(np.finfo(np.float64).max)
@@ -84,8 +84,8 @@ def scaled(features: Value, scaler: FeatureScaler) -> Value:
 def machine(z: Value, head: Head, dtype: np.dtype[Any]) -> Value:
     """The score of scaled features: ``[B, K] -> [B]``.
 
-    A quadratic form is computed in the dtype of scores. The sum over training bins of a kernel that
-    does not fold cancels, so it is float64 always.
+    A quadratic form is computed in the dtype of scores. The sum over training bins
+    cancels, so it is float64 always.
     """
     if isinstance(head, KernelSum):
         score = _kernel_sum(z, head)
@@ -100,17 +100,8 @@ def machine(z: Value, head: Head, dtype: np.dtype[Any]) -> Value:
 
 
 def _kernel_sum(z: Value, head: KernelSum) -> Value:
-    support, kernel = head.support.double(), head.kernel
-    gram = z @ support.T.double()
-    if isinstance(kernel, Polynomial):
-        base = gram + kernel.offset
-        values = base
-        for _ in range(kernel.degree - 1):
-            values = values * base
-    else:
-        norms = _float64(z, support.square().sum(-1))
-        squares = (z * z).sum(1, keepdim=True) + norms - gram * 2.0
-        values = (squares.clamp(min=0.0) * -kernel.gamma).exp()
+    base = z @ head.support.T.double() + head.kernel.offset
+    values = base if head.kernel.degree == 1 else base * base
     return (values @ head.beta[:, None].double()).squeeze(1)
 
 

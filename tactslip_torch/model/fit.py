@@ -33,7 +33,6 @@ from torch.utils.checkpoint import checkpoint
 from tactslip_torch.model.kernels import (
     PAPER_KERNEL,
     Head,
-    Kernel,
     Polynomial,
     QuadraticForm,
     collapse,
@@ -102,9 +101,9 @@ class TrainingBins:
 
 
 def fit_machine(
-    bins: TrainingBins, penalty: float, kernel: Kernel = PAPER_KERNEL, route: Route = "auto"
+    bins: TrainingBins, penalty: float, kernel: Polynomial = PAPER_KERNEL, route: Route = "auto"
 ) -> Head:
-    """Solve the kernel machine, and fold it into its quadratic form where the kernel folds.
+    """Solve the kernel machine, and fold it into its quadratic form unless that is larger.
 
     Through the primal or the dual, whichever ``takes_dual`` finds cheaper; both give the same
     machine. The primal takes two matrices of monomials by monomials (7381 for 120 features)
@@ -119,26 +118,25 @@ def fit_machine(
         route: ``"auto"``, or the one to take.
 
     Raises:
-        ValueError: if a number is not finite, the primal is asked of a kernel that does not fold,
-            or it would lose the lightest bin to rounding.
+        ValueError: if a number is not finite, or the primal would lose the lightest bin to
+            rounding.
     """
     if len(bins.features) == 0:
         raise ValueError("a machine needs training bins, got none; add bins of both classes")
     bins = bins.double()
     if not _goes_dual(bins, penalty, kernel, route):
-        assert isinstance(kernel, Polynomial)
         normal = _normal_matrix(kernel, bins.features, bins.sample_weight)
         moment = kernel.sum_of_monomials(bins.features, bins.sample_weight * bins.targets)
         return kernel.solve(normal, moment, penalty, bins.features.shape[1])[0]
     gram = gram_matrix(kernel, bins.features)
     solution = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
     num_features = bins.features.shape[1]
-    most_rank = kernel.num_monomials(num_features) if isinstance(kernel, Polynomial) else len(gram)
+    most_rank = kernel.num_monomials(num_features)
     make = functools.partial(machine_of, bins.features, kernel=kernel)
     machine = solved_machine(solution, make, most_rank)
     if not isinstance(machine, QuadraticForm):
         log.info(
-            "%s does not fold into a quadratic form: all %d training bins are kept, %s",
+            "%s of more features than bins: all %d training bins are kept, %s",
             kernel,
             len(bins.features),
             machine.cost,
@@ -238,14 +236,12 @@ def fit_quadratic(
     return machine
 
 
-def takes_dual(kernel: Kernel, num_bins: int, num_features: int) -> bool:
-    """Whether the dual is the cheaper route, by the multiply-adds of both; the only one for some.
+def takes_dual(kernel: Polynomial, num_bins: int, num_features: int) -> bool:
+    """Whether the dual is the cheaper route, by the multiply-adds of both.
 
     At degree 2 a Cholesky factorisation in as many unknowns as bins stands against one in as many
     as monomials and the sums it is made of: for 120 features up to 9800 bins, not just 7381.
     """
-    if not isinstance(kernel, Polynomial) or not kernel.collapses:
-        return True
     num_monomials = kernel.num_monomials(num_features)
     if kernel.degree == 1:
         return num_bins <= num_monomials
@@ -253,25 +249,22 @@ def takes_dual(kernel: Kernel, num_bins: int, num_features: int) -> bool:
     return num_bins**3 <= num_monomials**3 + 6 * sums
 
 
-def check_route(route: str, kernel: Kernel) -> None:
-    """Refuse an unknown route, and the primal of a kernel that does not fold.
+def check_route(route: str) -> None:
+    """Refuse an unknown route.
 
     Raises:
         ValueError: if it is one.
     """
     if route not in ("auto", "primal", "dual"):
         raise ValueError(f"route must be 'auto', 'primal' or 'dual', got {route!r}")
-    if route == "primal" and not kernel.collapses:
-        raise ValueError(f"{kernel} has no primal of fixed size; take route='dual' or 'auto'")
 
 
-def _goes_dual(bins: TrainingBins, penalty: float, kernel: Kernel, route: Route) -> bool:
+def _goes_dual(bins: TrainingBins, penalty: float, kernel: Polynomial, route: Route) -> bool:
     """Whether the dual is asked for, cheaper, or needed: sums would lose the lightest bin."""
-    check_route(route, kernel)
+    check_route(route)
     num_bins, num_features = bins.features.shape
     if route == "dual" or (route == "auto" and takes_dual(kernel, num_bins, num_features)):
         return True
-    assert isinstance(kernel, Polynomial)
     longest = float(bins.features.square().sum(-1).max()) + kernel.offset
     lightest, heaviest = (float(x) for x in bins.sample_weight.detach().aminmax())
     light, heavy = (weight * longest**kernel.degree for weight in (lightest, heaviest))
@@ -320,17 +313,17 @@ class HeldOut:
 
     Raises:
         ValueError: if shapes disagree, all bins are one group, leaving a group (named)
-            out leaves one class, or the primal is asked of a kernel that does not fold.
+            out leaves one class.
     """
 
     def __init__(
         self,
         bins: TrainingBins,
         groups: Tensor,
-        kernel: Kernel = PAPER_KERNEL,
+        kernel: Polynomial = PAPER_KERNEL,
         route: Route = "auto",
     ) -> None:
-        check_route(route, kernel)
+        check_route(route)
         bins = bins.double()
         _check_groups(groups, bins.is_slip)
         self._order, self._groups = ordered_groups(groups)
@@ -343,7 +336,6 @@ class HeldOut:
         if self._is_dual:
             self._system = gram_matrix(kernel, self._z)
         else:
-            assert isinstance(kernel, Polynomial)
             self._system = _normal_matrix(kernel, self._z, self._weights)
 
     def at(self, penalty: float) -> HeldOutFit:
@@ -393,7 +385,6 @@ class HeldOut:
 
     def _primal(self, penalty: float) -> tuple[Head, Tensor]:
         kernel, weights = self._kernel, self._weights
-        assert isinstance(kernel, Polynomial)
         moment = kernel.sum_of_monomials(self._z, weights * self._targets)
         num_features = self._z.shape[1]
         head, factor = kernel.solve(self._system, moment, penalty, num_features, MOST_CONDITION)

@@ -1,11 +1,11 @@
-"""Kernels, their explicit features, and the heads that a sum over training bins becomes.
+"""The kernel, its explicit features, and the heads that a sum over training bins becomes.
 
 The paper's is the polynomial of degree 2 (section IV-E). Polynomials of degree 1 and 2 in K
 features have few monomials, so their sum over the training bins folds into one quadratic form of
-fixed size (REFERENCE.md section 5):
+fixed size:
 ``sum_i beta_i (z_i . z + c)^2 = z' Q z + l' z + a`` with ``Q = Z' diag(beta) Z``,
 ``l = 2 c Z' beta`` and ``a = c^2 sum(beta)``. Degree 1 likewise, with ``Q = 0`` (not stored),
-``l = Z' beta``, ``a = c sum(beta)``. Other kernels keep every training bin.
+``l = Z' beta``, ``a = c sum(beta)``. Where there are far more features than bins, the sum stays.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Polynomial:
     """``(a . b + offset) ** degree``; differentiable in both.
 
     Args:
-        degree: at least 1.
+        degree: 1 or 2.
         offset: the paper's ``c``, at least 0.
 
     Raises:
@@ -41,19 +41,12 @@ class Polynomial:
     offset: float = 0.5
 
     def __post_init__(self) -> None:
-        if not (self.degree >= 1 and self.degree % 1 == 0):
-            raise ValueError(
-                f"degree of the kernel must be a whole number, at least 1, got {self.degree}"
-            )
+        if self.degree not in (1, 2):
+            raise ValueError(f"degree of the kernel must be 1 or 2, got {self.degree}")
         if not 0 <= self.offset < math.inf:
             raise ValueError(
                 f"offset (the paper's c) must be finite and at least 0, got {self.offset}"
             )
-
-    @property
-    def collapses(self) -> bool:
-        """Whether a sum of them is a quadratic form of its argument."""
-        return self.degree <= 2
 
     def __call__(self, a: Tensor, b: Tensor) -> Tensor:
         """Kernel matrix.
@@ -80,7 +73,7 @@ class Polynomial:
         return torch.where((first == second) & (first > 0), 1.0, of_each)
 
     def monomials(self, z: Tensor) -> Tensor:
-        """The explicit feature map of degree 1 or 2: ``phi(a) . phi(b)`` is the kernel.
+        """The explicit feature map: ``phi(a) . phi(b)`` is the kernel.
 
         Of degree 1 the variables ``(1, z_1, .., z_K)``, of degree 2 the products of pairs of them,
         row by row: the constant, the features, then ``z_i z_j`` for i <= j. Each times its scale.
@@ -169,78 +162,35 @@ class Polynomial:
         return {"kind": "polynomial", **asdict(self)}
 
 
-@dataclass(frozen=True)
-class RadialBasis:
-    """``exp(-gamma |a - b|^2)``; differentiable in both, at ``a = b`` as well.
-
-    Squared distances come from squares and products, so they carry an error of some
-    ``eps (|a|^2 + |b|^2)``, which scaled features keep small; none is negative.
-
-    Args:
-        gamma: positive; in units of 1 / squared scaled feature.
-
-    Raises:
-        ValueError: if it is not positive.
-    """
-
-    gamma: float
-
-    def __post_init__(self) -> None:
-        if not 0 < self.gamma < math.inf:
-            raise ValueError(f"gamma of the kernel must be positive and finite, got {self.gamma}")
-
-    @property
-    def collapses(self) -> bool:
-        """Never: the exponential has every degree."""
-        return False
-
-    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
-        """Kernel matrix.
-
-        Shape:
-            - a: ``[*, N, K]``; b: ``[*, M, K]``; output: ``[*, N, M]``
-        """
-        norms = a.square().sum(-1)[..., :, None] + b.square().sum(-1)[..., None, :]
-        squares = norms - 2 * (a @ b.mT)
-        squares = squares - squares.detach().clamp(max=0)  # at least 0, and gradients stay whole
-        return torch.exp(-self.gamma * squares)
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; ``kernel_from_dict`` takes it."""
-        return {"kind": "radial basis", **asdict(self)}
-
-
 def _with_one(z: Tensor) -> Tensor:
     """The variables ``(1, z_1, .., z_K)`` of bins."""
     return torch.cat([torch.ones_like(z[:, :1]), z], dim=-1)
 
 
-Kernel = Polynomial | RadialBasis
 PAPER_KERNEL = Polynomial(degree=2, offset=0.5)
-_KINDS: dict[Any, type[Kernel]] = {"polynomial": Polynomial, "radial basis": RadialBasis}
 
 
-def kernel_from_dict(values: Mapping[str, Any]) -> Kernel:
+def kernel_from_dict(values: Mapping[str, Any]) -> Polynomial:
     """The kernel that ``to_dict`` described.
 
     Raises:
         ValueError: if the kind is unknown or its numbers are not those it has.
 
     Example:
-        >>> kernel_from_dict({"kind": "polynomial", "degree": 3, "offset": 1.0})
-        Polynomial(degree=3, offset=1.0)
+        >>> kernel_from_dict({"kind": "polynomial", "degree": 1, "offset": 1.0})
+        Polynomial(degree=1, offset=1.0)
     """
     numbers = dict(values)
     kind = numbers.pop("kind", None)
-    if kind not in list(_KINDS):
-        raise ValueError(f"kind of the kernel must be one of {', '.join(_KINDS)}, got {kind!r}")
+    if kind != "polynomial":
+        raise ValueError(f"kind of the kernel must be polynomial, got {kind!r}")
     try:
-        return _KINDS[kind](**numbers)
+        return Polynomial(**numbers)
     except TypeError as error:
-        raise ValueError(f"{numbers} does not describe a {kind} kernel") from error
+        raise ValueError(f"{numbers} does not describe a polynomial kernel") from error
 
 
-def gram_matrix(kernel: Kernel, z: Tensor) -> Tensor:
+def gram_matrix(kernel: Polynomial, z: Tensor) -> Tensor:
     """``kernel(z, z)``, not differentiable, in the memory of the result.
 
     Shape:
@@ -282,7 +232,7 @@ def _coefficients(machine: Head) -> Tensor:
 class Cost(NamedTuple):
     """What a head costs: multiply-adds to score one bin, and bytes to keep.
 
-    Powers and exponentials are not counted.
+    Powers are not counted.
     """
 
     multiply_adds: int
@@ -380,15 +330,15 @@ class KernelSum(nn.Module):
         ValueError: if shapes disagree.
 
     Example:
-        >>> machine = KernelSum(torch.zeros(1, 2), torch.ones(1), RadialBasis(1.0))
+        >>> machine = KernelSum(torch.ones(1, 2), torch.ones(1), Polynomial(2, 1.0))
         >>> machine(torch.tensor([[0.0, 0.0], [1.0, 0.0]]))
-        tensor([1.0000, 0.3679])
+        tensor([1., 4.])
     """
 
     support: Tensor
     beta: Tensor
 
-    def __init__(self, support: Tensor, beta: Tensor, kernel: Kernel) -> None:
+    def __init__(self, support: Tensor, beta: Tensor, kernel: Polynomial) -> None:
         super().__init__()
         self.solved: SolveReport | None = None
         if support.ndim != 2 or beta.shape != support.shape[:1]:
@@ -424,11 +374,11 @@ class KernelSum(nn.Module):
 
 
 Head = QuadraticForm | KernelSum
-"""A quadratic form of fixed size, or the sum over training bins of a kernel that does not fold."""
+"""A quadratic form of fixed size, or the sum over training bins where that is smaller."""
 
 
-def collapse(support: Tensor, beta: Tensor, kernel: Kernel = PAPER_KERNEL) -> QuadraticForm:
-    """Fold a kernel sum of degree 1 or 2 into its quadratic form.
+def collapse(support: Tensor, beta: Tensor, kernel: Polynomial = PAPER_KERNEL) -> QuadraticForm:
+    """Fold a kernel sum into its quadratic form.
 
     Sums and result are in float64 whatever comes in: the terms are many and cancel. Differentiable
     in both tensors.
@@ -436,20 +386,12 @@ def collapse(support: Tensor, beta: Tensor, kernel: Kernel = PAPER_KERNEL) -> Qu
     Args:
         support: scaled training bins.
         beta: their output weights.
-        kernel: a polynomial of degree 1 or 2.
+        kernel: of the machine.
 
     Shape:
         - support: ``[N, K]``
         - beta: ``[N]``
-
-    Raises:
-        ValueError: for a kernel that does not fold.
     """
-    if not isinstance(kernel, Polynomial) or not kernel.collapses:
-        raise ValueError(
-            f"{kernel} does not fold into a quadratic form, polynomials of degree 1 and 2 do; "
-            "keep the sum as a KernelSum"
-        )
     support, beta = support.double(), beta.double()
     pull, total = support.mT @ beta, beta.sum()
     if kernel.degree == 1:
@@ -458,8 +400,8 @@ def collapse(support: Tensor, beta: Tensor, kernel: Kernel = PAPER_KERNEL) -> Qu
     return QuadraticForm(bend, 2 * kernel.offset * pull, kernel.offset**2 * total)
 
 
-def machine_of(support: Tensor, beta: Tensor, kernel: Kernel) -> Head:
-    """A kernel sum, folded where its kernel folds and that makes it smaller.
+def machine_of(support: Tensor, beta: Tensor, kernel: Polynomial) -> Head:
+    """A kernel sum, folded where that makes it smaller.
 
     A quadratic form has a number for each pair of features: of more than 1000 features and fewer
     bins than that, the sum over bins is the smaller one.
@@ -468,7 +410,6 @@ def machine_of(support: Tensor, beta: Tensor, kernel: Kernel) -> Head:
         - support: ``[N, K]``; beta: ``[N]``
     """
     is_wide = support.shape[1] > max(_MOST_QUADRATIC, len(support))
-    is_quadratic = isinstance(kernel, Polynomial) and kernel.degree == 2
-    if kernel.collapses and not (is_wide and is_quadratic):
-        return collapse(support, beta, kernel)
-    return KernelSum(support, beta, kernel)
+    if is_wide and kernel.degree == 2:
+        return KernelSum(support, beta, kernel)
+    return collapse(support, beta, kernel)

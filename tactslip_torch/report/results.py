@@ -469,9 +469,7 @@ def _chosen(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
 def _structure(row: Mapping[str, Any]) -> tuple[str, ...]:
     """What a choice is but for its penalty: kind of features if there are several, K, kernel."""
     kernel = row["kernel"]
-    said = f"rbf, gamma {kernel['gamma']:g}" if "gamma" in kernel else ""
-    if kernel["kind"] == "polynomial":
-        said = f"degree {kernel['degree']}, c {kernel['offset']:g}"
+    said = f"degree {kernel['degree']}, c {kernel['offset']:g}"
     return (*([row["use"]] if "use" in row else []), str(row["num_features"] or "all"), said)
 
 

@@ -29,72 +29,20 @@ from tactslip_torch.simulation._blocks import Array, Grid, Key
 
 # --- calibrated parameters ----------------------------------------------------------------------
 
-Value = float | tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Prior:
-    """A calibrated parameter before calibration.
-
-    Args:
-        start: PHYSICS.md's starting value, or both ends of a range.
-        spread: prior standard deviation, as a factor. It moves both ends of a range.
-        harder: the sign of the parameter's change where slip gets harder to tell.
-        source: of the spread.
-    """
-
-    start: Value
-    spread: float
-    harder: int
-    source: str
-
-    def at(self, difficulty: float) -> Value:
-        """The parameter ``difficulty`` prior standard deviations harder, to four digits."""
-        factor = self.spread ** (self.harder * difficulty)
-        if isinstance(self.start, tuple):
-            low, high = self.start
-            return float(f"{low * factor:.4g}"), float(f"{high * factor:.4g}")
-        return float(f"{self.start * factor:.4g}")
-
-
-PRIORS: Mapping[str, Prior] = {
-    "friction_noise_mv": Prior(
-        8.0, 1.5, -1, "PHYSICS.md: 2 to 12 mV, about two standard deviations on either side"
-    ),
-    "presliding_mm": Prior(
-        (0.3, 3.0), 1.5, 1, "PHYSICS.md: .2 to 2 mm beside a starting range of .3 to 3 mm"
-    ),
-    "burst_rate_hz": Prior(0.3, 2.0, 1, "ours; PHYSICS.md gives no range"),
-}
-"""The calibrated parameters by name."""
-
 CALIBRATED_PATH = Path(__file__).parent / "calibrated.json"
 """The frozen values, part of the package."""
 
 
-def read_calibrated(path: Path = CALIBRATED_PATH) -> dict[str, Any]:
-    """The values that a calibration froze: numbers, and ``(low, high)`` for a range.
-
-    Raises:
-        ValueError: if the file is missing or damaged. Nothing can start without it, ``calibrate``
-            included, so the error says to restore it.
-    """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))["values"]
-        return {
-            name: tuple(map(float, values[name]))
-            if isinstance(prior.start, tuple)
-            else float(values[name])
-            for name, prior in PRIORS.items()
-        }
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise ValueError(
-            f"{path} must hold the calibrated parameters, but: {error!r}; restore it from the "
-            "release (reinstall tactslip_torch)"
-        ) from None
+def _read_calibrated() -> dict[str, Any]:
+    """The frozen values: numbers, and ``(low, high)`` for a range."""
+    values = json.loads(CALIBRATED_PATH.read_text(encoding="utf-8"))["values"]
+    return {
+        name: tuple(map(float, value)) if isinstance(value, list) else float(value)
+        for name, value in values.items()
+    }
 
 
-_CALIBRATED = read_calibrated()
+_CALIBRATED = _read_calibrated()
 
 # --- groups of parameters -----------------------------------------------------------------------
 

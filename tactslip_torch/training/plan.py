@@ -47,7 +47,7 @@ from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
-from tactslip_torch.model.kernels import Head, Kernel, Polynomial, kernel_from_dict
+from tactslip_torch.model.kernels import Head, Polynomial, kernel_from_dict
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
@@ -80,8 +80,6 @@ fold, so its cost grows with the bins."""
 MOST_EXTENSIONS = 3
 """Decades by which a grid of penalties that ends at its edge is extended, at either end."""
 _SCALED_BINS = 256  # at a time, which fits the cache of a processor
-MOST_KEPT_BINS = 8192
-"""So many bins at most for a kernel that does not fold: its machine is a matrix of bins by bins."""
 
 
 # Held validation --------------------------------------------------------------------------
@@ -93,7 +91,7 @@ def _choose_held(
     sample: SampledBins,
     *,
     show: bool = False,
-) -> tuple[list[dict[str, Any]], int, Kernel, float]:
+) -> tuple[list[dict[str, Any]], int, Polynomial, float]:
     """Rows of the validation, and the K, kernel and C of the best of them.
 
     Args:
@@ -126,7 +124,7 @@ def validate(
     bins: TrainingBins,
     groups: Tensor,
     names: Sequence[str],
-    choices: Sequence[tuple[int, Kernel, float]],
+    choices: Sequence[tuple[int, Polynomial, float]],
     *,
     show: bool = False,
 ) -> list[dict[str, Any]]:
@@ -242,7 +240,6 @@ def candidates(recipe: Recipe, num_bins: int) -> list[Structure]:
         Structure(use, size, kernel)
         for size in [*sizes, *recipe.sizes]
         for kernel in recipe.kernels
-        if isinstance(kernel, Polynomial)
         for use in recipe.uses
         if kernel.degree == 1 or may_grow or (size is not None and not recipe.scene_weights)
     ]
@@ -644,7 +641,6 @@ class Plan:
         kernel: of the machine.
         penalty: the paper's ``C``.
         fractions: the part of non-slip and slip bins that is trained on.
-        bin_weight: of each of those, as one of several of which it alone is kept.
         num_bins: how many bins are trained on; about, where fractions are below 1.
         imputation: mean of the scaled columns, both classes counting alike; for lost channels.
         sensing: what the training bins tell of channels that work; ``None`` without a pool.
@@ -661,10 +657,9 @@ class Plan:
 
     recipe: Recipe
     selection: FeatureSelection
-    kernel: Kernel
+    kernel: Polynomial
     penalty: float
     fractions: tuple[float, float]
-    bin_weight: float
     num_bins: int
     imputation: Tensor
     sensing: Sensing | None = None
@@ -675,9 +670,7 @@ class Plan:
 
     @property
     def adds_up(self) -> bool:
-        """Whether training bins become sums of fixed size; few bins, or other kernels, do not."""
-        if not isinstance(self.kernel, Polynomial) or not self.kernel.collapses:
-            return False
+        """Whether training bins become sums of fixed size; few bins do not."""
         return self.num_bins > self.kernel.num_monomials(self.selection.size)
 
     @property
@@ -786,7 +779,7 @@ def plan_detector(
     """
     sample = statistics if isinstance(statistics, SampledBins) else statistics.sample.bins()
     allowed = None if pool is None else recipe.allowed(pool)
-    fractions, bin_weight = class_fractions(recipe, sample), 1.0
+    fractions = class_fractions(recipe, sample)
     num_bins = number_of_bins(recipe, sample)
     nested = None
     if recipe.validation == "nested" and selection is None:
@@ -801,7 +794,7 @@ def plan_detector(
             structure, penalty = candidates(recipe, num_bins)[0], penalties[len(penalties) // 2]
             rows = []
             log.warning("%s, C=%g are taken unvalidated: one group", structure, penalty)
-        kernel: Kernel = structure.kernel
+        kernel = structure.kernel
         selection = fitted_selection(recipe, pool, sample, structure)
     else:
         if selection is None:
@@ -810,15 +803,6 @@ def plan_detector(
             selection = select_features(recipe, statistics, allowed)
         rows, size, kernel, penalty = _choose_held(recipe, selection, sample, show=show)
         selection = selection.first(size)
-    if num_bins > MOST_KEPT_BINS and not kernel.collapses:
-        log.warning(
-            "%s takes %d of %d training bins: its machine does not fold to a fixed size",
-            kernel,
-            MOST_KEPT_BINS,
-            num_bins,
-        )
-        bin_weight, num_bins = num_bins / MOST_KEPT_BINS, MOST_KEPT_BINS
-        fractions = fractions[0] / bin_weight, fractions[1] / bin_weight
     z, weights = selection(sample.features), sample_weight(recipe, sample)
     means = [
         weights[own] @ z[own] / weights[own].sum() for own in (sample.is_slip, ~sample.is_slip)
@@ -837,7 +821,6 @@ def plan_detector(
         kernel=kernel,
         penalty=penalty,
         fractions=fractions,
-        bin_weight=bin_weight,
         num_bins=num_bins,
         imputation=(means[0] + means[1]) / 2,
         sensing=None if pool is None else _sensing(recipe, pool, statistics, sample, selection),
@@ -913,7 +896,7 @@ class TrainingPass:
         features, is_slip = features[kept], is_slip[kept].bool()
         z, pooling = plan.selection(features), plan.selection.pooling
         of_class = torch.tensor(plan.scene_weights.get(scene, (1.0, 1.0)), dtype=torch.float64)
-        weights = plan.bin_weight * of_class[is_slip.long()]
+        weights = of_class[is_slip.long()]
         if plan.recipe.drop_channels > 0 and pooling is not None:
             is_lost = _dropped(recording, len(pooling.hand), plan.recipe.drop_channels)
             fewer = plan.selection(features, is_lost.expand(len(z), -1))

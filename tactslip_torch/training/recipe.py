@@ -25,7 +25,7 @@ from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.selection import ScoreVariance, rank_distinct, t_scores
 from tactslip_torch.features.sensing import Sensing, SpanFeatures
 from tactslip_torch.features.statistics import TrainingStatistics
-from tactslip_torch.model.kernels import Kernel, Polynomial, RadialBasis
+from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import check_number
 
@@ -52,7 +52,6 @@ _LISTS = ("num_features", "offsets", "penalties", "use", "degree")
 _CHOICES = {
     "use": ("channel", "pooled", "both"),
     "score_variance": ("pooled", "welch"),
-    "kernel": ("polynomial", "rbf"),
     "balance": ("undersample", "weights"),
     "group_by": ("material", "cycle"),
     "ranking": ("t", "gd"),
@@ -73,10 +72,8 @@ class Recipe:
             already taken are passed over (ours); 1 takes them all.
         compress: scale the signed log of the features (ours).
         tail: share of sampled bins beyond the scaled range on either side; they are clipped.
-        kernel: ``"polynomial"`` or ``"rbf"``.
-        degree: of the polynomial; 1 and 2 fold into a form of fixed size, others do not.
-        offsets: of the polynomial, its ``c``.
-        gamma: of the radial basis function.
+        degree: of the polynomial kernel, 1 or 2.
+        offsets: of the polynomial kernel, its ``c``.
         penalties: the paper's ``C``.
         balance: ``"undersample"`` (authors) or ``"weights"`` (ours).
         group_by: what a validation fold leaves out: a ``"material"`` or a fifth of the
@@ -116,10 +113,8 @@ class Recipe:
     most_correlation: float = 1.0
     compress: bool = False
     tail: float = 0.0
-    kernel: Literal["polynomial", "rbf"] = "polynomial"
     degree: int | Sequence[int] = 2
     offsets: float | Sequence[float] = 0.5
-    gamma: float | None = None
     penalties: float | Sequence[float] = (0.05, 0.08, 0.1, 0.13, 0.17, 0.2, 0.25, 0.3, 1.0, 3.0)
     balance: Balance = "undersample"
     group_by: GroupBy = "material"
@@ -169,17 +164,10 @@ class Recipe:
                 yield f".{name} must {wanted}, got {shown!r}"
         if len(self.penalties_ascending) > 1 and not math.isfinite(self.penalties_ascending[-1]):
             yield ".penalties: validation needs finite values; give inf alone, or leave it out"
-        if self.kernel == "rbf" and self.gamma is None:
-            yield ".kernel=rbf needs recipe.gamma, such as 0.01"
         if set(self.uses) != {"channel"} and self.pooling is None:
             yield ".use=pooled needs statistics over channels; set features.pooling=[mean, std]"
         degrees = _several(self.degree)
         if self.validation == "nested":
-            if self.kernel != "polynomial" or not set(degrees) <= {1, 2}:
-                yield (
-                    ".validation=nested needs recipe.kernel=polynomial of degree 1 or 2, got "
-                    f"{self.kernel} of degree {list(degrees)}"
-                )
             return
         for name, is_wanted in {
             "use": set(self.uses) != {"channel"},
@@ -253,10 +241,8 @@ class Recipe:
         return mask
 
     @property
-    def kernels(self) -> tuple[Kernel, ...]:
+    def kernels(self) -> tuple[Polynomial, ...]:
         """Kernels to choose from."""
-        if self.kernel == "rbf":
-            return (RadialBasis(float(self.gamma or 0.0)),)
         offsets = [float(c) for c in _several(self.offsets)]
         return tuple(
             Polynomial(degree, c)

@@ -1,9 +1,8 @@
-"""Checks that recordings look like the paper's (REFERENCE.md section 6, row *signals*).
+"""Checks that recordings look like the paper's.
 
 The paper shows and describes its signals. Each ``SignalCheck`` is one sentence of that: a statistic
 of filtered recordings and the range it must lie in. ``check_signals`` takes recordings of any
-origin; the tests check the simulated ones, and ``calibrate`` keeps to parameters at which they
-hold.
+origin; the tests check the simulated ones.
 """
 
 from __future__ import annotations
