@@ -213,6 +213,8 @@ def truth(
             row["onset_score"] = None
         row = {name: row[name] for name in (*ALARM_KEYS, "statistic", "alarm", "on", *of_onset)}
         row |= {name: None for name, value in row.items() if value != value}  # NaN
+        if row["statistic"] is not None and row["statistic"] < -0.99e30:  # too few decisions yet
+            row["statistic"] = None
         rows.append(row | ({"raised_by": kinds.get(row["time_s"])} if settings.onset else {}))
     return rows
 

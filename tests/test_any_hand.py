@@ -100,7 +100,9 @@ def test_train_takes_a_hand_from_its_configuration(tmp_path):
 
 def parts_of(bin_ms=50.0, **changes):
     """Pool and filter from the ``features`` section, which no recording is read for."""
-    source = SimpleNamespace(hand=HANDS["five slow"].layout(), sample_rate_hz=1000.0)
+    source = SimpleNamespace(
+        hand=HANDS["five slow"].layout(), sample_rate_hz=1000.0, is_simulated=False
+    )
     features = {"frames": {"SG": 5, "PVDF": 5, "force": None}, **changes}
     maker = feature_maker(source, LabelRule(bin_ms=bin_ms), **{**composed().features, **features})
     return maker.pool, maker.channel_filter

@@ -154,7 +154,6 @@ MISTAKES = {
         r"expected windows \[N, C, T\], got an array of shape \(2, 150\)",
     ),
     "ragged": (lambda X: [X[0], X[1, :, :9]], "different shapes; cut them to one"),
-    "nan": (lambda X: np.where(X.max() == X, np.nan, X), "X holds NaN: window .*; repair"),
     "text": (lambda X: np.full(X.shape, "a"), "convert|numeric|float"),
 }
 

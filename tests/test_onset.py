@@ -207,10 +207,13 @@ def test_any_cut_gives_the_scores_of_the_recording(cuts, dtype, backend):
 def scored_without_lost_blocks(classifier, samples, masked, most):
     """The classifier on the blocks that are known, as if the others had not been."""
     evidence = classifier.evidence
-    power, mean = evidence.blocks_of_recording(samples)
+    power, mean, moves = evidence.blocks_of_recording(samples)
     first = samples.shape[-1] // evidence.hop_samples - power.shape[-1]
     listened = [not masked[c] for c in evidence.hand.fast]
-    is_lost = power.isfinite().all(1)[listened].sum(0) < evidence.min_alive
+    silence = evidence.silence.T[..., None]  # [F, B, 1]
+    is_loud = (power.log() / 2 > silence).any(1) & moves | silence.isinf().all(1)
+    alive = power.isfinite().all(1) & is_loud
+    is_lost = alive[listened].sum(0) < evidence.min_alive
     found = torch.full((first + len(is_lost),), NOTHING_YET, dtype=torch.float64)
     known, scores, num_lost = [], [math.nan, math.nan], 0
     for block in range(len(is_lost)):

@@ -94,9 +94,10 @@ static int read_options(int count, char **words, struct options *options) {
 
 /* As few digits as read back to the same number, which is a float where is_single. */
 static void print_number(const char *before, const char *name, double value, bool is_single) {
-    char text[32] = "null"; /* JSON has no NaN */
+    char text[32] = "null"; /* JSON has no NaN; a statistic of too few decisions is -1e30 */
     int most = is_single ? 9 : 17;
-    for (int digits = most - 3; isfinite(value) && digits <= most; digits++) {
+    bool is_known = isfinite(value) && value > -0.99e30;
+    for (int digits = most - 3; is_known && digits <= most; digits++) {
         snprintf(text, sizeof text, "%.*g", digits, value);
         if (is_single ? strtof(text, NULL) == (float)value : strtod(text, NULL) == value) break;
     }

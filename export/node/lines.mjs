@@ -1,16 +1,17 @@
 // Decisions as JSON lines, the same from every host.
 
+const NONE = -0.99e30; // a statistic of too few decisions is below, and NaN is not above
 const DIGITS = { float32: 9, float64: 17 }; // read back as the same number
 
 /**
- * One decision, without newline; what is NaN becomes null.
+ * One decision, without newline; what is NaN, or not known yet, becomes null.
  *
  * @param {object} decision as `StreamGraph.push` gives it
  * @param {string} precision of the model
  * @param {boolean} isWhole with statistic, alarm and on
  */
 export function decisionLine(decision, precision, isWhole) {
-  const shown = (value) => Number(value.toPrecision(DIGITS[precision]));
+  const shown = (value) => (value > NONE ? Number(value.toPrecision(DIGITS[precision])) : null);
   const { time_s, onset_s, score, probability, statistic, alarm, on } = decision;
   const { valid, in_range, channels_lost } = decision;
   const line = {

@@ -6,6 +6,8 @@ import math
 import os
 import sys
 
+NONE = -0.99e30  # a statistic of too few decisions is below
+
 
 def run(main, *arguments):
     """Call ``main``, and see to it that what it said was written."""
@@ -20,9 +22,9 @@ def run(main, *arguments):
 
 
 def json_line(row):
-    """A dict as one line of JSON, which has no NaN: null."""
+    """A dict as one line of JSON; null for NaN, and for a statistic of too few decisions."""
     plain = {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        key: None if isinstance(value, float) and not NONE < value < math.inf else value
         for key, value in row.items()
     }
     return json.dumps(plain, allow_nan=False)

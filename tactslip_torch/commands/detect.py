@@ -218,10 +218,10 @@ def _detect_in(
 
 
 def _cell(value: Any) -> Any:
-    """What stands in a cell or in JSON: nothing for NaN, names of channels as one text."""
+    """What stands in a cell or in JSON: nothing for NaN and for a statistic that is none yet."""
     if isinstance(value, tuple):
         return " ".join(value)
-    return None if isinstance(value, float) and math.isnan(value) else value
+    return None if isinstance(value, float) and not value > NOTHING_YET else value
 
 
 def _with_truth(
