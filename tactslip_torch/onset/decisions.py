@@ -402,9 +402,9 @@ class _StreamRule:
     def walk(self, ratios: Array, number: int) -> _Walked:
         """The next decisions ``[m]``, NaN where not valid; the number of the first of them."""
         lost, found = np.isnan(ratios), _Walked([], [], [], [])
-        for part in np.split(np.arange(len(ratios)), np.flatnonzero(np.diff(lost)) + 1):
-            if not len(part):
-                continue
+        places = np.arange(len(ratios))
+        edges = np.flatnonzero(lost[1:] != lost[:-1]) + 1
+        for part in np.split(places, edges) if len(edges) else [places][: len(ratios)]:
             if lost[part[0]]:
                 kept = max(self._most - self._lost, 0)  # decisions that change nothing
                 self._lost += len(part)

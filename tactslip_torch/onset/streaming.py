@@ -449,6 +449,9 @@ class _HandEvents:
                 text = level_message(ratio, self._detector.info.get("units", "V"))
                 self._events.extend([StreamEvent(time_s[-1], text)] if text else [])
                 self._spans = None
+        if found.is_valid.all() and not found.channels_lost.any() and not self._reported.any():
+            self._changed[:] = 0
+            return
         states = np.concatenate([found.channels_lost, ~found.is_valid[:, None]], 1)
         for own_s, state in zip(time_s, states, strict=True):
             self._changed = np.where(state != self._reported, self._changed + 1, 0)
