@@ -95,12 +95,13 @@ def test_lost_samples_of_all_channels_raise_no_alarm_and_lose_none(
         lost = without(volts, round(start * RATE), num)
         made, alarms, _ = decided(detector, rules[rule], lost)
         assert not (made.is_alarm & ~made.is_valid).any()
-        reach = (num + REACH) / RATE + 1e-9
+        # a sum may need one decision more, as the evidence behind the loss may be weaker
+        reach = (num + REACH + 50 * (rule == "cusum")) / RATE + 1e-9
         for found in alarms:
             assert any(abs(found - own) <= reach for own in clean), (start, num, found)
         for own in clean:  # what was raised in quiet may be lost
-            is_kept = any(abs(found - own) <= reach for found in alarms)
-            assert is_kept or own < SLIP_S - 0.1, (start, num, own)
+            is_near = (made.available_s >= own) & (made.available_s <= own + reach)
+            assert made.is_on[is_near].any() or own < SLIP_S - 0.1, (start, num, own)
 
 
 def test_one_lost_sample_says_what_the_whole_recording_says(detector, volts, rules):
