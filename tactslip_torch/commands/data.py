@@ -24,7 +24,7 @@ from tactslip_torch.data.file_recordings import FileRecordings, Inspected
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest, write_template
 from tactslip_torch.data.manifest import Problem
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.features.sensing import level_message, level_ratio, without_stuck
+from tactslip_torch.features.sensing import level_message, level_ratio
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.report.recordings import (
@@ -203,7 +203,7 @@ def _levels(config: DictConfig, source: FileRecordings) -> list[Problem]:
         ValueError: if the detector is of another hand or rate.
     """
     detector = SlipDetector.load(str(config.model))
-    pool, stuck = detector.pool, detector.sensing.stuck_samples
+    pool = detector.pool
     if pool.hand.names != source.hand.names or pool.sample_rate_hz != source.sample_rate_hz:
         raise ValueError(
             f"{config.model} is of {len(pool.hand)} channels {pool.hand.names[0]} to "
@@ -214,7 +214,7 @@ def _levels(config: DictConfig, source: FileRecordings) -> list[Problem]:
 
     def one(recording: RecordingId) -> str:
         samples = source.load(recording).samples[:, : round(_LEVELS_S * pool.sample_rate_hz)]
-        found = score_stream(detector, without_stuck(samples, stuck), pool.bin_samples)
+        found = score_stream(detector, samples, pool.bin_samples)
         return level_message(level_ratio(found.span, detector.sensing), source.units)
 
     told = in_processes(one, source.ids, "comparing levels", "recording", config.num_workers)

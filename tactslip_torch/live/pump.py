@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -133,7 +134,7 @@ class _State:
                 elif is_broken and position:
                     lacking = round((now_s - came_s) * self._rate) - num
                     longer_s = self._stream.settings.hold_s + _LONGER_S
-                    position += max(lacking, -(-round(longer_s * self._rate * 1e6) // 10**6))
+                    position += max(lacking, math.ceil(longer_s * self._rate))
                 is_broken, came_s = False, now_s
                 self.counts.received += len(item.samples)
                 self.put(Placed(position, item))
