@@ -2,8 +2,8 @@
 
 import numpy as np
 import torch
+from extremes import slip_samples
 
-from tactslip_torch.deploy.check import simulated_stream
 from tactslip_torch.features.groups import JUMPING
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import Sensing
@@ -57,8 +57,8 @@ def small_detector(
     machine = QuadraticForm(bend + bend.T, linear, torch.tensor(0.0, dtype=torch.float64))
     middle = -machine(centre).median()  # so that both decisions occur
     machine = QuadraticForm(bend + bend.T, linear, middle)
-    facts = {"simulated": True}
-    return SlipDetector(pool, channel_filter, selected, scaler, machine, facts, backend=backend)
+    metadata = {"simulated": True}
+    return SlipDetector(pool, channel_filter, selected, scaler, machine, metadata, backend=backend)
 
 
 def with_floors(detector: SlipDetector, min_alive: int, stuck_samples: int = 150) -> SlipDetector:
@@ -72,7 +72,7 @@ def with_floors(detector: SlipDetector, min_alive: int, stuck_samples: int = 150
 def alarming_detector(seed: int = 0) -> SlipDetector:
     """The small detector, with settings by which the simulated slip raises alarms."""
     made = small_detector(seed, backend="auto")
-    scores = score_stream(made, simulated_stream(HAND, 2000.0, torch.float64), 20).score
+    scores = score_stream(made, slip_samples(HAND), 20).score
     rise = 2.0 / float(scores.std())
     settings = AlarmSettings(
         20,

@@ -22,12 +22,12 @@ from operator import xor
 import numpy as np
 import pytest
 import torch
+from extremes import slip_samples
 from small_detector import HAND, alarming_detector
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from tactslip_torch.data.formats import Reading
-from tactslip_torch.deploy.check import simulated_stream
 from tactslip_torch.live import (
     Block,
     Callback,
@@ -42,7 +42,7 @@ from tactslip_torch.live import (
     StandardInput,
     TcpClient,
     TcpListener,
-    page_facts,
+    page_metadata,
     source_of,
     watch,
 )
@@ -63,7 +63,7 @@ def detector():
 
 @pytest.fixture(scope="module")
 def samples():
-    return simulated_stream(HAND, RATE, torch.float64).T.numpy().copy()
+    return slip_samples(HAND).T.numpy().copy()
 
 
 class Kept:
@@ -729,7 +729,7 @@ def serve(detector, folders):
 
     def start(**options):
         stream = StreamingDetector(detector)
-        facts = page_facts(detector, stream.settings)
+        facts = page_metadata(detector, stream.settings)
         options = {"source": "test", "simulated": True, "counts": Counts()} | options
         made.append(PageServer(folders, facts, **options))
         return made[-1]

@@ -70,13 +70,13 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def page_facts(detector: SlipDetector, settings: AlarmSettings) -> dict[str, Any]:
+def page_metadata(detector: SlipDetector, settings: AlarmSettings) -> dict[str, Any]:
     """What the page is told of a detector: the metadata of its ``stream.onnx``, and more."""
     from tactslip_torch.deploy.bins import host_metadata  # brings onnx
 
     names = detector.pool.hand.names
     facts = host_metadata(detector, "stream", "float32") | {
-        "threshold": (settings.onset or settings).threshold,
+        "threshold": settings.alarm_threshold,
         "units": str(detector.info.get("units", "V")),
         "used_channels": [names[i] for i in detector.needed_index.tolist()],
     }
@@ -103,7 +103,7 @@ class PageServer(Sink):
 
     Args:
         folders: by the path that they are served under, ``""`` for the top, what holds the page.
-        facts: of the detector (``page_facts``).
+        facts: of the detector (``page_metadata``).
         source: name of the source.
         simulated: whether samples are known to be simulated.
         counts: of the stream, which change.
