@@ -23,7 +23,8 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-_PACKAGE = Path(__file__).resolve().parents[1]
+from tactslip_torch.commands.packaged import packaged_folder
+
 _COMMENTED = re.compile(r"( *)(?:- )?([\w@/]+):(?: +([^#\s].*?))?(?: +# (.*))?$")
 _WIDTH, _INDENT = 100, 34
 _HELP = """
@@ -61,14 +62,6 @@ class Key(NamedTuple):
     name: str
     value: Any
     description: str
-
-
-def packaged_folder(name: str, hint: str) -> Path:
-    """A folder inside the package (wheel) or beside it (checkout); ``hint`` is a file in it."""
-    for folder in (_PACKAGE / name, _PACKAGE.parent / name):
-        if (folder / hint).is_file():
-            return folder
-    raise FileNotFoundError(f"no {name} folder with {hint} in or beside {_PACKAGE}; reinstall")
 
 
 def conf_dir() -> Path:

@@ -18,9 +18,9 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from tactslip_torch.commands.configuration import packaged_folder
 from tactslip_torch.commands.detect import plain_section, settings_of
 from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.commands.packaged import hosts_dir
 from tactslip_torch.data.formats import Reading
 from tactslip_torch.live.frames import Frames
 from tactslip_torch.live.mcap_log import McapLog
@@ -130,7 +130,7 @@ def _page(
     events: SimpleQueue[Event],
 ) -> PageServer:
     """The page, served."""
-    port, place = config.port, packaged_folder("export", "README.md")
+    port, place = config.port, hosts_dir()
     if type(port) is not int or not 0 <= port < 1 << 16:
         raise ValueError(f"port must be a whole number from 0 to 65535, got {port!r}")
     return PageServer(
