@@ -12,15 +12,16 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig
 
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.commands.stopping import fail, one_line
-from tactslip_torch.data.file_recordings import FileRecordings, Inspected
+from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest, write_template
 from tactslip_torch.data.manifest import Problem
 from tactslip_torch.data.recording import Recording, RecordingId
@@ -39,6 +40,8 @@ from tactslip_torch.runtime import __version__, in_processes
 FIGURE = Path("outputs/data.png")
 _SHOWN = 5  # rows of a template
 _LEVELS_S = 30.0  # of a recording, from which levels are taken
+_BEFORE_ONSET_S = 1.01  # that the labels of train take as non-slip, unless it is told
+_CONTEXT = 25  # samples that the longest filter reads on either side of a bin
 _BIN_MS, _FEWEST = 50.0, 8  # the bin that train takes unless it is told, and samples it should have
 
 
@@ -56,8 +59,10 @@ def check(config: DictConfig) -> int:
             entry = source.entry(recording)
             if isinstance(found, str):
                 problems.append(entry.problem(found))
-            else:
-                warnings += map(entry.problem, found.oddities(source.hand.names))
+                continue
+            for row, names in zip(found, source.hand.names, strict=True):
+                problems += map(entry.problem, row.problems(names))
+                warnings += map(entry.problem, row.warnings(names))
     if config.model is not None and source.ids:
         warnings += _levels(config, source)
     for line in (*(f"problem: {p}" for p in problems), *(f"warning: {w}" for w in warnings)):
@@ -89,11 +94,11 @@ def summary(config: DictConfig) -> list[dict[str, Any]]:
         print("labels= takes up to a second before each onset as non-slip; it is not counted here")
     ranges = np.full((len(hand), 2), np.nan)
     if config.samples:
-        found = [one for _, one in _inspect_all(config, source) if isinstance(one, Inspected)]
-        if found:
-            with np.errstate(all="ignore"):
-                ranges[:, 0] = np.fmin.reduce([one.least for one in found])
-                ranges[:, 1] = np.fmax.reduce([one.greatest for one in found])
+        for _, found in _inspect_all(config, source):
+            if not isinstance(found, str):
+                own = np.array([(row.least, row.greatest) for row in found])
+                ranges[:, 0] = np.fmin(ranges[:, 0], own[:, 0])
+                ranges[:, 1] = np.fmax(ranges[:, 1], own[:, 1])
     print("\n" + ranges_table(hand.to_rows(), ranges, source.units))
     print("\n" + _headline(source, source.problems, source.warnings))
     path = FIGURE if config.output is None else Path(config.output)
@@ -181,14 +186,79 @@ def _source(config: DictConfig, **options: bool) -> FileRecordings:
     return source
 
 
+class _Range(NamedTuple):
+    """What a channel of a recording is.
+
+    Args:
+        least: NaN if none of it is finite.
+        greatest: the same.
+        num_broken: samples that are not finite, missing ones apart.
+        broken_s: when the first of them is.
+        is_needed: whether bins need one of them, so that ``train`` refuses the recording.
+    """
+
+    least: float
+    greatest: float
+    num_broken: int = 0
+    broken_s: float = 0.0
+    is_needed: bool = False
+
+    def _broken(self, name: str) -> str:
+        return (
+            f"{name} is not finite in {self.num_broken} samples, first at {self.broken_s:.4f} s; "
+            "leave the stretch out as missing_s, or repair it"
+        )
+
+    def problems(self, name: str) -> list[str]:
+        """Why ``train`` refuses it."""
+        return [self._broken(name)] if self.is_needed else []
+
+    def warnings(self, name: str) -> list[str]:
+        """What is worth a look."""
+        found = [self._broken(name)] if self.num_broken and not self.is_needed else []
+        if self.least == self.greatest:
+            found.append(f"{name} never changes, it is {self.least:g} throughout")
+        return found
+
+
+def _inspected(source: FileRecordings, recording: RecordingId) -> list[_Range]:
+    """The range of each channel, and what in it is not finite."""
+    samples, times = source.load(recording).samples.double(), source.timeline(recording)
+    rate_hz = source.sample_rate_hz
+    is_there = torch.ones(samples.shape[-1], dtype=torch.bool)
+    is_needed = ~is_there
+    for start_s, end_s in times.missing_s:
+        is_there[round(start_s * rate_hz) : round(end_s * rate_hz)] = False
+    before = [(onset - _BEFORE_ONSET_S, onset) for onset in times.annotated_onsets_s]
+    for start_s, end_s in (*before, *times.sliding_s, *times.slip_s, *times.non_slip_s):
+        first = max(round(start_s * rate_hz) - _CONTEXT, 0)
+        is_needed[first : round(end_s * rate_hz) + _CONTEXT] = True
+    found = []
+    for row in samples:
+        is_broken = ~row.isfinite() & is_there
+        finite = row[row.isfinite()]
+        least, greatest = finite.aminmax() if len(finite) else (math.nan, math.nan)
+        first = int(is_broken.int().argmax())
+        found.append(
+            _Range(
+                float(least),
+                float(greatest),
+                int(is_broken.sum()),
+                first / rate_hz,
+                bool((is_broken & is_needed).any()),
+            )
+        )
+    return found
+
+
 def _inspect_all(
     config: DictConfig, source: FileRecordings
-) -> list[tuple[RecordingId, Inspected | str]]:
+) -> list[tuple[RecordingId, list[_Range] | str]]:
     """What the samples of every recording are, or why they cannot be read."""
 
-    def one(recording: RecordingId) -> Inspected | str:
+    def one(recording: RecordingId) -> list[_Range] | str:
         try:
-            return source.inspect(recording)
+            return _inspected(source, recording)
         except (ValueError, OSError) as error:
             return one_line(error)
 

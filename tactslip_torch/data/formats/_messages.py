@@ -1,10 +1,11 @@
-"""Recordings as MCAP files and as folders of rosbag2: messages on topics as samples, without ROS.
+"""Recordings as MCAP files, and rosbag2 folders to read: messages as samples, without ROS.
 
-Ours have one topic, ``/tactile``, of ``std_msgs/msg/Float32MultiArray`` or ``Float64MultiArray`` in
-CDR: a block of up to 0.1 s a message, ``[samples, channels]``, logged at the time of its first
-sample on the clock of the recording; metadata hold the rest. Of others are read ``std_msgs``
-arrays, any numbers of ROS 2 in CDR, and JSON (MCAP alone), on one topic. Every message is looked
-at when a file is opened; the samples are kept in a temporary file (``TMPDIR``).
+Package files have one topic, ``/tactile``, of ``std_msgs/msg/Float32MultiArray`` or
+``Float64MultiArray`` in CDR: a block of up to 0.1 s a message, ``[samples, channels]``, logged at
+the time of its first sample on the clock of the recording; a metadata record holds the rest. Of
+foreign ones are read ``std_msgs`` arrays, any numbers of ROS 2 in CDR, and JSON (MCAP alone), on
+one topic. Every message is looked at when a file is opened; the samples are kept in a temporary
+file (``TMPDIR``).
 """
 
 from __future__ import annotations
@@ -13,9 +14,7 @@ import json
 import keyword
 import os
 import re
-import shutil
 import tempfile
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -23,23 +22,19 @@ from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote, unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._choice import chosen_columns
-from tactslip_torch.data.formats._names import epoch_unit, time_unit_in
+from tactslip_torch.data.formats._inference import SECONDS, Refused, epoch_unit, time_unit_in
 from tactslip_torch.data.formats._reading import (
-    MOST_HEADER,
     MOST_MEMBERS,
-    SECONDS,
     Opened,
     Reading,
-    Refused,
     Samples,
     Spool,
     check_plausible,
+    chosen_columns,
     header_in,
     needs,
     opened_from,
@@ -55,9 +50,6 @@ _LOG_TIME = "log_time"
 _BLOCK_S = 0.1
 RECORDING = "tactslip_torch recording"
 _MOST_CHUNK = 256 * 2**20
-_METADATA = "metadata.yaml"
-_CHECKSUM = "tactslip_torch_message_sum"
-_SAFE = "{}[]:,"  # all else is written as in URLs: YAML writers wrap quoted text, and may err there
 _SECOND = 10**9  # in nanoseconds, as all times of messages
 _LONGEST = 2**62
 _GAP = 1.5  # usual spacings between messages; beyond, something is missing
@@ -143,7 +135,7 @@ def _sizes(kind: Any) -> Iterator[int]:
         what, of = of[0]
 
 
-# Ours --------------------------------------------------------------------------------------------
+# Package files -----------------------------------------------------------------------------------
 
 
 def kind_of(header: Mapping[str, Any]) -> str:
@@ -172,11 +164,6 @@ def blocks(
         message = known[kind](layout(axes, 0), block.reshape(-1))
         content = types.store.serialize_cdr(message, kind, little_endian=True)
         yield round(first / rate * 1e9), bytes(content)
-
-
-def checksum_text(checksum: int) -> str:
-    """A CRC-32 as words, which no YAML takes for a number."""
-    return f"crc32 {checksum:08x}"
 
 
 # Messages as numbers -----------------------------------------------------------------------------
@@ -310,13 +297,12 @@ class TopicColumns:
             raise Refused("two numbers of one name")
         if how.time == _LOG_TIME or (how.time == "auto" and (is_stamped or names is None)):
             how = replace(how, time=None)
-        self._time, self._columns = chosen_columns(names, num_columns, how)
-        self.names = None if names is None else tuple(names[place] for place in self._columns)
-        self.time_name = names[self._time] if names and self._time is not None else None
-        rest = {*range(num_columns)} - {*self._columns, self._time}
-        is_asked = names is None or how.channels is not None
-        self.left_out = () if is_asked or names is None else tuple(names[n] for n in sorted(rest))
-        self.num_channels = len(self._columns)
+        self._chosen = chosen_columns(names, num_columns, replace(how, speed=None))
+        time, named = self._chosen.time, names or ()
+        self.names = None if names is None else tuple(named[n] for n in self._chosen.channels)
+        self.time_name = named[time] if named and time is not None else None
+        self.left_out = tuple(named[n] for n in self._chosen.left_out)
+        self.num_channels = len(self._chosen.channels)
         self.is_small = self._is_array and np.can_cast(rows.dtype, np.float32)
 
     def _decoded(self, message: bytes) -> tuple[NDArray[Any], tuple[str, ...] | None, int | None]:
@@ -355,8 +341,8 @@ class TopicColumns:
                 f"holds a message on {self.topic} with other channels than the first: "
                 f"{rows.shape[1]} numbers, or other names"
             )
-        named = None if self._time is None else rows[0, self._time]
-        return rows[:, self._columns], stamp, named
+        named = None if self._chosen.time is None else rows[0, self._chosen.time]
+        return rows[:, self._chosen.channels], stamp, named
 
 
 class _TopicSamples(TopicColumns):
@@ -369,7 +355,7 @@ class _TopicSamples(TopicColumns):
 
     def __init__(self, first: Message, types: Types | None, how: Reading, stack: ExitStack) -> None:
         super().__init__(first, types, how)
-        self._how, self._stack, self.checksum = how, stack, 0
+        self._how, self._stack = how, stack
         self.spool = Spool(self.num_channels, "f4" if self.is_small else "f8", stack)
         self._marks = Spool(3, np.int64, stack)  # when recorded, stamp or 0, number of samples
         self._named: list[Any] = []  # the times that ``how`` names
@@ -383,7 +369,6 @@ class _TopicSamples(TopicColumns):
         rows, stamp, named = self.rows(message.content)
         self.spool.add(rows)
         self._marks.add(np.array([[message.log_time, stamp or 0, len(rows)]], np.int64))
-        self.checksum = zlib.crc32(message.content, self.checksum)
         if named is not None:
             self._named.append(named)
 
@@ -456,7 +441,6 @@ def opened_messages(
     header: Mapping[str, Any] | None,
     how: Reading,
     stack: ExitStack,
-    checksum: str | None = None,
 ) -> Opened:
     """The samples of the one topic that holds any, and their times.
 
@@ -471,7 +455,6 @@ def opened_messages(
         header: of a recording of ours.
         how: what a person says of the file; ``samples`` names the topic.
         stack: closes what is kept.
-        checksum: that the messages must have, as ``checksum_text`` writes it.
 
     Raises:
         Refused: if no topic or more than one holds samples, or the messages are damaged or hold
@@ -479,10 +462,8 @@ def opened_messages(
     """
     if header is not None and how.samples in (None, TOPIC):
         topic, _ = _read_topic(messages, Reading(samples=TOPIC, time=None), stack)
-        if checksum is not None and checksum != checksum_text(topic.checksum if topic else 0):
-            raise ValueError("the messages fail their checksum")
-        nothing = np.empty((0, header["shape"][0]))
-        return opened_from(header, path, topic.spool.array() if topic else nothing)
+        rows = topic.spool.array() if topic else np.empty((0, len(header["channels"])))
+        return opened_from(header, path, Samples(path, rows))
     topic, others = _read_topic(messages, how, stack)
     if topic is not None:
         rows, seconds = topic.ordered()
@@ -568,16 +549,10 @@ def write_mcap(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> 
 
 
 def read_mcap(path: Path, how: Reading, stack: ExitStack) -> Opened:
-    """A file of ours or of others, every message looked at once.
+    """A native or foreign file, every message looked at once, in the order of the file.
 
     A file without its end is refused, not read up to there.
     """
-    reader = _mcap_reader(path, stack)
-    return opened_messages(path, _mcap_messages(reader), _mcap_header(reader), how, stack)
-
-
-def _mcap_reader(path: Path, stack: ExitStack) -> Any:
-    """The reader of a file that has its end, and claims no more than is plausible."""
     library = needs("mcap.reader", "reading .mcap")
     file = stack.enter_context(path.open("rb"))
     size = file.seek(0, os.SEEK_END)
@@ -594,23 +569,14 @@ def _mcap_reader(path: Path, stack: ExitStack) -> Any:
     sizes = [chunk.uncompressed_size for chunk in summary.chunk_indexes] if summary else []
     check_plausible("its largest chunk", max(sizes, default=0), size, _MOST_CHUNK)
     check_plausible("it", sum(sizes), size)
-    return reader
-
-
-def _mcap_header(reader: Any) -> dict[str, Any] | None:
-    summary = reader.get_summary()
-    if summary is None or all(one.name != RECORDING for one in summary.metadata_indexes):
-        return None
-    own = next(one.metadata for one in reader.iter_metadata() if one.name == RECORDING)
-    return header_in(own.get(HEADER))
-
-
-def _mcap_messages(reader: Any) -> Iterator[Message]:
-    """In the order in which they stand in the file."""
-    summary = reader.get_summary()
+    header = None
+    if summary and any(one.name == RECORDING for one in summary.metadata_indexes):
+        own = next(one.metadata for one in reader.iter_metadata() if one.name == RECORDING)
+        header = header_in(own.get(HEADER))
     statistics = summary and summary.statistics
-    all_of_them = reader.iter_messages(log_time_order=False)
-    yield from _counted(map(_mcap_message, all_of_them), statistics and statistics.message_count)
+    found = map(_mcap_message, reader.iter_messages(log_time_order=False))
+    messages = _counted(found, statistics and statistics.message_count)
+    return opened_messages(path, messages, header, how, stack)
 
 
 def _mcap_message(found: tuple[Any, Any, Any]) -> Message:
@@ -625,63 +591,20 @@ def _mcap_message(found: tuple[Any, Any, Any]) -> Message:
 # rosbag2, by the library ``rosbags`` ------------------------------------------------------------
 
 
-def write_rosbag2(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
-    """Write a ``.db3`` file and ``metadata.yaml`` into a folder that is not there yet."""
-    library = needs("rosbags.rosbag2", "writing folders of rosbag2")
-    types, kind = Types(), kind_of(header)
-    with tempfile.TemporaryDirectory() as elsewhere:
-        plain = Path(elsewhere, "recording")  # "#" and "?" in a path are parts of URLs to SQLite
-        with library.Writer(plain, version=8) as writer:
-            definition, digest = types.definition(kind), types.store.hash_rihs01(kind)
-            channel = writer.add_connection(TOPIC, kind, msgdef=definition, rihs01=digest)
-            total = 0
-            for time, message in blocks(samples, header, types):
-                writer.write(channel, time, message)
-                total = zlib.crc32(message, total)
-            custom = {HEADER: text_of(header), _CHECKSUM: checksum_text(total)}
-            for name, text in custom.items():
-                writer.set_custom_data(name, quote(text, safe=_SAFE))
-        shutil.copytree(plain, path)
-
-
 def read_rosbag2(path: Path, how: Reading, stack: ExitStack) -> Opened:
-    """A folder of ours or of others, every message looked at once; several files are one."""
-    reader = _bag_reader(path, stack)
-    custom = _custom_of(reader)
-    own = header_in(custom.get(HEADER))
-    checksum = None if own is None else custom.get(_CHECKSUM, "")
-    return opened_messages(path, _bag_messages(reader), own, how, stack, checksum)
-
-
-def _bag_reader(path: Path, stack: ExitStack) -> Any:
-    """An open bag; its files lie in the folder itself, whatever it says."""
+    """A folder, every message looked at once; several files are one recording."""
     library = needs("rosbags.rosbag2", "reading folders of rosbag2")
     for file in path.iterdir():
         if file.is_symlink() and not file.resolve().is_relative_to(path.resolve()):
             raise Refused(f"holds {file.name!r}, which leads out of the folder")
-    size = (path / _METADATA).stat().st_size
-    if size > 4 * MOST_HEADER:
-        raise Refused(f"has {_METADATA} of {size} bytes, at most {4 * MOST_HEADER} are read")
-    if re.search(rb"compression_mode:\W*file", (path / _METADATA).read_bytes(), re.IGNORECASE):
-        raise Refused("has packed files; unpack them first: ros2 bag convert")
-    if re.search(r"[?#%]", str(path)):
-        link = Path(stack.enter_context(tempfile.TemporaryDirectory()), "bag")
-        link.symlink_to(path.resolve(), target_is_directory=True)
-        path = link
-    return stack.enter_context(library.Reader(path))
-
-
-def _custom_of(reader: Any) -> dict[str, str]:
-    """What the writer of a bag added, as text."""
-    custom = reader.storage.metadata.custom
-    pairs = custom.items() if isinstance(custom, dict) else ()
-    return {name: unquote(text) for name, text in pairs if isinstance(text, str)}
-
-
-def _bag_messages(reader: Any) -> Iterator[Message]:
+    folder = path
+    if re.search(r"[?#%]", str(path)):  # parts of URLs to SQLite
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()), "bag")
+        folder.symlink_to(path.resolve(), target_is_directory=True)
+    reader = stack.enter_context(library.Reader(folder))
     topics = {}
     for one in reader.connections:
         encoding = "ros2msg" if one.msgdef.format.name == "MSG" else ""
         topics[one.id] = Topic(one.topic, one.msgtype, "cdr", encoding, one.msgdef.data)
     found = (Message(topics[one.id], time, bytes(data)) for one, time, data in reader.messages())
-    yield from _counted(found, reader.message_count)
+    return opened_messages(path, _counted(found, reader.message_count), None, how, stack)
