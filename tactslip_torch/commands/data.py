@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from hydra.utils import get_object, instantiate
+from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from tactslip_torch.commands.entry import entry_point
@@ -37,7 +38,7 @@ from tactslip_torch.report.recordings import (
 from tactslip_torch.report.style import SIMULATED_LINE
 from tactslip_torch.runtime import __version__, in_processes
 
-FIGURE = Path("outputs/data.png")
+_FIGURE = Path("outputs/data.png")
 _SHOWN = 5  # rows of a template
 _LEVELS_S = 30.0  # of a recording, from which levels are taken
 _BEFORE_ONSET_S = 1.01  # that the labels of train take as non-slip, unless it is told
@@ -59,10 +60,9 @@ def check(config: DictConfig) -> int:
             entry = source.entry(recording)
             if isinstance(found, str):
                 problems.append(entry.problem(found))
-                continue
-            for row, names in zip(found, source.hand.names, strict=True):
-                problems += map(entry.problem, row.problems(names))
-                warnings += map(entry.problem, row.warnings(names))
+            else:
+                problems += map(entry.problem, found.problems)
+                warnings += map(entry.problem, found.warnings)
     if config.model is not None and source.ids:
         warnings += _levels(config, source)
     for line in (*(f"problem: {p}" for p in problems), *(f"warning: {w}" for w in warnings)):
@@ -95,13 +95,12 @@ def summary(config: DictConfig) -> list[dict[str, Any]]:
     ranges = np.full((len(hand), 2), np.nan)
     if config.samples:
         for _, found in _inspect_all(config, source):
-            if not isinstance(found, str):
-                own = np.array([(row.least, row.greatest) for row in found])
-                ranges[:, 0] = np.fmin(ranges[:, 0], own[:, 0])
-                ranges[:, 1] = np.fmax(ranges[:, 1], own[:, 1])
+            if isinstance(found, _Inspected):
+                ranges[:, 0] = np.fmin(ranges[:, 0], found.ranges[:, 0])
+                ranges[:, 1] = np.fmax(ranges[:, 1], found.ranges[:, 1])
     print("\n" + ranges_table(hand.to_rows(), ranges, source.units))
     print("\n" + _headline(source, source.problems, source.warnings))
-    path = FIGURE if config.output is None else Path(config.output)
+    path = _FIGURE if config.output is None else Path(config.output)
     what = "SIMULATED recordings" if source.is_simulated else "Recordings"
     title = f"{what} in {source.root.resolve().name}"
     dataset_figure(trials, _example(source), hand.names, path, title=title)
@@ -186,77 +185,54 @@ def _source(config: DictConfig, **options: bool) -> FileRecordings:
     return source
 
 
-class _Range(NamedTuple):
-    """What a channel of a recording is.
+class _Inspected(NamedTuple):
+    """What the samples of a recording are.
 
     Args:
-        least: NaN if none of it is finite.
-        greatest: the same.
-        num_broken: samples that are not finite, missing ones apart.
-        broken_s: when the first of them is.
-        is_needed: whether bins need one of them, so that ``train`` refuses the recording.
+        ranges: ``[C, 2]``, least and greatest of each channel; NaN if none is finite.
+        problems: why ``train`` refuses it.
+        warnings: what is worth a look.
     """
 
-    least: float
-    greatest: float
-    num_broken: int = 0
-    broken_s: float = 0.0
-    is_needed: bool = False
-
-    def _broken(self, name: str) -> str:
-        return (
-            f"{name} is not finite in {self.num_broken} samples, first at {self.broken_s:.4f} s; "
-            "leave the stretch out as missing_s, or repair it"
-        )
-
-    def problems(self, name: str) -> list[str]:
-        """Why ``train`` refuses it."""
-        return [self._broken(name)] if self.is_needed else []
-
-    def warnings(self, name: str) -> list[str]:
-        """What is worth a look."""
-        found = [self._broken(name)] if self.num_broken and not self.is_needed else []
-        if self.least == self.greatest:
-            found.append(f"{name} never changes, it is {self.least:g} throughout")
-        return found
+    ranges: NDArray[np.float64]
+    problems: list[str]
+    warnings: list[str]
 
 
-def _inspected(source: FileRecordings, recording: RecordingId) -> list[_Range]:
-    """The range of each channel, and what in it is not finite."""
+def _inspected(source: FileRecordings, recording: RecordingId) -> _Inspected:
     samples, times = source.load(recording).samples.double(), source.timeline(recording)
     rate_hz = source.sample_rate_hz
     is_there = torch.ones(samples.shape[-1], dtype=torch.bool)
-    is_needed = ~is_there
+    is_needed = ~is_there  # by bins
     for start_s, end_s in times.missing_s:
         is_there[round(start_s * rate_hz) : round(end_s * rate_hz)] = False
     before = [(onset - _BEFORE_ONSET_S, onset) for onset in times.annotated_onsets_s]
     for start_s, end_s in (*before, *times.sliding_s, *times.slip_s, *times.non_slip_s):
         first = max(round(start_s * rate_hz) - _CONTEXT, 0)
         is_needed[first : round(end_s * rate_hz) + _CONTEXT] = True
-    found = []
-    for row in samples:
+    found = _Inspected(np.full((len(samples), 2), np.nan), [], [])
+    for row, name, ends in zip(samples, source.hand.names, found.ranges, strict=True):
         is_broken = ~row.isfinite() & is_there
-        finite = row[row.isfinite()]
-        least, greatest = finite.aminmax() if len(finite) else (math.nan, math.nan)
-        first = int(is_broken.int().argmax())
-        found.append(
-            _Range(
-                float(least),
-                float(greatest),
-                int(is_broken.sum()),
-                first / rate_hz,
-                bool((is_broken & is_needed).any()),
+        if is_broken.any():
+            first_s = int(is_broken.int().argmax()) / rate_hz
+            is_refused = bool((is_broken & is_needed).any())
+            (found.problems if is_refused else found.warnings).append(
+                f"{name} is not finite in {int(is_broken.sum())} samples, first at {first_s:.4f} "
+                "s; leave the stretch out as missing_s, or repair it"
             )
-        )
+        if len(finite := row[row.isfinite()]):
+            ends[:] = finite.min(), finite.max()
+            if ends[0] == ends[1]:
+                found.warnings.append(f"{name} never changes, it is {ends[0]:g} throughout")
     return found
 
 
 def _inspect_all(
     config: DictConfig, source: FileRecordings
-) -> list[tuple[RecordingId, list[_Range] | str]]:
+) -> list[tuple[RecordingId, _Inspected | str]]:
     """What the samples of every recording are, or why they cannot be read."""
 
-    def one(recording: RecordingId) -> list[_Range] | str:
+    def one(recording: RecordingId) -> _Inspected | str:
         try:
             return _inspected(source, recording)
         except (ValueError, OSError) as error:

@@ -18,11 +18,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.data.clock import Clock, Gap, even_clock, nominal_rate, snapped_rate
+from tactslip_torch.data.clock import Clock, even_clock, nominal_rate, snapped_rate
 from tactslip_torch.data.formats import Archived, Opened, Reading, Samples, file_of, open_file
 from tactslip_torch.data.formats._inference import bare
 from tactslip_torch.data.formats._reading import MM_S
@@ -262,7 +261,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 class EvenSamples(Samples):
-    """Samples of a file on an even clock.
+    """Samples of a file on an even clock; those of a file with gaps are read whole.
 
     Args:
         samples: of the file.
@@ -283,14 +282,12 @@ class EvenSamples(Samples):
         rows: Sequence[int] | None = None,
     ) -> None:
         self.num_samples, self.dtype = clock.num_samples, samples.dtype
-        self.num_channels = samples.num_channels if rows is None else len(rows)
-        self._inner, self._most, self._wanted = samples, most_bridged, rows
+        self._rows = list(range(samples.num_channels) if rows is None else rows)
+        self.num_channels = len(self._rows)
+        self._inner, self._whole = samples, None
         self.level: Tensor | None = None
-        self._gaps = clock.gaps
-        edges = [(gap.start, gap.missing) for gap in clock.gaps]
-        self._starts, missing = np.array([(0, 0), *edges]).T
-        self._lost = missing.cumsum()  # samples, up to the end of each gap
-        self._ends = self._starts + missing
+        if clock.gaps:
+            self._whole = _without_gaps(samples, clock, most_bridged)[self._rows]
 
     def read(self, first: int, stop: int) -> Tensor:
         """Samples from ``first`` to before ``stop`` on the clock, ``[C, n]``."""
@@ -298,27 +295,27 @@ class EvenSamples(Samples):
 
     def exact(self, first: int, stop: int) -> Tensor:
         """The same, in float64 if a level is taken off."""
-        ticks = np.arange(max(first, 0), min(stop, self.num_samples))
-        behind = np.searchsorted(self._starts, ticks, "right") - 1  # the gap before each
-        is_there = ticks >= self._ends[behind]
-        places = (ticks - self._lost[behind])[is_there]  # in the file, one after the other
-        found = torch.full((self._inner.num_channels, len(ticks)), torch.nan, dtype=self.dtype)
-        if len(places):
-            read = self._inner.read(int(places[0]), int(places[-1]) + 1)
-            found[:, slice(None) if is_there.all() else torch.from_numpy(is_there)] = read
-        for number in np.unique(behind[~is_there]):
-            gap = self._gaps[number - 1]
-            if gap.missing <= self._most:
-                within = torch.from_numpy(~is_there & (behind == number))
-                found[:, within] = self._line(gap, torch.from_numpy(ticks)[within])
-        found = found if self._wanted is None else found[list(self._wanted)]
+        if self._whole is not None:
+            found = self._whole[:, first : max(stop, first)]
+        else:
+            found = self._inner.read(first, stop)[self._rows]
         return found if self.level is None else found - self.level
 
-    def _line(self, gap: Gap, ticks: Tensor) -> Tensor:
-        """The straight line across a gap, at those ticks of it."""
-        ends = self._inner.read(gap.place - 1, gap.place + 1).double()
-        weight = (ticks.double() - (gap.start - 1)) / (gap.missing + 1)
-        return (ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * weight).to(self.dtype)
+
+def _without_gaps(samples: Samples, clock: Clock, most_bridged: int) -> Tensor:
+    """All samples on an even clock, ``[C, T]``: in gaps a straight line, or NaN in longer ones."""
+    read = samples.read(0, samples.num_samples)
+    whole = torch.full((len(read), clock.num_samples), torch.nan, dtype=read.dtype)
+    is_there = torch.ones(clock.num_samples, dtype=torch.bool)
+    for start, missing, place in clock.gaps:
+        is_there[start : start + missing] = False
+        if missing <= most_bridged:
+            before, behind = read[:, place - 1 : place + 1].double().split(1, dim=1)
+            weight = torch.arange(1, missing + 1, dtype=torch.float64) / (missing + 1)
+            line = before + (behind - before) * weight
+            whole[:, start : start + missing] = line.to(read.dtype)
+    whole[:, is_there] = read
+    return whole
 
 
 def _even(opened: Opened, path: Path, head: _Head, reading: Reading) -> EvenSamples:

@@ -35,7 +35,7 @@ _TIME_NAME = re.compile(  # "Time (ms)", "t_us", "t/s", "timestamps", "%time", "
     r"%?(?:field\.)?(?:header\.)?(?:(?:time|t|timestamps?|stamp|time_stamp|elapsed(?:[ _]time)?)"
     rf"(?:[\s_/(\[]+({_UNIT_OF_TIME})[)\]]?)?|({'|'.join(_LONG)}))"
 )
-EPOCH_S = 1e9, 4e9
+_EPOCH_S = 1e9, 4e9
 """Seconds since 1970, of 2001 to 2096: stamps that lie there in a unit are taken as of that unit,
 where neither a person nor the file says it."""
 
@@ -54,7 +54,7 @@ def time_unit_in(name: str | None) -> TimeUnit | None:
 
 def epoch_unit(stamp: float) -> TimeUnit | None:
     """The unit in which a stamp counts from 1970, if it does."""
-    least, most = EPOCH_S
+    least, most = _EPOCH_S
     return next((unit for unit, s in SECONDS.items() if least <= stamp * s < most), None)
 
 
@@ -65,12 +65,12 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-LABELS = _words(
+_LABELS = _words(
     "label labels slip is_slip slip_label slipping is_slipping contact trial material class "
     "target targets ground_truth annotation speed slip_speed"
 )
 """Columns that may be what a detector is to find out."""
-BOOK_KEEPING = _words(
+_BOOK_KEEPING = _words(
     "frame frame_id frame_index frame_number index idx row row_index row_number seq sequence "
     "sequence_number sample sample_index sample_number counter packet packet_number episode "
     "episode_index task_index"
@@ -90,7 +90,7 @@ def no_channels(names: Sequence[str], kept: Iterable[str] = ()) -> list[int]:
     """Places of names of times, labels and book-keeping, but for those that are ``kept``."""
     plain = [bare(name) for name in names]
     words = [re.sub(r"[\s_-]+", "_", name.removeprefix("field.header.")) for name in plain]
-    beside = LABELS | BOOK_KEEPING - ({"index"} if _FINGERS.intersection(words) else set())
+    beside = _LABELS | _BOOK_KEEPING - ({"index"} if _FINGERS.intersection(words) else set())
     asked = set(map(bare, kept))
 
     def is_channel(place: int) -> bool:

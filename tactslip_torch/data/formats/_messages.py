@@ -51,7 +51,6 @@ _BLOCK_S = 0.1
 RECORDING = "tactslip_torch recording"
 _MOST_CHUNK = 256 * 2**20
 _SECOND = 10**9  # in nanoseconds, as all times of messages
-_LONGEST = 2**62
 _GAP = 1.5  # usual spacings between messages; beyond, something is missing
 _MOST_NUMBERS = 4096  # of one instant; a picture is no set of channels
 _MOST_DEPTH = 16
@@ -142,28 +141,6 @@ def kind_of(header: Mapping[str, Any]) -> str:
     """The type of the messages that hold the samples."""
     bits = header["dtype"].removeprefix("float")
     return f"std_msgs/msg/Float{bits}MultiArray"
-
-
-def blocks(
-    samples: NDArray[Any], header: Mapping[str, Any], types: Types
-) -> Iterator[tuple[int, bytes]]:
-    """Samples ``[C, T]`` as messages of up to 0.1 s: nanoseconds since the first, and bytes."""
-    rate, (num_channels, num_samples) = header["sample_rate_hz"], samples.shape
-    if num_samples / rate * 1e9 >= 2**63 or num_channels > _MOST_NUMBERS:
-        raise Refused(
-            f"cannot hold {num_channels} channels of {num_samples / rate:g} s: too long for "
-            f"messages, or more than {_MOST_NUMBERS}"
-        )
-    kind, known = kind_of(header), types.store.types
-    axis, layout = (known[f"std_msgs/msg/MultiArray{part}"] for part in ("Dimension", "Layout"))
-    step = max(int(rate * _BLOCK_S), 1)
-    for first in range(0, num_samples, step):
-        block = np.ascontiguousarray(samples[:, first : first + step].T)
-        axes = [axis("samples", len(block), block.size)]
-        axes += [axis("channels", num_channels, num_channels)]
-        message = known[kind](layout(axes, 0), block.reshape(-1))
-        content = types.store.serialize_cdr(message, kind, little_endian=True)
-        yield round(first / rate * 1e9), bytes(content)
 
 
 # Messages as numbers -----------------------------------------------------------------------------
@@ -357,7 +334,7 @@ class _TopicSamples(TopicColumns):
         super().__init__(first, types, how)
         self._how, self._stack = how, stack
         self.spool = Spool(self.num_channels, "f4" if self.is_small else "f8", stack)
-        self._marks = Spool(3, np.int64, stack)  # when recorded, stamp or 0, number of samples
+        self._marks: list[tuple[int, int, int]] = []  # when recorded, stamp or 0, samples
         self._named: list[Any] = []  # the times that ``how`` names
 
     def add(self, message: Message) -> None:
@@ -368,7 +345,7 @@ class _TopicSamples(TopicColumns):
         """
         rows, stamp, named = self.rows(message.content)
         self.spool.add(rows)
-        self._marks.add(np.array([[message.log_time, stamp or 0, len(rows)]], np.int64))
+        self._marks.append((message.log_time, stamp or 0, len(rows)))
         if named is not None:
             self._named.append(named)
 
@@ -377,7 +354,7 @@ class _TopicSamples(TopicColumns):
 
         No times if nobody asks for them, or of a single block where nobody gives the rate.
         """
-        rows, (logged, stamps, counts) = self.spool.array(), self._marks.array().T
+        rows, (logged, stamps, counts) = self.spool.array(), np.array(self._marks, np.int64).T
         times = stamps if self._how.time == "auto" and stamps.any() else logged
         if times is stamps and (stamps == 0).sum() > 1:  # one alone may be where a clock begins
             raise Refused(
@@ -385,11 +362,7 @@ class _TopicSamples(TopicColumns):
                 "one in others; say reading.time=log_time to go by the times of recording"
             )
         if self._named:
-            named = np.array(self._named)
-            unit = self._how.time_unit or time_unit_in(self.time_name)
-            if unit is None and named.dtype.kind in "iuf":
-                unit = epoch_unit(float(named.max()))
-            times = _nanoseconds(named, SECONDS[unit or "s"])
+            times = self._named_times()
         if (np.diff(times) < 0).any():
             order = np.argsort(times, kind="stable")
             starts = np.cumsum(counts) - counts  # the first row of each message
@@ -400,6 +373,15 @@ class _TopicSamples(TopicColumns):
             rows, times, counts = spool.array(), times[order], counts[order]
         return rows, None if self._how.time is None else self._seconds(times, counts)
 
+    def _named_times(self) -> NDArray[np.int64]:
+        """Nanoseconds since the least of the times that are numbers in messages."""
+        times = np.array(self._named)
+        if times.dtype.kind not in "iuf" or not np.isfinite(times).all():
+            raise Refused("holds a time that is no number; say reading.time")
+        unit = self._how.time_unit or time_unit_in(self.time_name)
+        seconds = SECONDS[unit or epoch_unit(float(times.max())) or "s"]
+        return np.asarray(np.round((times - times.min()) * round(seconds * _SECOND)), np.int64)
+
     def _seconds(
         self, times: NDArray[np.int64], counts: NDArray[np.int64]
     ) -> NDArray[np.float64] | None:
@@ -409,33 +391,18 @@ class _TopicSamples(TopicColumns):
         shows.
         """
         spacings = np.diff(times) / counts[:-1]
+        if self._how.sample_rate_hz is None and not len(spacings) and counts[0] > 1:
+            return None
+        usual = float(np.median(spacings)) if len(spacings) else 0.0
         if self._how.sample_rate_hz is not None:
             usual = _SECOND / self._how.sample_rate_hz
-        elif len(spacings):
-            usual = float(np.median(spacings))
-        elif counts[0] > 1:
-            return None
-        else:
-            usual = 0.0
         spacing = np.append(np.where(spacings > _GAP * usual, usual, spacings), usual)
         number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         since = np.repeat((times - times[0]).astype(np.float64), counts)
         return np.asarray((since + number * np.repeat(spacing, counts)) / _SECOND)
 
 
-def _nanoseconds(times: NDArray[Any], seconds: float) -> NDArray[np.int64]:
-    """Times of a unit of so many seconds since the least; of whole numbers nothing is lost."""
-    unit = round(seconds * _SECOND)
-    if times.dtype.kind not in "iuf" or not np.isfinite(times).all():
-        raise Refused("holds a time that is no number; say reading.time")
-    first, last = times.min().item(), times.max().item()
-    if (last - first) * unit > _LONGEST:
-        raise Refused(f"has times {(last - first) * seconds:g} s apart; see reading.time_unit")
-    since = (times - times.dtype.type(first)) * unit
-    return np.asarray(np.round(since), np.int64)
-
-
-def opened_messages(
+def _opened_messages(
     path: Path,
     messages: Iterable[Message],
     header: Mapping[str, Any] | None,
@@ -536,15 +503,27 @@ def _counted(messages: Iterable[Message], said: int | None) -> Iterator[Message]
 def write_mcap(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
     """Write blocks of samples, and a metadata record with everything else; nothing is packed."""
     writer = needs("mcap.writer", "writing .mcap")
-    types, kind = Types(), kind_of(header)
+    types, kind, rate = Types(), kind_of(header), header["sample_rate_hz"]
+    num_channels, num_samples = samples.shape
+    if num_channels > _MOST_NUMBERS:
+        raise Refused(f"cannot hold {num_channels} channels, at most {_MOST_NUMBERS} are read")
+    known = types.store.types
+    axis, layout = (known[f"std_msgs/msg/MultiArray{part}"] for part in ("Dimension", "Layout"))
+    step = max(int(rate * _BLOCK_S), 1)
     with path.open("wb") as file:
         output = writer.Writer(file, compression=writer.CompressionType.NONE)
         output.start(profile="ros2", library="tactslip_torch")
         output.add_metadata(RECORDING, {HEADER: text_of(header)})
         schema = output.register_schema(kind, "ros2msg", types.definition(kind).encode())
         channel = output.register_channel(TOPIC, "cdr", schema)
-        for number, (time, message) in enumerate(blocks(samples, header, types)):
-            output.add_message(channel, time, message, time, number)
+        for number, first in enumerate(range(0, num_samples, step)):
+            block = np.ascontiguousarray(samples[:, first : first + step].T)
+            axes = [axis("samples", len(block), block.size)]
+            axes += [axis("channels", num_channels, num_channels)]
+            message = known[kind](layout(axes, 0), block.reshape(-1))
+            content = bytes(types.store.serialize_cdr(message, kind, little_endian=True))
+            time = round(first / rate * _SECOND)
+            output.add_message(channel, time, content, time, number)
         output.finish()
 
 
@@ -576,7 +555,7 @@ def read_mcap(path: Path, how: Reading, stack: ExitStack) -> Opened:
     statistics = summary and summary.statistics
     found = map(_mcap_message, reader.iter_messages(log_time_order=False))
     messages = _counted(found, statistics and statistics.message_count)
-    return opened_messages(path, messages, header, how, stack)
+    return _opened_messages(path, messages, header, how, stack)
 
 
 def _mcap_message(found: tuple[Any, Any, Any]) -> Message:
@@ -607,4 +586,4 @@ def read_rosbag2(path: Path, how: Reading, stack: ExitStack) -> Opened:
         encoding = "ros2msg" if one.msgdef.format.name == "MSG" else ""
         topics[one.id] = Topic(one.topic, one.msgtype, "cdr", encoding, one.msgdef.data)
     found = (Message(topics[one.id], time, bytes(data)) for one, time, data in reader.messages())
-    return opened_messages(path, _counted(found, reader.message_count), None, how, stack)
+    return _opened_messages(path, _counted(found, reader.message_count), None, how, stack)

@@ -118,9 +118,9 @@ def needs(module: str, what: str, extra: str = "formats") -> ModuleType:
 
 # What a person says -----------------------------------------------------------------------------
 
-SpeedUnit = Literal["mm/s", "cm/s", "m/s", "um/s"]
-MM_S: dict[SpeedUnit, float] = {"mm/s": 1.0, "cm/s": 10.0, "m/s": 1000.0, "um/s": 1e-3}
-RowOrder = Literal["channel", "time"]
+_SpeedUnit = Literal["mm/s", "cm/s", "m/s", "um/s"]
+MM_S: dict[_SpeedUnit, float] = {"mm/s": 1.0, "cm/s": 10.0, "m/s": 1000.0, "um/s": 1e-3}
+_RowOrder = Literal["channel", "time"]
 
 
 @dataclass(frozen=True)
@@ -168,9 +168,9 @@ class Reading:
     time_first: bool | None = None
     delimiter: str | None = None
     speed: str | int | None = None
-    speed_unit: SpeedUnit = "mm/s"
+    speed_unit: _SpeedUnit = "mm/s"
     samples_per_row: int = 1
-    row_order: RowOrder | None = None
+    row_order: _RowOrder | None = None
     gaps: GapRule = "refuse"
     bridge_ms: float = 10.0
     resample_hz: float | None = None
@@ -185,7 +185,7 @@ class Reading:
         for name, known in (
             ("time_unit", (*SECONDS, None)),
             ("speed_unit", tuple(MM_S)),
-            ("row_order", (*get_args(RowOrder), None)),
+            ("row_order", (*get_args(_RowOrder), None)),
             ("gaps", get_args(GapRule)),
         ):
             check_choice(f"reading.{name}", getattr(self, name), known)
@@ -269,6 +269,7 @@ class Samples:
             numbers exactly (whole numbers beyond 2**53 are rounded), unless it is set.
     """
 
+    path: str | os.PathLike[str]
     num_channels: int
     num_samples: int
     dtype: torch.dtype
@@ -280,7 +281,7 @@ class Samples:
         time_axis: int = 0,
         rows: Sequence[int] | None = None,
     ) -> None:
-        self._path, self._source, self._axis = path, source, time_axis
+        self.path, self._source, self._axis = path, source, time_axis
         self._rows = None if rows is None else list(rows)
         columns: Sequence[Any] = source if isinstance(source, list) else [source]
         stored = [column.dtype for column in columns]
@@ -306,7 +307,7 @@ class Samples:
         """As ``read``, in the numbers that the file has."""
         first = min(first, self.num_samples)
         part = slice(first, max(min(stop, self.num_samples), first))
-        with guarded(self._path):
+        with guarded(self.path):
             if isinstance(self._source, list):
                 return np.stack([_along(column, part) for column in self._source])
             if self._axis:
@@ -314,36 +315,6 @@ class Samples:
             else:
                 values = np.asarray(self._source[part]).T
         return values if self._rows is None else values[self._rows]
-
-
-class _RowSamples(Samples):
-    """Samples of which each row of a table holds several of every channel.
-
-    Args:
-        rows: ``[C * k, T]``, as the table has them.
-        per_row: ``k``.
-        order: of the columns of a row.
-
-    Shape:
-        - what is read: ``[C, n]`` of ``[C, T * k]``
-    """
-
-    def __init__(self, rows: Samples, per_row: int, order: RowOrder) -> None:
-        self._inner, self._per_row, self._order = rows, per_row, order
-        self.num_channels = rows.num_channels // per_row
-        self.num_samples, self.dtype = rows.num_samples * per_row, rows.dtype
-
-    def stored(self, first: int, stop: int) -> NDArray[Any]:
-        """As ``read``, in the numbers that the file has."""
-        first = min(first, self.num_samples)
-        stop = max(min(stop, self.num_samples), first)
-        begin, num, k = first // self._per_row, self.num_channels, self._per_row
-        rows = self._inner.stored(begin, -(-stop // k))  # [C * k, n]
-        if self._order == "channel":
-            cube = rows.reshape(num, k, -1).transpose(0, 2, 1)
-        else:
-            cube = rows.reshape(k, num, -1).transpose(1, 2, 0)
-        return cube.reshape(num, -1)[:, first - begin * k : stop - begin * k]
 
 
 _INDEX = re.compile(r"[\s_.\-\[(]*\d+[\])]?$")
@@ -362,23 +333,25 @@ def unfolded(opened: Opened, how: Reading) -> Opened:
             "list the columns that are channels as reading.channels"
         )
     stems = [_INDEX.sub("", name) for name in opened.names or ()]
-    groups: dict[RowOrder, list[list[str]]] = {
-        "channel": [stems[place : place + k] for place in range(0, len(stems), k)],
-        "time": [stems[place :: num // k] for place in range(num // k) if stems],
-    }
-    named: dict[RowOrder, tuple[str, ...]] = {}
-    for order, columns in groups.items():
-        names = tuple(column[0] for column in columns if len(set(column)) == 1)
-        if len(set(names)) == len(names) == num // k and all(names):
-            named[order] = names
+    named: dict[_RowOrder, tuple[str, ...]] = {}
+    for order, names in (("channel", stems[::k]), ("time", stems[: num // k])):
+        wanted = [n for n in names for _ in range(k)] if order == "channel" else names * k
+        if names and all(names) and len(set(names)) == len(names) and stems == wanted:
+            named[order] = tuple(names)
     found = how.row_order or next(iter(named), None)
     if found is None and num != k:
         raise Refused(
             f"does not show how its rows hold {k} samples of each channel; say "
             "reading.row_order=channel (a_0, a_1, b_0, b_1) or time (a_0, b_0, a_1, b_1)"
         )
-    order = found or "channel"
-    return opened._replace(samples=_RowSamples(opened.samples, k, order), names=named.get(order))
+    order, samples = found or "channel", opened.samples
+    rows = samples.stored(0, samples.num_samples)  # [C * k, T]
+    if order == "channel":
+        cube = rows.reshape(num // k, k, -1).transpose(0, 2, 1)
+    else:
+        cube = rows.reshape(k, num // k, -1).transpose(1, 2, 0)
+    whole = Samples(samples.path, cube.reshape(num // k, -1), 1)
+    return opened._replace(samples=whole, names=named.get(order))
 
 
 def _along(column: Any, part: slice) -> NDArray[Any]:
