@@ -53,7 +53,6 @@ _MOST_CHUNK = 256 * 2**20
 _SECOND = 10**9  # in nanoseconds, as all times of messages
 _GAP = 1.5  # usual spacings between messages; beyond, something is missing
 _MOST_NUMBERS = 4096  # of one instant; a picture is no set of channels
-_MOST_DEPTH = 16
 _STRETCH = 2**16  # rows at a time
 _ARRAY = re.compile(r"std_msgs/msg/(Float|U?Int)(8|16|32|64)MultiArray|std_msgs/msg/ByteMultiArray")
 
@@ -168,19 +167,17 @@ def _rows_of(message: Any) -> NDArray[Any]:
     return data.reshape(sizes[0], -1) if time == 0 else data.reshape(-1, sizes[-1]).T
 
 
-def _numbers(part: Any, name: str = "", depth: int = _MOST_DEPTH) -> Iterator[tuple[str, Any]]:
+def _numbers(part: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """All numbers in a message by name, such as ``wrench.force.x``; arrays are one list.
 
     Where a field names as many words as arrays beside it have elements, each has its word:
     ``position[wrist]``. Times and texts are none, ``null`` is NaN.
     """
-    if depth < 0:
-        raise Refused(f"messages nested deeper than {_MOST_DEPTH}")
     if isinstance(part, np.ndarray):
         yield name, part.reshape(-1)[: _MOST_NUMBERS + 1].tolist()
     elif isinstance(part, list):
         for place, value in enumerate(part):
-            yield from _numbers(value, f"{name}[{place}]", depth - 1)
+            yield from _numbers(value, f"{name}[{place}]")
     elif part is None or isinstance(part, (int, float)):
         yield name, float("nan") if part is None else part
     elif _clock(part) is None:
@@ -191,9 +188,9 @@ def _numbers(part: Any, name: str = "", depth: int = _MOST_DEPTH) -> Iterator[tu
             if words and isinstance(value, np.ndarray | list) and len(value) == len(words):
                 elements = value if isinstance(value, list) else value.tolist()
                 for word, element in zip(words, elements, strict=True):
-                    yield from _numbers(element, f"{whole}[{word}]", depth - 1)
+                    yield from _numbers(element, f"{whole}[{word}]")
             else:
-                yield from _numbers(value, whole, depth - 1)
+                yield from _numbers(value, whole)
 
 
 def _words_in(fields: Mapping[str, Any]) -> list[str]:
