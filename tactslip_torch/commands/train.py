@@ -28,7 +28,7 @@ from tactslip_torch.features.pooling import pooled_names
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.decisions import KEY, Scorer, calibration_of
-from tactslip_torch.own_files import read_checkpoint
+from tactslip_torch.package_files import read_checkpoint
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process, whole_file
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm

@@ -54,7 +54,7 @@ from tactslip_torch.onset.events import (
     pooled_metrics,
     recording_events,
 )
-from tactslip_torch.own_files import CHECKPOINT, FORGED
+from tactslip_torch.package_files import CHECKPOINT, DAMAGE_ERRORS
 from tactslip_torch.report.metrics import (
     bin_metrics,
     confusion_matrix,
@@ -343,7 +343,7 @@ class SlipLearner(L.LightningModule):
             )
         try:
             self._plan = Plan.from_dict(checkpoint["plan"], self.recipe, self.pool)
-        except FORGED as error:
+        except DAMAGE_ERRORS as error:
             said = str(error).splitlines()[0]
             raise ValueError(f"the checkpoint is damaged: {said}; train again") from error
         self._is_resumed = True  # baselines need the first pass's sample: drawn in the second

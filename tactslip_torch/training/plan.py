@@ -669,7 +669,7 @@ class Plan:
     scene_weights: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
-    def adds_up(self) -> bool:
+    def uses_normal_equations(self) -> bool:
         """Whether training bins become sums of fixed size; few bins do not."""
         return self.num_bins > self.kernel.num_monomials(self.selection.size)
 
@@ -876,7 +876,7 @@ class TrainingPass:
         self.seen_batches = SeenBatches()
         self.bins: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
         self.stats: SufficientStats | None = None
-        if plan.adds_up:
+        if plan.uses_normal_equations:
             assert isinstance(plan.kernel, Polynomial)
             self.stats = SufficientStats(plan.selection.size, degree=plan.kernel.degree)
 
@@ -927,7 +927,7 @@ class TrainingPass:
 
 def solve_metadata(head: Head) -> dict[str, Any]:
     """How a machine was solved for, JSON-able: method, condition, error (``SolveReport``)."""
-    return {} if head.solved is None else head.solved.facts()
+    return {} if head.solved is None else head.solved.metadata()
 
 
 def _is_kept(recording: str, is_slip: Tensor, fractions: Sequence[float]) -> Tensor:

@@ -299,8 +299,8 @@ class FeatureSelection:
     def first(self, num: int) -> FeatureSelection:
         """The best ``num`` columns alone."""
         scaler = self.scaler
-        knee = None if scaler.knee is None else scaler.knee[:num]
-        scaler = FeatureScaler(scaler.minimum[:num], scaler.maximum[:num], knee)
+        compression = None if scaler.compression is None else scaler.compression[:num]
+        scaler = FeatureScaler(scaler.minimum[:num], scaler.maximum[:num], compression)
         if self.pooling is None:
             return FeatureSelection(self.selected[:num], scaler)
         place = dict(zip(self.pooling.inputs, self.selected, strict=True))
