@@ -31,7 +31,7 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, most_stuck_samples
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.model.calibration import Platt, probability
+from tactslip_torch.model.calibration import Calibration, Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.model.kernels import Head
 from tactslip_torch.onset.decisions import calibration_of
@@ -229,31 +229,36 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         hand, frames = self.hand, FRAMES if self.frames is None else self.frames
         if hand is None:
             alike = range(1, windows.shape[1] + 1)
-            hand = HandLayout([Channel(f"C{i}", "taxel", "any", "any", "fast") for i in alike])
+            hand = HandLayout(tuple(Channel(f"C{i}", "taxel", "any", "any", "fast") for i in alike))
         if self.frames and (unknown := sorted(set(frames) - set(hand.kinds))):
             raise ValueError(
                 f"frames names the kind {unknown[0]!r}, which no channel is of; take some of "
                 f"{', '.join(hand.kinds)}"
             )
         lengths = [frames.get(channel.kind) or 1 for channel in hand.channels]
-        self._take(None, ChannelFilter(lengths, align=self.align), hand)
-        before, after = self.context_
+        layer = ChannelFilter(lengths, align=self.align)
+        before, after = (0, 0) if self.filtered else (layer.context_before, layer.context_after)
         if (num := windows.shape[-1] - before - after) < 1:
             raise ValueError(
                 f"windows of {windows.shape[-1]} samples leave nothing, as the filter takes "
                 f"{before} before and {after} behind; give longer ones, filtered ones with "
                 "filtered=True, or frames={} for no filter"
             )
-        options = {"bin_samples": num, "wavelet": self.wavelet, "level": None}
-        self._pool = FeaturePool(hand, float(self.sample_rate_hz), **options)
+        pool = FeaturePool(
+            hand,
+            float(self.sample_rate_hz),
+            bin_samples=num,
+            wavelet=self.wavelet,
+            level=None,
+        )
+        self._set(pool, layer)
         return windows
 
-    def _take(self, pool: Any, channel_filter: ChannelFilter, hand: HandLayout) -> None:
-        self._pool: FeaturePool = pool
-        self._filter, self.hand_ = channel_filter, hand
-        self.context_ = (channel_filter.context_before, channel_filter.context_after)
-        if self.filtered:
-            self.context_ = (0, 0)
+    def _set(self, pool: FeaturePool, layer: ChannelFilter) -> None:
+        """What windows of a fit, or of a detector, are described by."""
+        self._pool, self._filter, self.hand_ = pool, layer, pool.hand
+        context = (layer.context_before, layer.context_after)
+        self.context_ = (0, 0) if self.filtered else context
 
     def _bins(self, windows: Tensor) -> Tensor:
         """Filtered bins of windows."""
@@ -382,7 +387,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         with torch.no_grad():
             x = pool(features._bins(windows), torch.float64)
             plan, head = _solved(recipe, pool, x, is_slip, *_groups(y, groups))
-        self._slope = _UNCALIBRATED
+        self._slope: Calibration = _UNCALIBRATED
         if plan.calibration is not None:
             self._slope = Platt(plan.calibration["slope"], 0.0)  # a score of 0 says nothing
         info = plan.metadata | {
@@ -447,7 +452,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         features = TactileFeatures(
             pool.sample_rate_hz, pool.hand, filtered=filtered, align=layer.align
         )
-        features._take(pool, layer, pool.hand)
+        features._set(pool, layer)
         made = cls(features, slip_label=labels[1])
         made.classes_, made.slip_label_ = np.unique(np.array(labels)), np.array(labels)[1]
         found = calibration_of(detector)

@@ -1,29 +1,17 @@
 """From the skin to volts: vibration of sliding, slow and fast channels, what disturbs them.
 
-*Vibration* is in volts at a fast channel of unit gain. Three parts while an element slides: a *high*
-part, broadband behind the skin's resonance (friction noise of every contact, and the texture's
-``k^-a`` part, whose spectrum keeps its shape at any speed); a *low* part below 25 Hz; and *lines*
-at speed over wavelength, which run with the arm's position. Then a burst where it lets go.
+*Vibration* is in volts at a fast channel of unit gain. While an element slides it has a *high*
+part, broadband behind the skin's resonance; a *low* part below 25 Hz; and *lines* at speed over
+wavelength, which run with the arm's position. Then a burst where it lets go.
 
 A slow channel (SG, strain gauge) follows force and stays: preload, shear, creep, offset, drift. A
 fast one (PVDF film) gives the rate of strain, behind a high-pass. Both end in white noise and a
 converter with rails.
 
-*Disturbances* reach every channel: arm, motor, mains, knocks, a machine beside the hand, pick-up.
-Each is a common signal (or a few) times one coupling per channel.
-
-*Handling* loads the contact without sliding: a carried object's inertia, taps, changes of grip. It
-comes on top of what the contact says, and only where nothing slides: at rest and in strokes that
-move ``"both"``, a tenth of a second away from any stroke that slides. One thing reaches further: a
-carried object's shear outlasts its stroke by 30 ms, into a slide that begins sooner, where it is
-sensed and moves no onset. Taps and grips press harder and never less, and carried shear stays below
-half of static friction, so a contact that sticks goes on sticking: no slip begins or ends by them.
-
-*Imperfections* are noise, wander and partial slip of single elements; *faults* are what is broken
-between the sensors and the file. Neither moves what slides and when.
-
-Everything is a function of absolute time and of keys of its own, so any interval can be computed
-alone, and nothing moves by what is switched on beside it.
+*Disturbances* reach every channel through one coupling each. *Handling* loads a contact that does
+not slide and begins no slip. *Imperfections* are noise, wander and partial slip of single elements;
+*faults* are what is broken between the sensors and the file. Everything is a function of absolute
+time and of keys of its own, so any interval can be computed alone.
 """
 
 from __future__ import annotations
@@ -65,7 +53,7 @@ _PVDF_WARMING = 0.02  # of an SG channel's warming, what passes a film's high-pa
 # --- vibration ------------------------------------------------------------------------------------
 
 
-class Vibration(NamedTuple):
+class _Vibration(NamedTuple):
     """One element's vibration on a grid.
 
     Attributes:
@@ -134,7 +122,7 @@ def _band_responses(
     return causal_response(np.stack([high, low]))
 
 
-class Vibrations:
+class _Vibrations:
     """What the touching elements of a recording sound like on a grid.
 
     Args:
@@ -149,7 +137,7 @@ class Vibrations:
         self._levels_v = _levels_v(scene, grasp, motion.speed_mm_s)  # [K, B] each
         self._lines = _lines(scene, grasp, motion)
 
-    def element(self, element: int, contact: ElementContact) -> Vibration:
+    def element(self, element: int, contact: ElementContact) -> _Vibration:
         """One element's vibration, imperfections included; work only in blocks that slide."""
         scene, grasp, grid = self._scene, self._grasp, self._grid
         low_fraction = scene.contact.friction_noise_low_share
@@ -176,7 +164,7 @@ class Vibrations:
             bands[1, rows] += np.sqrt(low_fraction) * friction * low
             fluctuation[rows] += np.minimum(slide, 1.0) * low
         self._add_imperfections(bands, element, contact)
-        return Vibration(bands, fluctuation)
+        return _Vibration(bands, fluctuation)
 
     def _add_imperfections(self, bands: Array, element: int, contact: ElementContact) -> None:
         """Partial slip or sticking, and local noise."""
@@ -234,7 +222,7 @@ def _runs(chosen: Flags) -> list[slice]:
 # --- sensors --------------------------------------------------------------------------------------
 
 
-class Front(NamedTuple):
+class _Front(NamedTuple):
     """Parameters of every channel in one recording, ``[C]`` each.
 
     Attributes:
@@ -248,7 +236,7 @@ class Front(NamedTuple):
     offset_v: Array
 
 
-def draw_front(scene: Scene) -> Front:
+def draw_front(scene: Scene) -> _Front:
     """Gains, noise floors and offsets: per session, and a little again per recording."""
     sensors, num = scene.sensors, len(scene.hand)
     session, rng = generator(*scene.session_key("front")), generator(*scene.key("f"))
@@ -258,20 +246,20 @@ def draw_front(scene: Scene) -> Front:
     sg_offset = sensors.sg_session_offset_v * session.standard_normal(num)
     sg_offset = sg_offset + sensors.sg_offset_v * rng.standard_normal(num)
     pvdf_offset = 1e-3 * sensors.pvdf_offset_mv * rng.uniform(-1.0, 1.0, num)
-    return Front(
+    return _Front(
         gain=gain,
         white_v=1e-3 * floor_mv * lognormal(session, 0.2, num),
-        offset_v=np.where(is_slow(scene), sg_offset, pvdf_offset),
+        offset_v=np.where(_is_slow(scene), sg_offset, pvdf_offset),
     )
 
 
-def is_slow(scene: Scene) -> Flags:
+def _is_slow(scene: Scene) -> Flags:
     """Which channels are slow, ``[C]``."""
     return np.isin(np.arange(len(scene.hand)), scene.hand.slow)
 
 
 @lru_cache(maxsize=8)
-def highpass_response(corner_hz: float, block_samples: int, sample_rate_hz: float) -> Spectrum:
+def _highpass_response(corner_hz: float, block_samples: int, sample_rate_hz: float) -> Spectrum:
     """A film and its amplifier: first-order high-pass that passes no constant, ``[B + 1]``.
 
     The one-pole filter with a zero at 0 Hz, cut after one block and freed of what the cut leaves
@@ -285,7 +273,7 @@ def highpass_response(corner_hz: float, block_samples: int, sample_rate_hz: floa
     return np.asarray(np.fft.rfft(taps, 2 * block_samples))
 
 
-def _slow_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: Vibration) -> Array:
+def _slow_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: _Vibration) -> Array:
     """What an SG channel of unit gain says of its element; all on one grid."""
     sensors = scene.sensors
     shear_v = sensors.sg_shear_v_per_n * friction_n
@@ -294,7 +282,7 @@ def _slow_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: Vib
     return np.asarray(sensors.sg_preload_v_per_n * normal_n + shear_v + vibration_v)
 
 
-def _fast_volts(scene: Scene, grid: Grid, force_n: Array, vibration: Vibration) -> Array:
+def _fast_volts(scene: Scene, grid: Grid, force_n: Array, vibration: _Vibration) -> Array:
     """What a PVDF channel of unit gain says of its element.
 
     Args:
@@ -304,7 +292,7 @@ def _fast_volts(scene: Scene, grid: Grid, force_n: Array, vibration: Vibration) 
         vibration: on ``grid``; behind the high-pass already.
     """
     corner_hz = scene.sensors.pvdf_highpass_hz
-    response = highpass_response(corner_hz, grid.block_samples, grid.sample_rate_hz)
+    response = _highpass_response(corner_hz, grid.block_samples, grid.sample_rate_hz)
     strain_v = grid.filtered(scene.sensors.pvdf_shear_v_per_n * force_n, response)
     return np.asarray(strain_v + vibration.bands[0] + vibration.bands[1])
 
@@ -329,7 +317,7 @@ def _warming_v(scene: Scene, index: int, grid: Grid) -> Array:
     return np.asarray(far_v * np.expm1(-_WARMING_TIMES * since) / np.expm1(-_WARMING_TIMES))
 
 
-def _converted(scene: Scene, front: Front, index: int, grid: Grid, volts: Array) -> Array:
+def _converted(scene: Scene, front: _Front, index: int, grid: Grid, volts: Array) -> Array:
     """What the converter says: with offset, drift and white noise, between the rails, in steps."""
     noise = grid.white_noise((*scene.key("white"), scene.hand.names[index]))
     total = volts + front.offset_v[index] + front.white_v[index] * noise
@@ -346,7 +334,7 @@ def volts_of(
 ) -> list[Array]:
     """Volts of the channels asked for on the grid, ``[K, B]`` each."""
     history, _, now = grid.history
-    front, vibrations = draw_front(scene), Vibrations(scene, grasp, grid)
+    front, vibrations = draw_front(scene), _Vibrations(scene, grasp, grid)
     motion, handled = Motion(scene.slides, history), Handled(scene, grasp)
     volts = dict(zip(indices, _common_volts(scene, grid, indices), strict=True))
     elements = set(grasp.element_of_channel[indices].tolist()) & set(grasp.touching.tolist())
@@ -439,7 +427,7 @@ def _common_volts(scene: Scene, grid: Grid, channels: list[int]) -> Array:
     if scene.imperfections.pickup_mv > 0:
         session = generator(*scene.session_key("pick-up"))
         signs = np.where(session.random(num) < 0.5, -1.0, 1.0)
-        signs *= np.where(is_slow(scene), _SG_PICKUP, 1.0)
+        signs *= np.where(_is_slow(scene), _SG_PICKUP, 1.0)
         add(signs * lognormal(session, _PICKUP_COUPLING_SPREAD, num), _pickup_v(scene, grid))
     return volts
 
@@ -525,7 +513,7 @@ def _draw_knocks(scene: Scene) -> list[tuple[Array, float, float, float]]:
     reached = rng.random((num, num_channels)) < 0.5
     sizes_v = 1e-3 * of.burst_mv * lognormal(rng, 0.5, (num, 1))
     sizes_v = sizes_v * lognormal(rng, 0.5, (num, num_channels)) * reached
-    sizes_v *= np.where(is_slow(scene), 0.3, 1.0)
+    sizes_v *= np.where(_is_slow(scene), 0.3, 1.0)
     return list(zip(sizes_v, times_s.tolist(), omegas.tolist(), decays.tolist(), strict=True))
 
 
