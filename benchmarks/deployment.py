@@ -1,8 +1,8 @@
 """Exported files in onnxruntime beside the package: ``python -m benchmarks.deployment``.
 
 The detector that comes with the package, exported to ONNX as single bins and as a stream, in
-float32 and float64: error and latency beside the package itself, throughput in bulk, pushes of a stream, sizes of files,
-and a first score in a fresh process.
+float32 and float64: error and latency beside the package itself, throughput in bulk, pushes of a
+stream, sizes of files, and a first score in a fresh process.
 """
 
 from __future__ import annotations
