@@ -54,14 +54,14 @@ def host(module: str) -> Any:
 
 def bin_scores(path: Path) -> Callable[[torch.Tensor], Array]:
     """What scores raw bins with all context ``[N, C, n + 2 * context]`` by a bin graph."""
-    session, facts = host("files").load_model(path, "bin")
+    session, metadata = host("files").load_model(path, "bin")
     context = ChannelFilter(WINDOW_LENGTHS).context
-    first = context - facts["context_before_samples"]  # the file takes no more than it needs
-    unused = context - facts["context_after_samples"]
+    first = context - metadata["context_before_samples"]  # the file takes no more than it needs
+    unused = context - metadata["context_after_samples"]
 
     def scores(samples: torch.Tensor) -> Array:
         cut = samples[..., first : samples.shape[-1] - unused].numpy()
-        x = np.ascontiguousarray(cut, facts["precision"])
+        x = np.ascontiguousarray(cut, metadata["precision"])
         found: Array = session.run(["score", "valid"], {"samples": x})[0]
         return found
 

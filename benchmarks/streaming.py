@@ -189,9 +189,9 @@ def _c_host(
     """Pushes of the C host, which is built; None where there is no compiler."""
     if not (shutil.which("cc") and shutil.which("make")):
         return None
-    told = copy(detector)
-    told.info = {**detector.info, KEY: settings.to_dict()}
-    path = export_detector(told, folder, ["stream"])[0]
+    made = copy(detector)
+    made.info = {**detector.info, KEY: settings.to_dict()}
+    path = export_detector(made, folder, ["stream"])[0]
     words = [f"BUILD={folder}", f"PYTHON={sys.executable}", f"{folder}/libslip.so"]
     source = Path(__file__).parents[1] / "export" / "c"
     subprocess.run(["make", "-C", source, *words], check=True, stdout=subprocess.DEVNULL)

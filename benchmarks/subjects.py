@@ -96,7 +96,7 @@ def shipped(
 
 
 def alarm_settings(hop: int) -> AlarmSettings:
-    """Usual settings of a stream; what they say of a bin does not matter here."""
+    """Usual settings of a stream; their decisions do not matter here."""
     rule = Cusum(drift=0.1, evidence=min(1.0, hop / 100), ceiling=10.0)
     return AlarmSettings(hop, Platt(1.0, 0.0), rule, 8.0, target_per_hour=1.0)
 

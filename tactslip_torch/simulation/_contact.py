@@ -414,7 +414,7 @@ def _lanes_of(scene: Scene, grasp: Grasp) -> Lanes:
 
     ``mu_s N0`` over the presliding travel is the stiffness of skin and bristles in series; the
     bristles take ``bristle_share`` of the travel, a single one what its stiffness leaves it.
-    Resonance and damping ratio say how heavy and how damped the skin is, its relaxation which part
+    Resonance and damping ratio give mass and damping of the skin, its relaxation which part
     of it is a Maxwell arm. Part of the damping goes with friction, as what feeds stick-slip does:
     a damping ratio alone is too little for some skins or too much for others.
     """
