@@ -246,7 +246,7 @@ class ElementContact:
         slide: slip speed over the speed between hand and object, on the grid: 0 sticking, or
             where nothing drives it; 1 sliding steadily; above 1 where the skin springs back, by
             much where the arm is slow.
-        release_v: what a film of unit gain hears of letting go and sticking again, on the grid.
+        release_v: fast channel's volts by letting go and sticking again, on the grid.
     """
 
     normal_n: Array
