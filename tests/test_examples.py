@@ -1,4 +1,4 @@
-"""The example scripts run, and do what they say."""
+"""The example scripts run."""
 
 import copy
 import json

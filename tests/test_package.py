@@ -77,7 +77,7 @@ def test_a_detector_gives_probabilities_of_raw_and_of_filtered_bins(paper: Train
     for given in (raw, raw.numpy(), bins):
         torch.testing.assert_close(detector.probability(given), expected)
     assert torch.equal(detector.predict_proba(raw).sum(-1), torch.ones_like(expected))
-    del detector.info["alarm"]
+    detector.info = {}
     with pytest.raises(ValueError, match=r"no calibration, .*several recipe.penalties"):
         detector.probability(raw)
     for take in (detector, detector.predict_raw, detector.pool):

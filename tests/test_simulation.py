@@ -59,7 +59,7 @@ FINE = {"num_bits": 32, "rail_v": 100.0}
 """A converter without steps or rails, where recordings are subtracted from each other."""
 
 CALM = {"mains_mv": 0.0, "sg_drift_mv": 0.0, "pvdf_drift_mv": 0.0, "burst_rate_hz": 0.0}
-"""Nothing but white noise and what the contact, the arm and the scene itself say."""
+"""Nothing but white noise and what contact, arm and scene add."""
 
 
 def scene_of(name, material, cycle=0, **changes):
@@ -299,9 +299,9 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("make", "values", "said"), REFUSED, ids=[row[2] for row in REFUSED])
-def test_what_cannot_be_is_refused_in_one_line(make, values, said):
-    with pytest.raises(ValueError, match=said) as refusal:
+@pytest.mark.parametrize(("make", "values", "message"), REFUSED, ids=[row[2] for row in REFUSED])
+def test_what_cannot_be_is_refused_in_one_line(make, values, message):
+    with pytest.raises(ValueError, match=message) as refusal:
         make(**values)
     assert "\n" not in str(refusal.value)
 

@@ -246,7 +246,7 @@ class ElementContact:
         slide: slip speed over the speed between hand and object, on the grid: 0 sticking, or
             where nothing drives it; 1 sliding steadily; above 1 where the skin springs back, by
             much where the arm is slow.
-        release_v: what a film of unit gain hears of letting go and sticking again, on the grid.
+        release_v: fast channel's volts by letting go and sticking again, on the grid.
     """
 
     normal_n: Array
@@ -414,7 +414,7 @@ def _lanes_of(scene: Scene, grasp: Grasp) -> Lanes:
 
     ``mu_s N0`` over the presliding travel is the stiffness of skin and bristles in series; the
     bristles take ``bristle_share`` of the travel, a single one what its stiffness leaves it.
-    Resonance and damping ratio say how heavy and how damped the skin is, its relaxation which part
+    Resonance and damping ratio give mass and damping of the skin, its relaxation which part
     of it is a Maxwell arm. Part of the damping goes with friction, as what feeds stick-slip does:
     a damping ratio alone is too little for some skins or too much for others.
     """

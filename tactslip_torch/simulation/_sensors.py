@@ -43,12 +43,14 @@ _BANDS = ("high", "low")  # parts of vibration, above and below 25 Hz
 _REFERENCE_MM_S = 40.0  # the speed at which levels are given
 _LOW_BAND_HZ = 25.0  # where the low part of friction noise ends
 _LINE_DAMPING = 0.5  # ratio with which lines meet the skin: a patch is many bristles (prior, ours)
-_SG_VIBRATION = 0.08  # of a film's vibration, what an SG channel sees (prior, ours)
+_SLOW_VIBRATION = 0.08  # of a fast channel's vibration, what a slow one sees (prior, ours)
 _FORCE_FLUCTUATION = 0.03  # slow, of friction over its mean while sliding, rms (prior, ours)
 _DRIFT_HZ = (0.05, 2.0)  # where a channel's drift lies
 _DRIFT_NODES = 8  # per block
 _WARMING_TIMES = 2.0  # time constants of warming that a recording lasts (prior, ours)
-_PVDF_WARMING = 0.02  # of an SG channel's warming, what passes a film's high-pass (prior, ours)
+_FAST_WARMING = (
+    0.02  # of a slow channel's warming, what passes a fast one's high-pass (prior, ours)
+)
 
 # --- vibration ------------------------------------------------------------------------------------
 
@@ -123,7 +125,7 @@ def _band_responses(
 
 
 class _Vibrations:
-    """What the touching elements of a recording sound like on a grid.
+    """Vibration of the touching elements of a recording on a grid.
 
     Args:
         scene: of the recording.
@@ -150,7 +152,7 @@ class _Vibrations:
             slide = contact.slide[rows]
             keys = [(*scene.key(band), element) for band in _BANDS]
             high, low = self._band_noises(element, rows, keys)
-            if scene.fidelity == "bristles":  # a speed of its own, with the sound of that speed
+            if scene.fidelity == "bristles":  # a speed of its own, with the vibration of that speed
                 friction_gate = _powered(slide, scene.contact.friction_noise_exponent)
                 texture_gate = _powered(slide, grasp.texture_exponent)
             else:  # a fading in
@@ -274,16 +276,16 @@ def _highpass_response(corner_hz: float, block_samples: int, sample_rate_hz: flo
 
 
 def _slow_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: _Vibration) -> Array:
-    """What an SG channel of unit gain says of its element; all on one grid."""
+    """Volts of a slow channel of unit gain on its element; all on one grid."""
     sensors = scene.sensors
     shear_v = sensors.sg_shear_v_per_n * friction_n
     shear_v = shear_v * (1.0 + _FORCE_FLUCTUATION * vibration.fluctuation)
-    vibration_v = _SG_VIBRATION * (vibration.bands[0] + vibration.bands[1])
+    vibration_v = _SLOW_VIBRATION * (vibration.bands[0] + vibration.bands[1])
     return np.asarray(sensors.sg_preload_v_per_n * normal_n + shear_v + vibration_v)
 
 
 def _fast_volts(scene: Scene, grid: Grid, force_n: Array, vibration: _Vibration) -> Array:
-    """What a PVDF channel of unit gain says of its element.
+    """Volts of a fast channel of unit gain on its element.
 
     Args:
         scene: whose sensors.
@@ -310,7 +312,7 @@ def _warming_v(scene: Scene, index: int, grid: Grid) -> Array:
     Nothing at first, fast in the beginning and slower later, with a sign and size of the channel's.
     """
     rng = generator(*scene.key("warming"), index)
-    fraction = 1.0 if index in scene.hand.slow else _PVDF_WARMING
+    fraction = 1.0 if index in scene.hand.slow else _FAST_WARMING
     sign = 1.0 if rng.random() < 0.5 else -1.0
     far_v = 1e-3 * scene.sensors.warming_mv * fraction * sign * lognormal(rng, 0.5)
     since = np.maximum(grid.time_s, 0.0) / scene.end_s
@@ -318,7 +320,7 @@ def _warming_v(scene: Scene, index: int, grid: Grid) -> Array:
 
 
 def _converted(scene: Scene, front: _Front, index: int, grid: Grid, volts: Array) -> Array:
-    """What the converter says: with offset, drift and white noise, between the rails, in steps."""
+    """Volts of the converter: with offset, drift and white noise, between the rails, in steps."""
     noise = grid.white_noise((*scene.key("white"), scene.hand.names[index]))
     total = volts + front.offset_v[index] + front.white_v[index] * noise
     total += _drift_v(scene, index, grid)
@@ -370,13 +372,13 @@ _ARM_MODE_WEIGHTS = (0.25, 0.15, 0.25, 0.2, 0.1, 0.05)  # of a transient's first
 _MAINS_ORDERS = np.array([1, 2, 3, 5, 7, 9])  # up to 450 Hz
 _MAINS_BURST_S = (0.1, 1.0)  # how long the mains is stronger; log-uniform (prior, ours)
 _MAINS_RAMP_S = 0.02  # of a burst, at both ends
-_MOTOR_PITCH_MM = (0.37, 0.61)  # arm travel per turn of two gears that are heard (prior, ours)
+_MOTOR_PITCH_MM = (0.37, 0.61)  # arm travel per turn of two gears that vibrate (prior, ours)
 _MACHINE_ORDERS = np.array([1, 2, 3, 4, 6, 8])  # harmonics of the rotation
 _MACHINE_RUN_S = (1.0, 4.0)  # how long a run lasts; log-uniform (ours)
 _MACHINE_BREAK_S = (0.5, 2.0)  # how long it stands between runs; log-uniform (ours)
 _MACHINE_RAMP_S = 0.3  # how long it runs up and down, at both ends of a run (ours)
 _PICKUP_COUPLING_SPREAD = 0.7  # of the channels (ours)
-_SG_PICKUP = 0.1  # coupling of a strain gauge's bridge, of low resistance, over a film's (ours)
+_SLOW_PICKUP = 0.1  # coupling of a slow channel, of low resistance, over a fast one's (ours)
 _LEVEL_SPREAD = 0.5  # of levels of pick-up and local noise over time, and between elements (ours)
 _WANDER_HZ = (0.1, 2.0)  # where levels wander
 _WANDER_NODES = 16  # per block
@@ -427,7 +429,7 @@ def _common_volts(scene: Scene, grid: Grid, channels: list[int]) -> Array:
     if scene.imperfections.pickup_mv > 0:
         session = generator(*scene.session_key("pick-up"))
         signs = np.where(session.random(num) < 0.5, -1.0, 1.0)
-        signs *= np.where(_is_slow(scene), _SG_PICKUP, 1.0)
+        signs *= np.where(_is_slow(scene), _SLOW_PICKUP, 1.0)
         add(signs * lognormal(session, _PICKUP_COUPLING_SPREAD, num), _pickup_v(scene, grid))
     return volts
 
@@ -500,7 +502,7 @@ def _arm_ringing(scene: Scene, driven: Motion) -> tuple[slice, list[Array]]:
 
 
 def _draw_knocks(scene: Scene) -> list[tuple[Array, float, float, float]]:
-    """Knocks at random times, each in about half of the channels, weakly in SG channels (ours).
+    """Knocks at random times, each in about half of the channels, weakly in slow ones (ours).
 
     Volts of every channel, time, angular frequency and decay of each.
     """
@@ -571,7 +573,7 @@ def _machine_wave(scene: Scene, grid: Grid) -> Array:
 
 
 def _pickup_v(scene: Scene, grid: Grid) -> Array:
-    """Broadband pick-up at a film of coupling 1; its level wanders, ``[K, B]``."""
+    """Broadband pick-up at a fast channel of coupling 1; its level wanders, ``[K, B]``."""
     f = grid.frequency_hz
     response = causal_response(f / (f + 20.0) / (1 + f / 200.0))
     level = _wandering(_LEVEL_SPREAD, generator(*scene.key("pick-up level")), grid)
@@ -594,11 +596,13 @@ def _at_random(scene: Scene, key: Key, per_s: float, lengths_s: Interval) -> lis
 # --- handling -------------------------------------------------------------------------------------
 
 _MARGIN_S = 0.1  # between a tap or grip, with its settling, and a stroke that slides (ours)
-_SETTLE_S = 0.1  # how long a film still tells of a tap or grip that is over (ours)
+_SETTLE_S = 0.1  # how long a fast channel still shows a tap or grip that is over (ours)
 _EVENT_SPREAD = 0.3  # how unevenly elements take part in a tap or grip (ours)
 _RINGING_S = 0.3  # how long the arm's ringing counts as handling after a stroke (ours)
 _MOST_CARRIED = 0.5  # of static friction, what a carried object may take
-_KNOCK_V_PER_N = 0.05  # first swing of a knock's modes at a film, per newton of the peak (ours)
+_KNOCK_V_PER_N = (
+    0.05  # first swing of a knock's modes at a fast channel, per newton of the peak (ours)
+)
 _KNOCK_HZ = (60.0, 800.0)  # where a knock's modes lie
 _KNOCK_DECAY_S = (0.002, 0.008)
 _KNOCK_MODES = 8
@@ -749,7 +753,7 @@ class Handled:
         return extra
 
     def knock_v(self, element: int, grid: Grid) -> Array:
-        """What a film of unit gain hears of the taps beyond their force: many modes, soon gone.
+        """Volts of a fast channel of unit gain by taps beyond their force: many modes, soon gone.
 
         Shape:
             - output: ``[K, B]``
