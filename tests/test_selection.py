@@ -202,7 +202,6 @@ def updated(features, labels=5):
 
 ONES = torch.ones(3)
 BINS = torch.ones(5, 3)
-NEEDS, PRICES = torch.ones(3, 2, dtype=torch.bool), torch.tensor([1, 2])
 BROKEN = torch.zeros(5, 3).index_put((torch.tensor(4), torch.tensor(2)), torch.tensor(math.nan))
 
 
