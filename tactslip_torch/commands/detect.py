@@ -34,10 +34,10 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.prediction import masked_names
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.onset.events import (
+    EventRecord,
     EventRules,
     LatencyParts,
     RecordingEvents,
-    Watched,
     first_releases,
     pooled_metrics,
     recording_events,
@@ -230,7 +230,7 @@ def _with_truth(
     """The entry with what is true of its alarms, and the events."""
     alarms = entry["alarms"]
     ends = [alarm["end_s"] for alarm in alarms]
-    watched = Watched(
+    watched = EventRecord(
         recording=entry["file"],
         material=entry["material"],
         scene=entry["scene"],

@@ -44,7 +44,7 @@ from tactslip_torch.onset.evidence import (
 from tactslip_torch.onset.rules import NOTHING_YET, Cusum, Rule, most_lost
 from tactslip_torch.signals.filtering import past_matrix
 
-LATCH_START = (0.0, 0.0, 2.0**52)
+_LATCH_START = (0.0, 0.0, 2.0**52)
 """Armed, with no alarm before; the last number counts on exactly in float64."""
 
 
@@ -89,7 +89,7 @@ def stream_graph(
     before = 0.0 if onset is None else math.nan  # what no stream has is no evidence
     nothing = graph.constant(np.full((timing.tail, num_channels), before), dtype)
     no_sample = [math.nan] * num_channels + [0.0] * num_channels
-    starts = [0, 0, 0, *LATCH_START, 0, *no_sample, *rule_start(settings.rule)]
+    starts = [0, 0, 0, *_LATCH_START, 0, *no_sample, *rule_start(settings.rule)]
     start = graph.constant(starts, F64)
     if onset is not None:
         says_nothing = [0.0, *([math.nan] * 3), 0.0, 0.0, math.inf, *([0.0] * num_channels)]
@@ -99,7 +99,7 @@ def stream_graph(
     else:
         small = timing.state_size
     state = graph.concat(state, start, axis=0).slice(0, small, 0)
-    marked, stuck = without_stuck(
+    marked, stuck = _without_stuck(
         samples, state.slice(7, 7 + 2 * num_channels, 0), detector.sensing.stuck_samples
     )
     held = graph.concat(nothing, tail, marked, axis=0)
@@ -114,11 +114,8 @@ def stream_graph(
     if onset is not None:
         outputs |= {"onset_score": F64, "by_onset": BOOL}
     rate_hz = detector.pool.sample_rate_hz
-    rearm, refractory = (
-        settings.decisions(seconds, rate_hz)
-        for seconds in (settings.rearm_s, settings.refractory_s)
-    )
-
+    latch_times = tuple(settings.latch_times(rate_hz).values())
+    decision_samples = settings.decision_samples
     window = timing.raw.length
     hold = round(settings.hold_s * rate_hz)
 
@@ -137,6 +134,37 @@ def stream_graph(
         llr: Any = settings.calibration.llr(known)
         return number, scored, llr.clamp(-LARGEST, LARGEST)
 
+    def gathered(
+        number: Value, scored: Scored, llr: Value, run: Value, of_rule: Value, lost: Value
+    ) -> list[Value]:
+        """Statistics, where runs of positive ratios began, and what rule and ``lost`` are then."""
+
+        def simply() -> list[Value]:
+            statistic, after = statistic_of(settings.rule, llr, of_rule)
+            return [statistic, _latest(llr <= 0.0, run, number + 1.0), after, lost]
+
+        def with_gaps() -> list[Value]:
+            gaps = _Gaps.of(scored.is_valid, number, lost, most)
+            statistic, after = gaps.statistic_of(settings.rule, llr, of_rule)
+            is_end = ((llr <= 0.0) & scored.is_valid) | gaps.is_over
+            return [statistic, _latest(is_end, run, number + 1.0), after, gaps.lost_after]
+
+        return graph.if_(_is_whole(scored.is_valid, lost), simply, with_gaps)
+
+    def raised(
+        statistic: Value, high: Value, number: Value, of_latch: Value, valid: Value, lost: Value
+    ) -> list[Value]:
+        """Alarms, whether one stands, and what latch and ``lost`` are then."""
+
+        def simply() -> list[Value]:
+            return [*_latched(statistic, high, number, of_latch, *latch_times), lost]
+
+        def with_gaps() -> list[Value]:
+            gaps = _Gaps.of(valid, number, lost, most_lost(window, hold, decision_samples))
+            return [*gaps.latched(statistic, high, number, of_latch, *latch_times), gaps.lost_after]
+
+        return graph.if_(_is_whole(valid, lost), simply, with_gaps)
+
     def only_valid(value: Any, scored: Scored) -> Value:
         return graph.where(scored.is_valid, value, math.nan)
 
@@ -147,27 +175,12 @@ def stream_graph(
     sizes_before = [1, 1, 1, 3, 1, 2 * num_channels, len(rule_start(settings.rule))]
 
     def decide() -> list[Value]:
-        sizes = graph.axes(*sizes_before)
-        parts = graph.ops("Split", state, sizes, dtypes=[F64] * 7, axis=0)
+        parts = graph.ops("Split", state, graph.axes(*sizes_before), dtypes=[F64] * 7, axis=0)
         _, made, run, of_latch, lost, _, of_rule = parts
         number, scored, llr = bins(made)
         high = level(settings.threshold, dtype)
-
-        def simply() -> list[Value]:
-            statistic, after = statistic_of(settings.rule, llr, of_rule)
-            latch = latched(statistic, high, number, of_latch, rearm=rearm, refractory=refractory)
-            runs = _latest(llr <= 0.0, run, number + 1.0)
-            return [statistic, *latch, runs, after, lost]
-
-        def with_gaps() -> list[Value]:
-            gaps = Gaps.of(scored.is_valid, number, lost, most)
-            statistic, after = gaps.statistic_of(settings.rule, llr, of_rule)
-            latch = gaps.latched(statistic, high, number, of_latch, rearm, refractory)
-            is_end = ((llr <= 0.0) & scored.is_valid) | gaps.is_over
-            return [statistic, *latch, _latest(is_end, run, number + 1.0), after, gaps.lost_after]
-
-        is_whole = _is_whole(scored.is_valid, lost)
-        statistic, alarm, on, memory, runs, after, lost = graph.if_(is_whole, simply, with_gaps)
+        statistic, runs, after, _ = gathered(number, scored, llr, run, of_rule, lost)
+        alarm, on, memory, lost = raised(statistic, high, number, of_latch, scored.is_valid, lost)
         return [
             scored.score,
             only_valid(stated(llr), scored),
@@ -201,20 +214,7 @@ def stream_graph(
 
         def decide_bins() -> list[Value]:
             number, scored, llr = bins(made)
-
-            def simply() -> list[Value]:
-                statistic, after = statistic_of(settings.rule, llr, of_rule)
-                return [statistic, _latest(llr <= 0.0, run, number + 1.0), after, lost]
-
-            def with_gaps() -> list[Value]:
-                gaps = Gaps.of(scored.is_valid, number, lost, most)
-                statistic, after = gaps.statistic_of(settings.rule, llr, of_rule)
-                is_end = ((llr <= 0.0) & scored.is_valid) | gaps.is_over
-                runs = _latest(is_end, run, number + 1.0)
-                return [statistic, runs, after, gaps.lost_after]
-
-            is_whole = _is_whole(scored.is_valid, lost)
-            statistic, runs, after, now_lost = graph.if_(is_whole, simply, with_gaps)
+            statistic, runs, after, now_lost = gathered(number, scored, llr, run, of_rule, lost)
             unwaiting = replace(timing, frame=0)
             onset_s = _times_s(number, runs, settings, unwaiting, rate_hz)[1]
             columns = (
@@ -262,19 +262,9 @@ def stream_graph(
             is_valid = valid.cast(BOOL) | (onset_score > NOTHING_YET)
             is_high = (by_onset | (statistic >= settings.threshold)).cast(F64)
             one = graph.constant([1.0], F64)
-
-            def simply() -> list[Value]:
-                made = latched(is_high, one, number, of_latch, rearm=rearm, refractory=refractory)
-                return [*made, alarm_lost]
-
-            def with_gaps() -> list[Value]:
-                of_hops = most_lost(window, hold, int(hop))
-                gaps = Gaps.of(is_valid, number, alarm_lost, of_hops)
-                found = gaps.latched(is_high, one, number, of_latch, rearm, refractory)
-                return [*found, gaps.lost_after]
-
-            is_whole = _is_whole(is_valid, alarm_lost)
-            alarm, on, of_alarm, now_lost = graph.if_(is_whole, simply, with_gaps)
+            alarm, on, of_alarm, now_lost = raised(
+                is_high, one, number, of_latch, is_valid, alarm_lost
+            )
             return [
                 score.cast(dtype),
                 stated.cast(dtype),
@@ -388,7 +378,7 @@ def _times_s(
     return waited_s, waited_s - (time_s - onset_s)
 
 
-def without_stuck(samples: Value, known: Value, most: int) -> tuple[Value, Value]:
+def _without_stuck(samples: Value, known: Value, most: int) -> tuple[Value, Value]:
     """Samples with NaN where a channel is stuck (``StuckChannels``), and what is kept.
 
     Args:
@@ -508,7 +498,7 @@ def onset_scores(
         moves = moves & ~(own - own.slice(0, 1, 1)).abs().amax(1).eq(0.0)
     never_silent = graph.constant(evidence.silence.isinf().all(0).numpy(), BOOL)
     alive = of_fast.sum(1).isfinite() & (moves | never_silent)
-    is_known = alive.cast(F64).sum(1) >= float(evidence.min_alive or 1)  # [k]
+    is_known = alive.cast(F64).sum(1) >= float(evidence.min_alive)  # [k]
     longest, num_floor = evidence.windows[-1], evidence.memory - evidence.windows[-1]
 
     def scores_of(made: Sequence[Value], num_rows: Value) -> list[Value]:
@@ -564,7 +554,7 @@ def onset_scores(
         return [mean, lost * 0.0, *after]
 
     def some_lost() -> list[Value]:
-        gaps = Gaps.of(is_known, places.cast(F64), lost, most)
+        gaps = _Gaps.of(is_known, places.cast(F64), lost, most)
 
         def nothing_known() -> list[Value]:
             mean = graph.where(is_known, 0.0, graph.constant([NOTHING_YET], F64))
@@ -647,7 +637,7 @@ def statistic_of(
     return largest.slice(rule.k - 1, rule.k, 1).squeeze(1), kept
 
 
-class Gaps(NamedTuple):
+class _Gaps(NamedTuple):
     """Decisions of which some are not valid: these are left out, and put back (``rules``).
 
     Attributes:
@@ -665,7 +655,7 @@ class Gaps(NamedTuple):
     lost_after: Value
 
     @classmethod
-    def of(cls, valid: Value, number: Value, lost: Value, most: int) -> Gaps:
+    def of(cls, valid: Value, number: Value, lost: Value, most: int) -> _Gaps:
         """Of decisions.
 
         Args:
@@ -715,18 +705,18 @@ class Gaps(NamedTuple):
         memory: Value,
         rearm: int,
         refractory: int,
-    ) -> Latched:
+    ) -> _Latched:
         """As ``latched``; decisions that are not valid raise nothing, and end an alarm in time."""
         graph = statistic.graph
 
         def some() -> list[Value]:
-            found = latched(
+            found = _latched(
                 self.valid_of(statistic),
                 level,
                 self.valid_of(number),
                 memory,
-                rearm=rearm,
-                refractory=refractory,
+                rearm,
+                refractory,
                 first=number.slice(0, 1, 0),
                 anew=self.valid_of(self.begins_anew),
             )
@@ -745,10 +735,10 @@ class Gaps(NamedTuple):
         alarm, on, after = graph.if_(self.has_valid, some, none)
         is_over = _last(self.is_over)
         armed = graph.concat(*[graph.constant([0.0, 0.0], F64), after.slice(2, 3, 0)], axis=0)
-        return Latched(alarm, on & ~self.is_over, graph.where(is_over, armed, after))
+        return _Latched(alarm, on & ~self.is_over, graph.where(is_over, armed, after))
 
 
-class Latched(NamedTuple):
+class _Latched(NamedTuple):
     """Which decisions raise an alarm.
 
     Attributes:
@@ -762,17 +752,17 @@ class Latched(NamedTuple):
     memory: Value
 
 
-def latched(
+def _latched(
     statistic: Value,
     level: Value,
     number: Value,
     memory: Value,
-    *,
     rearm: int,
     refractory: int,
+    *,
     first: Value | None = None,
     anew: Value | None = None,
-) -> Latched:
+) -> _Latched:
     """Alarms as ``onset.rules.latch`` raises them.
 
     One is raised where the statistic is high, and the last alarm is no later than the last
@@ -784,7 +774,7 @@ def latched(
         level: from which on an alarm is raised.
         number: of the decisions in their stream, float64.
         memory: whether an alarm stands, for how many decisions then the statistic was low, and
-            decisions since the last alarm (``LATCH_START``); float64.
+            decisions since the last alarm (``_LATCH_START``); float64.
         rearm: decisions in a row that must be low.
         refractory: shortest distance of two alarms, in decisions.
         first: number of the first decision behind the memory, where others were left out.
@@ -826,7 +816,7 @@ def latched(
         return [is_high, is_high, memory + graph.constant([0, 0, 1], F64) * num]
 
     is_awake = (statistic.amax(0, keepdim=True) >= level) | (memory.slice(0, 1, 0) > 0.0)
-    return Latched(*graph.if_(is_awake, awake, asleep))
+    return _Latched(*graph.if_(is_awake, awake, asleep))
 
 
 def _count_up(num: Value) -> Value:

@@ -61,7 +61,7 @@ class EventRules:
 
 
 @dataclass(frozen=True)
-class Watched:
+class EventRecord:
     """One recording as a detector saw it. Decisions and alarms are at the time they are available.
 
     Args:
@@ -164,7 +164,9 @@ class RecordingEvents(NamedTuple):
     latency: LatencyParts
 
 
-def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts) -> RecordingEvents:
+def recording_events(
+    watched: EventRecord, rules: EventRules, latency: LatencyParts
+) -> RecordingEvents:
     """What became of each onset that was watched, and which alarms were false.
 
     A slip has three instants: its first element lets go, half of the load has let go (the onset),

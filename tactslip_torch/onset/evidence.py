@@ -90,7 +90,7 @@ class OnsetEvidence:
         comb_periods: over how many it takes the mean.
         least_rms: root mean square of each fast channel and filter, ``[F, B]``, below which the
             channel is silent; empty: below rounding.
-        min_alive: fast channels that must be alive for evidence; ``None``: half of them.
+        min_alive: fast channels that must be alive for evidence; 0: half of them.
 
     Raises:
         ValueError: if the hand has no fast channel, a hop is longer than 5 ms, or a scale is not
@@ -105,7 +105,7 @@ class OnsetEvidence:
     mains_hz: float = 50.0
     comb_periods: int = 1
     least_rms: tuple[tuple[float, ...], ...] = ()
-    min_alive: int | None = None
+    min_alive: int = 0
 
     def __post_init__(self) -> None:
         if not self.hand.fast:
@@ -126,7 +126,7 @@ class OnsetEvidence:
         least = np.array(self.least_rms or np.zeros(shape), np.float64)
         if least.shape != shape or not (np.isfinite(least) & (least >= 0)).all():
             raise ValueError(f"least_rms must be finite, at least 0 and {list(shape)}")
-        if self.min_alive is None:
+        if not self.min_alive:
             object.__setattr__(self, "min_alive", least_alive(shape[0]))
 
     def blocks_in(self, seconds: float) -> int:
@@ -303,7 +303,7 @@ class OnsetEvidence:
             pools = _over_channels(both, size.sum(1).isfinite() & slow, num_slow)
             columns.append(torch.cat(pools, -1).flatten(-2))
         num_alive = in_use.type_as(level).sum(-1)
-        return torch.cat(columns, -1), num_alive >= float(self.min_alive or 1)
+        return torch.cat(columns, -1), num_alive >= float(self.min_alive)
 
     def to_dict(self) -> dict[str, Any]:
         """All but the hand and the sample rate, which are the detector's."""
@@ -496,7 +496,7 @@ class OnsetStream:
         rises = (logs - evidence.silence.T[:, None]).amax(-1)
         assert made.moves is not None  # of blocks that were just made
         alive = logs.sum(-1).isfinite() & ((rises > 0.0) & made.moves | rises.isinf())  # [F, k]
-        is_lost = alive.numpy()[fast].sum(0) < (evidence.min_alive or 1)
+        is_lost = alive.numpy()[fast].sum(0) < evidence.min_alive
         made_rows = torch.cat([logs.transpose(1, 2).flatten(0, 1), made.mean]).T.numpy()
         score, segments = np.full(len(made_rows), math.nan), list[tuple[bool, list[int]]]()
         for hop in range(len(made_rows)):
@@ -539,7 +539,7 @@ def _engine_of(classifier: OnsetClassifier, most_lost: int) -> OnsetEngine:
         scaling=(slope, offset),
         head=(quadratic, head.linear.numpy(), float(head.constant)),
         silence=evidence.silence.T.numpy(),
-        min_alive=evidence.min_alive or 1,
+        min_alive=evidence.min_alive,
         most_lost=most_lost,
     )
 

@@ -28,7 +28,7 @@ from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.events import first_releases
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
-from tactslip_torch.runtime import in_processes
+from tactslip_torch.runtime import check_number, in_processes
 
 ONSET_S = (0.002, 0.030)
 """Behind an onset, in which hops are positive."""
@@ -54,12 +54,22 @@ class OnsetTraining:
         penalty: the paper's ``C``, of hops whose weights sum to 1.
         comb_periods: of the mains, over which the comb takes the mean.
         mains_hz: nominal.
+        scenes: kinds of recordings that it is fitted on, where others are there too.
+        cycles: recordings of each material and scene, at most, that it is fitted on then.
+
+    Raises:
+        ValueError: if the number of cycles is not positive.
     """
 
     hop_ms: float = 5.0
     penalty: float = 2e4
     comb_periods: int = 1
     mains_hz: float = 50.0
+    scenes: Sequence[str] = ()
+    cycles: int = 4
+
+    def __post_init__(self) -> None:
+        check_number("onset.classifier.cycles", self.cycles, whole=True)
 
     def __call__(
         self,
