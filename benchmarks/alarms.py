@@ -25,7 +25,7 @@ from tactslip_torch import AlarmSettings, SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector
 from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.onset.events import EventRules, LatencyParts, pooled_metrics, recording_events
-from tactslip_torch.onset.thresholds import Budget
+from tactslip_torch.onset.rules import Budget
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.alarm import JOINT, OURS, Timing, decide, event_record, score_streams
 

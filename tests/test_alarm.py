@@ -135,9 +135,9 @@ def test_too_few_hours_are_told_and_a_scene_without_any_is_refused(caplog):
     assert not caplog.text
     stage(hours={"held": 1.0, "taps": 8 / 3600}).roles(loudness_detector())
     assert "0.01 h of held are left to calibrate on, onset.hours asks for 1: give" in caplog.text
+    few = stage(Streams(cycles=2), budget=BARE, classifier=replace(LEARNED, scenes=["paper"]))
     with pytest.raises(ValueError, match="no recording of scene paper that was not trained on"):
-        of_paper = replace(LEARNED, scenes=["paper"])
-        stage(Streams(cycles=2), budget=BARE, classifier=of_paper).roles(loudness_detector())
+        few.roles(loudness_detector())
 
 
 BEYOND_THE_HOURS = [

@@ -25,7 +25,7 @@ from tactslip_torch.native import reason_unavailable
 from tactslip_torch.onset.baselines import (
     VIBRATION_HZ,
     BaselineDetector,
-    film_band_power,
+    fast_band_power,
     largest_detail,
 )
 from tactslip_torch.onset.decisions import AlarmSettings
@@ -318,7 +318,7 @@ def test_gradients_are_those_of_differences():
 
 
 FILMS = HandLayout.paper24().indices("PVDF")
-SCORES = {"film_band_power": film_band_power, "largest_detail": largest_detail}
+SCORES = {"fast_band_power": fast_band_power, "largest_detail": largest_detail}
 
 
 def band_rms(x, rate=2000.0):
@@ -337,7 +337,7 @@ def test_band_power_is_numpys_for_bins_of_any_length_and_rate(num, rate, rng):
     """At 700 Hz up to half the rate, where an even bin has a line that is no pair."""
     bins = 0.2 + rng.standard_normal((3, 2, num))
     expected = [np.log(max(band_rms(x, rate) for x in bin_)) for bin_ in bins]
-    actual = film_band_power(torch.from_numpy(bins), [0, 1], rate)
+    actual = fast_band_power(torch.from_numpy(bins), [0, 1], rate)
     np.testing.assert_allclose(actual, expected, atol=1e-10)
 
 
@@ -394,13 +394,16 @@ def test_a_lost_film_counts_as_silent_and_without_films_there_is_no_score(name):
 
 
 NO_BASELINE = [
-    (lambda x: film_band_power(x, []), "needs a film"),
-    (lambda x: largest_detail(x, torch.zeros(3, dtype=torch.bool)), "needs a film"),
-    (lambda x: film_band_power(x, [0], 8.0), "no line of 100 samples"),
+    (lambda x: fast_band_power(x, []), "of fast channels needs one"),
+    (lambda x: largest_detail(x, torch.zeros(3, dtype=torch.bool)), "of fast channels needs one"),
+    (lambda x: fast_band_power(x, [0], 8.0), "no line of 100 samples"),
     (lambda x: largest_detail(x[..., :20], [0]), "level must lie in"),
     (lambda x: largest_detail(x, [0], wavelet="none"), "unknown wavelet"),
-    (lambda x: baseline("loudest"), r"baseline must be one of film.*got 'loudest'"),
-    (lambda x: baseline("largest_detail", HandLayout(HAND.channels[:2])), "needs a film"),
+    (lambda x: baseline("loudest"), r"baseline must be one of fast.*got 'loudest'"),
+    (
+        lambda x: baseline("largest_detail", HandLayout(HAND.channels[:2])),
+        "of fast channels needs one",
+    ),
     (lambda x: baseline("largest_detail").predict_raw(x), "expected samples"),
 ]
 

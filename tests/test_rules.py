@@ -16,18 +16,20 @@ from hypothesis import strategies as st
 from scipy.stats import beta, chi2
 from torch import Tensor
 
-from tactslip_torch.onset import thresholds
+from tactslip_torch.onset import rules
 from tactslip_torch.onset.rules import (
     NOTHING_YET,
     RULES,
+    Budget,
     Cusum,
     KOfN,
     Latch,
     Rule,
+    false_alarms,
     latch,
+    lowest_threshold,
     rule_from_dict,
 )
-from tactslip_torch.onset.thresholds import Budget, false_alarms, lowest_threshold
 
 LIST = (KOfN(1, 1), KOfN(2, 3), KOfN(7, 20), Cusum(), Cusum(drift=0.3, evidence=0.2, ceiling=3.0))
 LIST += (Cusum(np.float64(0.13), np.float64(0.37), 5.3),)
@@ -269,7 +271,7 @@ def test_the_lowest_threshold_is_that_of_trying_every_value(
     given_ = {**how, "is_raised": raised} if has_other else how
     ranked = np.sort(np.concatenate([row[q] for row, q in zip(scores, quiet, strict=True)]))[::-1]
     limits = {"_MOST_TRIED": most, "_LEAST_QUIET": least_quiet, "_TRIED_ONE_BY_ONE": one_by_one}
-    with patch.multiple(thresholds, **limits):
+    with patch.multiple(rules, **limits):
         if not len(ranked):
             with pytest.raises(ValueError, match="no decision to count alarms in"):
                 lowest_threshold(scores, quiet, allowed, **given_)

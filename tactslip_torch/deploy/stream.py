@@ -19,18 +19,19 @@ from onnx import numpy_helper
 from torch import Tensor
 
 from tactslip_torch.deploy.bins import (
-    SAID_OF_BIN,
+    OF_LAST_BIN,
     Precision,
     RawBin,
     Scored,
     Timing,
     dtype_of,
+    machine,
     memory_shapes,
     memory_size,
     rule_start,
+    scaled,
     score_bins,
 )
-from tactslip_torch.deploy.head import machine, scaled
 from tactslip_torch.deploy.value import BOOL, END, F64, I64, Graph, Value
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
@@ -67,7 +68,7 @@ def stream_graph(
 
     With an onset classifier there are ``onset_score``, float64, and ``by_onset`` too, the threshold
     is the classifier's, and behind the memory of the rule the state has decisions of the alarm in a
-    row that are not valid, what is said of the last bin (``SAID_OF_BIN``, and the channels that
+    row that are not valid, the last bin's columns (``OF_LAST_BIN``, and the channels that
     were lost) and the memory of blocks (``onset_scores``).
 
     Args:
@@ -92,8 +93,8 @@ def stream_graph(
     starts = [0, 0, 0, *_LATCH_START, 0, *no_sample, *rule_start(settings.rule)]
     start = graph.constant(starts, F64)
     if onset is not None:
-        says_nothing = [0.0, *([math.nan] * 3), 0.0, 0.0, math.inf, *([0.0] * num_channels)]
-        start, given = graph.concat(start, graph.constant(says_nothing, F64), axis=0), state
+        no_bin = [0.0, *([math.nan] * 3), 0.0, 0.0, math.inf, *([0.0] * num_channels)]
+        start, given = graph.concat(start, graph.constant(no_bin, F64), axis=0), state
         small = timing.state_size - memory_size(onset.evidence)
         state = given.slice(0, small, 0)
     else:
@@ -206,10 +207,10 @@ def stream_graph(
 
     def join(onset: OnsetClassifier) -> list[Value]:
         """Decisions a hop of the classifier apart, from its scores and the last bin by then."""
-        num_said = len(SAID_OF_BIN) + num_channels
-        sizes = graph.axes(*sizes_before, 1, num_said)
+        num_kept = len(OF_LAST_BIN) + num_channels
+        sizes = graph.axes(*sizes_before, 1, num_kept)
         parts = graph.ops("Split", state, sizes, dtypes=[F64] * 9, axis=0)
-        before, made, run, of_latch, lost, _, of_rule, alarm_lost, said = parts
+        before, made, run, of_latch, lost, _, of_rule, alarm_lost, last_bin = parts
         memory = onset_memory(given, small, onset.evidence)
 
         def decide_bins() -> list[Value]:
@@ -227,11 +228,11 @@ def stream_graph(
             )
             of_bins = [x.cast(F64).unsqueeze(1) for x in columns]
             made_rows = graph.concat(*of_bins, scored.channels_lost.cast(F64), axis=1)
-            rows = graph.concat(said.unsqueeze(0), made_rows, axis=0)
+            rows = graph.concat(last_bin.unsqueeze(0), made_rows, axis=0)
             return [rows, decided, _last(runs), after, now_lost]
 
         rows, *of_bins = graph.if_(
-            decided > made, decide_bins, lambda: [said.unsqueeze(0), made, run, of_rule, lost]
+            decided > made, decide_bins, lambda: [last_bin.unsqueeze(0), made, run, of_rule, lost]
         )
         hop, of_bin = float(onset.evidence.hop_samples), float(timing.hop)
         hops, first = (seen / hop).floor(), (before / hop).floor()
@@ -254,9 +255,9 @@ def stream_graph(
             if timing.frame > timing.first:
                 last = graph.where(samples >= float(timing.frame), last, -1.0)
             place = (last - made + 1.0).clamp(min=0.0).cast(I64)  # row 0 is what was known before
-            told = graph.op("Gather", rows, place, axis=0)
+            at_hop = graph.op("Gather", rows, place, axis=0)
             score, stated, statistic, valid, in_range, onset_s = (
-                told[..., i] for i in range(len(SAID_OF_BIN))
+                at_hop[..., i] for i in range(len(OF_LAST_BIN))
             )
             statistic, time_s = statistic.cast(dtype), samples / rate_hz
             is_valid = valid.cast(BOOL) | (onset_score > NOTHING_YET)
@@ -275,7 +276,7 @@ def stream_graph(
                 on,
                 time_s,
                 graph.where(by_onset, time_s - onset.lead_s, onset_s).minimum(time_s),
-                told.slice(len(SAID_OF_BIN), END, 1).cast(BOOL),
+                at_hop.slice(len(OF_LAST_BIN), END, 1).cast(BOOL),
                 onset_score,
                 by_onset,
                 next_state(of_alarm, now_lost, after),

@@ -10,10 +10,8 @@ import math
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self, TextIO, TypeVar
+from typing import Any, NamedTuple, Protocol, TextIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -415,49 +413,6 @@ class _Reader:
 
     since_s: float
     content: bytearray = field(default_factory=bytearray)
-
-
-class FileSink(Sink):
-    """A sink whose file gets its name when it is closed; a ``with`` that raises leaves none.
-
-    Args:
-        path: of the file.
-        ending: that it must have.
-        sample_rate_hz: of the stream.
-        is_live: whether the first sample is of now, where nobody tells times; else it is at 0.
-
-    Raises:
-        ValueError: if the path has another ending.
-    """
-
-    def __init__(self, path: Path, ending: str, sample_rate_hz: float, *, is_live: bool) -> None:
-        if path.suffix != ending:
-            raise ValueError(f"{path} must end in {ending}")
-        self._rate, self._is_live = sample_rate_hz, is_live
-        self._start_s: float | None = None  # since 1970, of the time 0 of a live stream
-        self._last_s = 0.0  # of the last sample
-        self._stack = ExitStack()
-
-    def _times_of(self, first: int, block: Block) -> Array:
-        """When the samples of a block were taken, ``[n]``, on the clock of the stream."""
-        times_s = block.time_s
-        if times_s is None:
-            times_s = (first + np.arange(len(block.samples))) / self._rate
-            if self._is_live and self._start_s is None:
-                self._start_s = time.time()
-        self._last_s = float(times_s[-1]) if len(times_s) else self._last_s
-        return times_s
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: Any
-    ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self._stack.__exit__(kind, error, trace)
 
 
 def truth_changes(recording: Recording | None) -> list[tuple[float, bool]]:

@@ -58,13 +58,17 @@ from tactslip_torch.onset.events import (
     recording_events,
 )
 from tactslip_torch.onset.evidence import OnsetClassifier
-from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN, Rule, rule_from_dict
-from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.onset.thresholds import (
+from tactslip_torch.onset.rules import (
+    NOTHING_YET,
     Budget,
+    Cusum,
+    KOfN,
+    Rule,
     false_alarms,
     lowest_threshold,
+    rule_from_dict,
 )
+from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.report.metrics import weights_at_share
 from tactslip_torch.runtime import bar, check_number, in_processes, one_thread
 from tactslip_torch.training.onset import OnsetTraining
