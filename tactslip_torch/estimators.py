@@ -27,7 +27,7 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, most_stuck_samples
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.model.calibration import Calibration, Platt, calibration_from_dict, probability
+from tactslip_torch.model.calibration import Platt, calibration_from_dict, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_from_dict
 from tactslip_torch.model.scaling import FeatureScaler
@@ -443,7 +443,7 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
         plan, head = _solved(recipe, pool, features, is_slip, *_groups(y, groups))
         self.penalty_: Any = plan.penalty
         self.validation_: list[dict[str, Any]] = plan.validation
-        self._slope: Calibration = _UNCALIBRATED
+        self._slope: Platt = _UNCALIBRATED
         if plan.calibration is not None:
             self._slope = Platt(plan.calibration["slope"], 0.0)  # a score of 0 tells nothing
         info = plan.metadata | {

@@ -171,6 +171,21 @@ def test_a_fast_channel_is_left_out_while_what_is_missing_is_remembered(value):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
 
 
+def test_a_living_channel_that_is_quiet_takes_part_in_the_pools():
+    """A thousandth as loud as the others, and far above what counts as silent: it is the least."""
+    evidence = evidence_of(fast_compression=(1e-6,) * 4, least_rms=((1e-6,) * 4,) * 4)
+    x = samples_of(evidence)
+    x[2] = x[2, 0] + 1e-3 * (x[2] - x[2, 0])
+    found, is_usable = columns_of(evidence, x)
+    assert bool(is_usable.all())
+    expected, _ = oracle(evidence, x.numpy())
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    without, _ = oracle(evidence, x.numpy(), {2})
+    assert (np.abs(found.numpy() - without) > 1e-3).any(1).all()
+    silent = replace(evidence, least_rms=((1e-6,) * 4, (1.0,) * 4, (1e-6,) * 4, (1e-6,) * 4))
+    np.testing.assert_allclose(columns_of(silent, x)[0], without, rtol=0, atol=1e-6)
+
+
 # The classifier, whole and in pieces -------------------------------------------------------------
 
 

@@ -289,6 +289,16 @@ def test_the_lowest_threshold_is_that_of_trying_every_value(
     assert found == expected if one_by_one == 500 else found in {above, *ranked.tolist()}
 
 
+@pytest.mark.parametrize(("num_quiet", "num_high"), [(39, 1), (40, 2), (400, 20)])
+def test_a_score_is_no_alarm_that_is_high_in_more_than_one_of_20_quiet_decisions(
+    num_quiet, num_high
+):
+    """However few alarms it raises: with a long re-arming all of these are one."""
+    scores = np.arange(float(num_quiet))
+    found = lowest_threshold([scores], [np.ones(num_quiet, bool)], 5, rearm=num_quiet, refractory=0)
+    assert int((scores >= found).sum()) == num_high
+
+
 @given(values=drawn_values, how=drawn_times, seed=st.integers(0, 2**20))
 def test_false_alarms_are_those_of_the_latch_in_quiet(values, how, seed: int) -> None:
     quiet = np.random.default_rng(seed).random(len(values)) < 0.5

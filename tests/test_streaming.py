@@ -123,6 +123,32 @@ def test_any_cut_gives_what_the_whole_recording_gives(
     assert_same(found, offline(detector, settings, samples))
 
 
+def test_samples_behind_the_look_ahead_change_no_decision():
+    samples = signal(2000, 5)
+    whole, later = in_pieces(stream_of(), samples), samples.clone()
+    later[:, 1000:] = 7.0
+    is_before = whole.available_s * RATE <= 1000
+    changed = in_pieces(stream_of(), later)
+    assert 10 < int(is_before.sum()) < len(is_before)
+    for name in ("score", "statistic", "is_alarm", "onset_s"):
+        found, expected = (getattr(of, name) for of in (changed, whole))
+        assert torch.equal(found[is_before], expected[is_before]), name
+
+
+def test_channels_may_be_masked_while_a_stream_runs():
+    samples = signal(1800, 5)
+    stream, parts = stream_of(), []
+    for third, masked in zip(samples.T.tensor_split(3), ([], ["SG1", "PVDF2"], []), strict=True):
+        stream.masked_channels = masked
+        parts.append(stream.push(third))
+        assert parts[-1].is_valid.all()  # two of four are enough
+        assert {parts[-1].names_lost(i) for i in range(len(parts[-1].score))} == {tuple(masked)}
+    made, whole = joined_decisions(parts), stream_of().push(samples.T)
+    kept = ~made.channels_lost.any(-1)
+    torch.testing.assert_close(made.score[kept], whole.score[kept], rtol=1e-9, atol=1e-9)
+    assert (made.score[~kept] != whole.score[~kept]).all()
+
+
 # Fast evidence ---------------------------------------------------------------------------------
 
 WITH_ONSET = replace(settings_of(), onset=onset_of(signal(6000, 5), quantile=0.75))
@@ -272,6 +298,23 @@ def test_samples_may_come_in_any_form(form):
     found = joined_decisions([stream.push(FORMS[form](samples.T)), stream.flush()])
     assert_same(found, expected)
     assert not found.score.requires_grad
+
+
+@pytest.mark.parametrize(
+    ("samples", "time_s", "words"),
+    [
+        (np.zeros((3, 5)), None, r"\[n, 4\].*\(3, 5\)"),
+        (np.zeros((3, 4), np.int16), None, "floating.*int16"),
+        (np.zeros((3, 4)), [0.1, 0.2], r"time_s.*3.*\(2,\)"),
+    ],
+)
+def test_what_cannot_be_pushed_is_refused_and_changes_nothing(samples, time_s, words):
+    stream, good = stream_of(), signal(1000, 6)
+    before = stream.push(good[:, :500].T)
+    with pytest.raises(ValueError, match=words):
+        stream.push(samples, time_s)
+    found = joined_decisions([before, stream.push(good[:, 500:].T), stream.flush()])
+    assert_same(found, in_pieces(stream_of(), good))
 
 
 def test_what_cannot_be_set_is_refused():

@@ -303,9 +303,6 @@ def _windows(
 ) -> Value:
     """The raw samples of each decision, ``[k, channels in use, RawBin.length]``.
 
-    Channels in between that are not in use go along, as columns are costly to pick and rows are
-    not.
-
     Args:
         held: samples, the last of which is number ``seen``, ``[m, C]``.
         seen: how many came so far, ``[1]``.
@@ -316,39 +313,29 @@ def _windows(
     """
     graph, raw = held.graph, timing.raw
     origin = start - seen - float(raw.before)  # negative: counted from the end
-    x = held.slice(origin.cast(I64), END, 0)
-    columns = range(raw.channels[0], raw.channels[-1] + 1)
-    if len(columns) < len(detector.pool.hand):
-        x = x.slice(columns.start, columns.stop, 1)
+    x = held.slice(origin.cast(I64), END, 0).take(raw.channels, 1)
     if raw.before:
         x = graph.if_(
             start < float(raw.before),
-            lambda: [_with_past(x, start.cast(I64), columns, detector, raw)],
+            lambda: [_with_past(x, start.cast(I64), detector, raw)],
             lambda: [x],
         )[0]
     index = (places * timing.hop).unsqueeze(1) + graph.axes(*range(raw.length))
-    windows = graph.op("Gather", x, index, axis=0).transpose(0, 2, 1)
-    if len(columns) == len(raw.channels):
-        return windows
-    return windows.take([columns.index(channel) for channel in raw.channels], 1)
+    return graph.op("Gather", x, index, axis=0).transpose(0, 2, 1)
 
 
-def _with_past(
-    x: Value, start: Value, columns: range, detector: SlipDetector, raw: RawBin
-) -> Value:
+def _with_past(x: Value, start: Value, detector: SlipDetector, raw: RawBin) -> Value:
     """The first raw bin and what follows, with a made-up past before the stream's start.
 
     Args:
-        x: ``[m, columns]``, from ``RawBin.before`` samples before ``start``.
+        x: ``[m, channels in use]``, from ``RawBin.before`` samples before ``start``.
         start: of the first bin, a sample of the stream, ``[1]``.
-        columns: channels of the hand that are there.
         detector: whose filter makes the past up.
         raw: its raw bin.
     """
     graph, layer = x.graph, detector.channel_filter
     known = x.slice(-start + raw.before, END, 0)
-    shortest = min(layer.window_lengths[channel] for channel in raw.channels)
-    lengths = [layer.window_lengths[c] if c in raw.channels else shortest for c in columns]
+    lengths = [layer.window_lengths[channel] for channel in raw.channels]
     pasts, order = list[Value](), list[int]()
     for length in dict.fromkeys(lengths):
         chosen = [i for i, own in enumerate(lengths) if own == length]
@@ -511,15 +498,8 @@ def onset_scores(
             rows = graph.concat(kept[of].slice(1 - num, END, 0), made[of], axis=0)
             return _rows(rows, first, range(num))
 
-        def one_floor() -> list[Value]:  # by a product, which copies nothing
-            weights = np.append(np.full(num_floor, 1 / num_floor), np.zeros(longest - 1))
-            return [graph.constant(weights[None], F64) @ kept[0]]
-
-        def floors() -> list[Value]:
-            rows = graph.concat(kept[0], made[0], axis=0)
-            return [_rows(rows, first, range(num_floor)).mean(1)]
-
-        (floor,) = graph.if_(made[0].length(0).eq(1), one_floor, floors)
+        rows = graph.concat(kept[0], made[0], axis=0)
+        floor = _rows(rows, first, range(num_floor)).mean(1)
         to_means = np.zeros((num_windows, longest))
         for row, length in zip(to_means, evidence.windows, strict=True):
             row[-length:] = 1 / length

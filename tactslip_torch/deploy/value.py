@@ -390,16 +390,6 @@ class Value:
         """Of a constant table of float64, at the places that are these values."""
         return self.graph.op("Gather", self.graph.constant(table, F64), self)
 
-    def places_in(self, knots: Tensor) -> Value:
-        """How many of some knots ``[n]``, ascending, are smaller."""
-        is_larger = self.unsqueeze(-1) > self.graph.constant(knots, F64)
-        return is_larger.cast(I64).sum(-1)
-
-    def interpolated(self, end: Value, weight: Value) -> Value:
-        """From this value to another, exact at both ends: ``torch.lerp``."""
-        rise = end - self
-        return self.graph.where(weight < 0.5, self + weight * rise, end - rise * (1.0 - weight))
-
     @classmethod
     def __torch_function__(
         cls,
@@ -467,8 +457,6 @@ _FUNCTIONS: dict[Callable[..., Any], Callable[..., Value]] = {
     torch.cat: lambda values, dim: values[0].graph.concat(*values, axis=dim),
     torch.minimum: Value.minimum,
     torch.maximum: Value.maximum,
-    torch.lerp: lambda start, end, weight: start.interpolated(end, weight),
-    torch.searchsorted: lambda ascending, values: values.places_in(ascending),
 }
 """Functions of torch that take values, and what they do."""
 

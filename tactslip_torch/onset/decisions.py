@@ -21,7 +21,7 @@ from torch import Tensor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import Sensing, without_stuck
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.calibration import Calibration, calibration_from_dict, probability
+from tactslip_torch.model.calibration import Platt, calibration_from_dict, probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.onset.evidence import OnsetClassifier
@@ -73,7 +73,7 @@ class AlarmSettings:
     """
 
     hop_samples: int
-    calibration: Calibration
+    calibration: Platt
     rule: Rule
     threshold: float
     target_per_hour: float | None
@@ -184,7 +184,7 @@ class AlarmSettings:
         return cls.from_dict(detector.info[KEY], detector.pool.hand, detector.pool.sample_rate_hz)
 
 
-def calibration_of(detector: SlipDetector) -> tuple[Calibration, float] | None:
+def calibration_of(detector: SlipDetector) -> tuple[Platt, float] | None:
     """What makes a probability of a detector's score, and the share of slip it is stated for.
 
     As ``SlipDetector.calibration``, whose alarm settings are checked.

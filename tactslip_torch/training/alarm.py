@@ -32,7 +32,6 @@ from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.calibration import (
-    Calibration,
     Platt,
     fit_platt,
     probability,
@@ -655,7 +654,7 @@ class CalibratedAlarm:
     def calibrated(
         self,
         rule: Rule,
-        calibration: Calibration,
+        calibration: Platt,
         streams: Sequence[Stream],
         timing: Timing,
         onset: OnsetClassifier | None = None,
@@ -695,7 +694,7 @@ class CalibratedAlarm:
         lead_s = _lead_s(streams, settings, timing, by_onset=True)
         return replace(settings, onset=replace(settings.onset, lead_s=lead_s))
 
-    def _settings(self, rule: Rule, calibration: Calibration, hop_samples: int) -> AlarmSettings:
+    def _settings(self, rule: Rule, calibration: Platt, hop_samples: int) -> AlarmSettings:
         """Without a threshold yet."""
         return AlarmSettings(
             hop_samples,
