@@ -62,7 +62,7 @@ def export_detector(
         wanted = " or ".join(get_args(GraphKind))
         raise ValueError(f"graphs must be {wanted}, or both, got {', '.join(graphs) or 'none'}")
     if "stream" in graphs:
-        AlarmSettings.of(detector)  # says what is missing before there is anything to undo
+        AlarmSettings.of(detector)  # the error comes before there is anything to undo
     detector_sha256 = _detector_digest(detector, source)
     paths = tuple(Path(folder) / FILES[kind] for kind in graphs)
     with ExitStack() as files:
@@ -128,8 +128,8 @@ def stale_graphs(source: Path) -> tuple[Path, ...]:
 
     def is_stale(path: Path) -> bool:
         try:
-            told = json.loads(sidecar_path(path).read_bytes())
-            return bool(told["detector_sha256"] != digest)
+            metadata = json.loads(sidecar_path(path).read_bytes())
+            return bool(metadata["detector_sha256"] != digest)
         except (OSError, ValueError, LookupError, TypeError):
             return True
 

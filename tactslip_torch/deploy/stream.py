@@ -1,9 +1,8 @@
 """The detector that watches a stream, as a graph: ``StreamingDetector.push``.
 
-Samples become decisions, these a statistic (``onset.rules``), and that alarms. What one decision
-hands to the next, and no more, is walked by a ``Scan``, an iteration of which costs as much as
-several nodes do on all decisions together. While nothing speaks for slip, nothing is walked.
-With an onset classifier decisions are its hop apart; its scores are those of ``OnsetStream.push``.
+What one decision hands to the next is walked by a ``Scan``; while nothing speaks for slip, nothing
+is walked. With an onset classifier decisions are its hop apart, with the scores of
+``OnsetStream.push``.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ class Graph:
         return Value(self, name, dtype)
 
     def output(self, name: str, value: Value, shape: Shape | None) -> None:
-        """Hand a value out under a name; without a shape nothing is said of it."""
+        """Hand a value out under a name; without a shape any will do."""
         self._bodies[-1].nodes.append(helper.make_node("Identity", [value.name], [name]))
         self._bodies[-1].outputs.append(_info(name, value.dtype, shape))
 
@@ -101,7 +101,7 @@ class Graph:
         dtype: np.dtype[Any] | None = None,
         **attributes: Any,
     ) -> Value:
-        """The only output of a node; its dtype is that of the first input if not said."""
+        """The only output of a node; its dtype is that of the first input by default."""
         return self.ops(kind, *inputs, dtypes=(dtype,), **attributes)[0]
 
     def ops(
@@ -213,7 +213,7 @@ def _of_itself(kind: str) -> Callable[[Value], Value]:
 def _with_operand(
     kind: str, dtype: np.dtype[Any] | None = None
 ) -> Callable[[Value, Operand], Value]:
-    """A method that is an operator of two inputs of one dtype; the output has it if not said."""
+    """A method that is an operator of two inputs of one dtype; the output has it by default."""
     return lambda value, other: value.graph.op(kind, value, value.meet(other), dtype=dtype)
 
 

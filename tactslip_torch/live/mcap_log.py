@@ -74,7 +74,7 @@ class McapLog(Sink):
         recording: its truth, units and origin, whatever its samples; ``None``: nothing is known.
         units: of the samples, if there is no recording.
         dtype: in which samples are kept.
-        is_live: whether the first sample is of now, where nobody tells times; else it is at 0.
+        is_live: whether the first sample is of now, where samples have no times; else it is at 0.
 
     Raises:
         ValueError: in one line, if ``mcap`` or ``rosbags`` is not installed, or the path is no
@@ -159,7 +159,7 @@ class McapLog(Sink):
             self._writer.add_message(channel, at, self._prefix + row.tobytes(), at)
 
     def decisions(self, decisions: Decisions) -> None:
-        """Write what each of them says, and alarms as events."""
+        """Write a message of each topic for each, and alarms as events."""
         columns: dict[str, Any] = {
             "probability": decisions.probability,
             "statistic": decisions.statistic,

@@ -35,17 +35,17 @@ def watch(
     counts: Counts | None = None,
     events: SimpleQueue[Event] | None = None,
 ) -> Counts:
-    """Watch a source until it ends: each sample through the detector, what it says to all sinks.
+    """Watch a source until it ends: each sample through the detector, decisions to all sinks.
 
     One thread reads, one decides and calls the sinks; this one waits. Where the source is live and
-    ``queue_s`` of samples wait to be decided on, all of them are dropped, counted and told
+    ``queue_s`` of samples wait to be decided on, all of them are dropped, counted and reported
     (``"dropped"``): decisions are late by no more than that. Behind samples that are lacking
     (dropped, or a connection that was lost) times go on as the clock of this machine did, and a new
     stream of decisions begins, if it is more than ``AlarmSettings.hold_s``.
 
-    What is lost is told (``"missing"``): for each stretch of samples that the same channels lack an
-    event with time, number and channels when it ends, and one before if it lasts over 1 s. Of many
-    stretches some are told together.
+    What is lost is reported (``"missing"``): for each stretch of samples that the same channels
+    lack an event with time, number and channels when it ends, and one before if it lasts over 1 s.
+    Of many stretches some are reported together.
 
     However it ends (a signal, or an exception of a sink), the last decisions are flushed and
     all sinks are closed.
@@ -265,11 +265,11 @@ class _Losses:
         self._is_reported = np.zeros(len(names), bool)
         self._next = 0
         self._shift_s = 0.0  # from the sender's clock to that of the stream
-        self._ended: dict[tuple[int, int], list[int]] = {}  # and not told: start, stop, channels
+        self._ended: dict[tuple[int, int], list[int]] = {}  # unreported: start, stop, channels
         self._room, self._since = float(_AT_ONCE), 0
 
     def take(self, first: int, block: Block) -> Iterator[Event]:
-        """What is to be told with these samples.
+        """Events that come with these samples.
 
         Args:
             first: index of the first since the stream's start; what lies before it and behind the

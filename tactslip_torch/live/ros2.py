@@ -139,7 +139,7 @@ class TopicMessages:
         return columns
 
     def _columns_of(self, first: Message) -> TopicColumns:
-        """The hand's channels, whatever they are called, where nobody says which numbers are."""
+        """The hand's channels, whatever they are called, unless the reading names them."""
         if self._how.channels is None:
             with suppress(Refused):
                 of_hand = replace(self._how, channels=self._hand)

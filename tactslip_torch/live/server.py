@@ -95,7 +95,7 @@ class PageServer(Sink):
     event. Samples are binary, little-endian: uint32 1, uint32 rows, float64 index of the first
     since the stream's start, float32 rows by channels. Times count from the stream's start.
 
-    A page that is too slow misses samples, and is told how many; nothing waits for it.
+    A page that is too slow misses samples, and gets their number; nothing waits for it.
 
     A request is refused if it comes from another site's page, or, on loopback, by another name;
     the socket also without the token, where there is one: of all wrong tokens one in half a second

@@ -26,7 +26,7 @@ Array = NDArray[Any]
 _MOST_WAITING = 1 << 20
 """Bytes that a program which reads lines may be behind."""
 _MOST_READERS, _MOST_TAKEN, _IDLE_S = 16, 256, 10.0
-_TOLD_EVERY_S, _TOLD_AT_LEAST_S = 1.0, 60.0
+_REPORT_EVERY_S, _REPORT_AT_LEAST_S = 1.0, 60.0
 
 
 class Block(NamedTuple):
@@ -34,7 +34,7 @@ class Block(NamedTuple):
 
     Attributes:
         samples: ``[n, C]``, float64; NaN for missing ones.
-        time_s: when each was taken, by the sender's clock, ``[n]``, float64; ``None``: not told.
+        time_s: when each was taken, by the sender's clock, ``[n]``, float64; ``None``: not known.
     """
 
     samples: Array
@@ -62,7 +62,7 @@ class Event(NamedTuple):
 
 
 class Notices:
-    """Counts something, to be told in one line, again only after longer and longer times.
+    """Counts something and reports it in one line, again only after longer and longer times.
 
     Args:
         kind: of the event.
@@ -73,10 +73,10 @@ class Notices:
     def __init__(self, kind: str, word: str, now: Callable[[], float] = time.monotonic) -> None:
         self._kind, self._word, self._now = kind, word, now
         self._num, self._why, self._since_s = 0, "", 0.0
-        self._told_s, self._every_s = -np.inf, _TOLD_EVERY_S
+        self._reported_s, self._every_s = -np.inf, _REPORT_EVERY_S
 
     def add(self, num: int, why: str) -> None:
-        """So many more; the first reason is told."""
+        """So many more; the first reason is reported."""
         if not self._num:
             self._why, self._since_s = why, self._now()
         self._num += num
@@ -84,13 +84,13 @@ class Notices:
     def events(self, is_over: bool = True, *, at_once: bool = False) -> Iterator[Event]:
         """The line, if it is due: it is over, or has lasted."""
         now = self._now()
-        is_due = now - self._told_s >= self._every_s
-        is_due &= is_over or now - self._since_s >= _TOLD_EVERY_S
+        is_due = now - self._reported_s >= self._every_s
+        is_due &= is_over or now - self._since_s >= _REPORT_EVERY_S
         if not self._num or not (is_due or at_once):
             return
-        is_new = now - self._told_s > 4 * self._every_s
-        self._every_s = _TOLD_EVERY_S if is_new else min(2 * self._every_s, _TOLD_AT_LEAST_S)
-        self._told_s = now
+        is_new = now - self._reported_s > 4 * self._every_s
+        self._every_s = _REPORT_EVERY_S if is_new else min(2 * self._every_s, _REPORT_AT_LEAST_S)
+        self._reported_s = now
         yield Event(self._kind, f"{counted(self._num, self._word)} {self._why}")
         self._num = 0
 
@@ -416,7 +416,7 @@ class _Reader:
 
 
 def truth_changes(recording: Recording | None) -> list[tuple[float, bool]]:
-    """Whether a recording slips from 0 s on, and from each change on; empty if nobody said."""
+    """Whether a recording slips from 0 s on, and from each change on; empty if it is not known."""
     if recording is None or not recording.has_truth:
         return []
     slides = sorted((*recording.sliding_s, *recording.slip_s))

@@ -55,8 +55,8 @@ class AlarmSettings:
         calibration: from a score to a log likelihood ratio.
         rule: from these to a statistic.
         threshold: at which the statistic raises an alarm.
-        target_per_hour: false alarms an hour that the threshold was set for; ``None``: for no rate,
-            of false alarms.
+        target_per_hour: false alarms an hour that the threshold was set for; ``None``: no
+            rate was set.
         slip_share: how much of a stream is slip; the balance that probabilities are stated for.
         rearm_s: how long the statistic must stay low before the next alarm.
         refractory_s: shortest time between two alarms.
@@ -135,7 +135,7 @@ class AlarmSettings:
         return -(-round(seconds * sample_rate_hz) // self.decision_samples)
 
     def latch_times(self, sample_rate_hz: float) -> dict[str, int]:
-        """What a latch is told, in decisions."""
+        """Times of a latch, in decisions."""
         return {
             "rearm": self.decisions(self.rearm_s, sample_rate_hz),
             "refractory": self.decisions(self.refractory_s, sample_rate_hz),
@@ -296,7 +296,7 @@ class Alarm:
 class Decisions(NamedTuple):
     """One entry per decision, in order; of several streams at once, one row each.
 
-    With an onset classifier there is one every hop of its own, and what is said of bins is that of
+    With an onset classifier there is one every hop of its own, and the columns of bins are those of
     the last bin known by then; before the first bin none is valid. Such a decision is valid where
     the bin is, or where there is fast evidence.
 
@@ -315,7 +315,7 @@ class Decisions(NamedTuple):
         is_on: whether an alarm stands after it: the contact's status, ``[*, m]``.
         onset_score: of fast evidence, ``NOTHING_YET`` where there is none, ``[*, m]``, float64.
         by_onset: whether fast evidence reaches its threshold, ``[*, m]``.
-        channels: names of ``C`` channels, empty where they are not told.
+        channels: names of ``C`` channels, empty where they are not known.
     """
 
     number: Tensor
@@ -460,7 +460,7 @@ class _StreamRule:
 class Decider:
     """Scores in, decisions out; its memory has a fixed size.
 
-    ``decide`` is told of bins alone. With an onset classifier ``join`` makes of these decisions and
+    ``decide`` takes bins alone. With an onset classifier ``join`` makes of these decisions and
     of onset scores those of the alarm: it is raised by whichever reaches its threshold first, and
     stands until both have been low for ``rearm_s``. So bins confirm what fast evidence raised, or
     clear it.
@@ -475,7 +475,7 @@ class Decider:
         look_ahead: samples behind its bin that a decision waits for.
         frame_samples: that must have come before any decision on a bin.
         context_before: samples before its bin that a decision rests on; default: ``look_ahead``.
-        channels: names of the channels, if ``decide`` is told which are lost.
+        channels: names of the channels, if ``decide`` gets which are lost.
         end_s: when so many samples had come, ``[m]``; by default by the sample rate.
 
     Example:
@@ -598,8 +598,8 @@ class Decider:
         assert onset is not None
         scores, known = onset_score.numpy(), self._known
         if known is None:  # before all bins, number -1
-            says_nothing = [math.inf, *[math.nan] * 4, 0.0, 0.0, *[0.0] * len(self._channels)]
-            known = np.multiply.outer(says_nothing, np.ones((*scores.shape[:-1], 1)))
+            no_bin = [math.inf, *[math.nan] * 4, 0.0, 0.0, *[0.0] * len(self._channels)]
+            known = np.multiply.outer(no_bin, np.ones((*scores.shape[:-1], 1)))
             num_streams, hop = math.prod(scores.shape[:-1]), onset.evidence.hop_samples
             self._first_known = -1
             self._alarm_rules = self._rules_of(None, 1.0, hop, num_streams)
@@ -612,16 +612,16 @@ class Decider:
         last = (samples - self._first) // settings.hop_samples
         last[samples < max(self._frame, self._first)] = -1
         at = last - self._first_known
-        said = known.take(at, -1)
+        latest = known.take(at, -1)
         if len(at) and at[-1]:
             known, self._first_known = known[..., at[-1] :].copy(), int(last[-1])
         self._known, self._hop = known, self._hop + len(number)
-        began_s, of_bin = said[0], said[1:5].astype(bins.score.numpy().dtype)
+        began_s, of_bin = latest[0], latest[1:5].astype(bins.score.numpy().dtype)
         score, llr, stated, statistic = torch.from_numpy(of_bin).unbind()
         by_onset = scores >= onset.threshold
         with np.errstate(invalid="ignore"):  # NaN is not high
             is_high = by_onset | (of_bin[3] >= of_bin.dtype.type(settings.threshold))
-        is_valid = (said[5] > 0) | (scores > NOTHING_YET)
+        is_valid = (latest[5] > 0) | (scores > NOTHING_YET)
         rows = np.where(is_valid, is_high * 1.0, np.nan)
         rows = rows.reshape(len(self._alarm_rules), len(number))
         walked = [rule.walk(row, 0) for row, rule in zip(rows, self._alarm_rules, strict=True)]
@@ -639,8 +639,8 @@ class Decider:
             stated,
             statistic,
             torch.from_numpy(is_valid),
-            torch.from_numpy(said[6] > 0),
-            torch.from_numpy(said[7:] > 0).movedim(0, -1),
+            torch.from_numpy(latest[6] > 0),
+            torch.from_numpy(latest[7:] > 0).movedim(0, -1),
             torch.from_numpy(alarms),
             torch.from_numpy(standing),
             onset_score,

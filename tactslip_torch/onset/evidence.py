@@ -1,19 +1,14 @@
-"""Fast evidence of a slip's beginning, every few milliseconds, and the classifier on it.
-
-When skin lets go, fast channels ring and the shear that slow channels carry falls. Both are told
-from taps, motors and mains by how they spread over channels and by what was there a moment before:
+"""Fast evidence of a slip's beginning, a column vector every few milliseconds, and its classifier.
 
 - *fast channels*: power of four band filters over 10, 25 and 50 ms, as a log ratio to the channel's
-  own floor, the mean of the log power over the last second;
+  noise floor, the mean of the log power over the last second;
 - *slow channels*: steps between means of neighbouring stretches of 10 to 100 ms, their size and,
-  with their sign, how far they stand out of silence: a grip presses, a slip relieves;
+  with their sign, how far they exceed the usual step;
 - each as mean, largest and smallest over the channels of its kind.
 
 Three filters are differences of neighbouring means (Haar wavelets); the fourth first takes away the
-mean of the last periods of the mains, a comb that no harmonic passes. The classifier is the kernel
-machine of degree 2, as for bins; its score is averaged over three hops. All is causal, and of a
-block of samples nothing but its powers and means is kept. The first second of a stream has no
-floor, and so no evidence.
+mean of the last periods of the mains (a comb). The classifier is a kernel machine of degree 2 whose
+score is averaged over three hops. All is causal; the first second of a stream has no evidence.
 """
 
 from __future__ import annotations
@@ -317,7 +312,7 @@ class OnsetClassifier:
     """Whether a slip begins, by the evidence of each hop: at least the threshold says yes.
 
     Args:
-        evidence: what is told of a hop.
+        evidence: what a hop is described by.
         scaler: of its columns.
         head: the machine on scaled columns.
         threshold: of its score.

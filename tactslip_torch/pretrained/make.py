@@ -26,7 +26,7 @@ SCENE = Scene(
     "wood", seed=7, session="sample", strokes=(Stroke(40.0, 40.0, pause_s=1.2),), tail_s=0.4
 )
 _LEFT_OUT = ("validation", "train_recordings", "solve")
-"""What a detector says of its training that is long, and is made again by training again."""
+"""Metadata of the training that are long, and made again by training again."""
 
 
 def make_detector(run: Path) -> None:

@@ -1,12 +1,9 @@
 """The alarm of a fitted detector, set on recordings that it was not trained on.
 
 ``CalibratedAlarm`` fits the onset classifier and sets its threshold and that of bins within a
-budget of false alarms. The recordings that learn, those that calibrate and those that test are
-apart; held-out materials set nothing.
-
-``DebouncedAlarm`` is for sets with too little recorded without slip to count false alarms on: k of
-the last n decisions say slip, by the calibration of the held-out scores that training chose by.
-How often it is false is not known.
+budget of false alarms; recordings that learn, calibrate and test are apart. ``DebouncedAlarm`` is
+for sets with too little recorded without slip to count false alarms: k of the last n decisions
+speak for slip, and the rate of false alarms is not known.
 """
 
 from __future__ import annotations
@@ -906,7 +903,7 @@ class DebouncedAlarm:
         hop_ms: distance of two decisions; ``None`` for half a bin.
         k: so many decisions must say slip,
         n: of so many.
-        probability: at which a decision says slip.
+        probability: from which a decision speaks for slip.
         slip_share: how much of a stream is slip, for probabilities.
         rearm_s: how long the statistic must stay low before the next alarm.
         refractory_s: shortest time between two alarms.

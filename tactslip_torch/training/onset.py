@@ -1,13 +1,8 @@
 """Fits the onset classifier: hops in which a slip begins against all that is no beginning.
 
-Negatives are what robots hear: holding, handling (taps, grips, the carrying arm), machines, mains,
-the moment before an onset, and steady sliding, which is the business of the classifier of bins.
-Each of these, of each scene, weighs alike, and so do onsets of each scene. The hops of each kind
-that are most like a slip are a kind of their own: a knock while a grip is changed is rare, and what
-sets the threshold. A first machine, fitted on some recordings, tells which they are.
-
-The penalty, the comb and the columns were chosen by leaving out each seen material: slips of it
-that are found at thresholds set on the others.
+Negatives are holding, handling (taps, grips, the carrying arm), machines, mains, the moment before
+an onset, and steady sliding. Each of these, of each scene, weighs alike, and so do onsets of each
+scene. Hard negatives of a first pass, fitted on some recordings, get their own class weight.
 """
 
 from __future__ import annotations
