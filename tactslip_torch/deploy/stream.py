@@ -140,7 +140,7 @@ def stream_graph(
         """Statistics, where runs of positive ratios began, and what rule and ``lost`` are then."""
 
         def simply() -> list[Value]:
-            statistic, after = statistic_of(settings.rule, llr, of_rule)
+            statistic, after = _statistic_of(settings.rule, llr, of_rule)
             return [statistic, _latest(llr <= 0.0, run, number + 1.0), after, lost]
 
         def with_gaps() -> list[Value]:
@@ -566,7 +566,7 @@ def _rows(rows: Value, start: Value, places: range) -> Value:
 # Rules and alarms ------------------------------------------------------------------------------
 
 
-def statistic_of(
+def _statistic_of(
     rule: Rule, llr: Value, memory: Value, anew: Value | None = None
 ) -> tuple[Value, Value]:
     """The statistic of each decision as the rule's ``scan`` makes it, and the memory behind.
@@ -663,12 +663,12 @@ class _Gaps(NamedTuple):
         return graph.op("Gather", graph.concat(before, values, axis=0), place, axis=0)
 
     def statistic_of(self, rule: Rule, llr: Value, memory: Value) -> tuple[Value, Value]:
-        """As ``statistic_of``; NaN where not valid."""
+        """As ``_statistic_of``; NaN where not valid."""
         graph = llr.graph
 
         def some() -> list[Value]:
             own, anew = self.valid_of(llr), self.valid_of(self.begins_anew)
-            found, after = statistic_of(rule, own, memory, anew)
+            found, after = _statistic_of(rule, own, memory, anew)
             return [self.spread(found, graph.constant([math.nan], llr.dtype)), after]
 
         def none() -> list[Value]:

@@ -120,7 +120,7 @@ class McapLog(Sink):
             text = self._types.definition(kind).encode()
             schema = self._writer.register_schema(kind, "ros2msg", text)
             self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
-        layout = foxglove_layout(hand, settings, known.units)
+        layout = _foxglove_layout(hand, settings, known.units)
         with whole_file(path.with_suffix(".foxglove.json")) as beside:
             beside.write_text(json.dumps(layout, indent=1) + "\n", encoding="utf-8")
         for time_s, is_slip in truth_changes(recording):
@@ -233,7 +233,7 @@ class McapLog(Sink):
 # The layout --------------------------------------------------------------------------------------
 
 
-def foxglove_layout(hand: HandLayout, settings: AlarmSettings, units: str = "V") -> dict[str, Any]:
+def _foxglove_layout(hand: HandLayout, settings: AlarmSettings, units: str = "V") -> dict[str, Any]:
     """Panels for such a file, as Foxglove imports them (Layouts, Import from file).
 
     A plot of the channels of each kind, the probability, the statistic and, with an onset

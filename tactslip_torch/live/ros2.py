@@ -206,9 +206,9 @@ class RosTopic:
         self._node = self._rclpy.create_node("tactslip")
         self._topic = self._node.resolve_topic_name(topic)
 
-    def publisher(self) -> RosPublisher:
+    def publisher(self) -> _Publisher:
         """The sink that publishes decisions; closing it ends the node."""
-        return RosPublisher(self._node)
+        return _Publisher(self._node)
 
     def close(self) -> None:
         """End the iteration."""
@@ -245,7 +245,7 @@ class RosTopic:
             executor.remove_node(self._node)
 
 
-class RosPublisher(Sink):
+class _Publisher(Sink):
     """A sink: decisions as messages of the topics above, published by a node."""
 
     def __init__(self, node: Any) -> None:
