@@ -130,15 +130,12 @@ class AlarmSettings:
         of_onset = {} if self.onset is None else {"onset_score": self.onset.threshold}
         return {"statistic": self.threshold} | of_onset
 
-    def decisions(self, seconds: float, sample_rate_hz: float) -> int:
-        """A length of time in decisions, rounded up."""
-        return -(-round(seconds * sample_rate_hz) // self.decision_samples)
-
     def latch_times(self, sample_rate_hz: float) -> dict[str, int]:
-        """Times of a latch, in decisions."""
+        """Times of a latch, in decisions, rounded up."""
+        seconds = {"rearm": self.rearm_s, "refractory": self.refractory_s}
         return {
-            "rearm": self.decisions(self.rearm_s, sample_rate_hz),
-            "refractory": self.decisions(self.refractory_s, sample_rate_hz),
+            name: -(-round(time_s * sample_rate_hz) // self.decision_samples)
+            for name, time_s in seconds.items()
         }
 
     def to_dict(self) -> dict[str, Any]:
