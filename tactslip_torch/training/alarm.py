@@ -16,7 +16,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import groupby, product
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,7 +90,6 @@ _STEP = 1.01  # by which a threshold is raised that a capped sum does not keep
 _LEAST_THRESHOLD = 1e-30  # at 0 a sum would stand for ever
 _NUM_POINTS = 25  # of a threshold curve, at most
 _NUM_TRIED = 100
-_TOGETHER = 256  # streams decided at once
 _PUSHES = 200  # timed
 _FULL_S = 2.0  # of stream, until memories are full
 _OF_BINS = 0.5  # of what a budget allows, at most, that bins alone raise
@@ -215,33 +214,17 @@ def labelled(streams: Sequence[Stream], timing: Timing) -> tuple[Tensor, Tensor]
 def decide(
     streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
 ) -> Iterator[tuple[Stream, Decisions]]:
-    """What a detector decides in each stream; those of one length are decided together.
+    """What a detector decides in each stream; the shortest streams first.
 
     ``settings.hop_samples`` may be a multiple of the timing's: so many decisions are left out.
-
-    Yields:
-        Every stream with its decisions, in order of length.
     """
     step = settings.hop_samples // timing.hop_samples
-    for _, group in groupby(sorted(streams, key=_length), key=_length):
-        alike = list(group)
-        for first in range(0, len(alike), _TOGETHER):
-            part = alike[first : first + _TOGETHER]
-            decider = Decider(
-                settings, timing.sample_rate_hz, timing.bin_samples, timing.look_ahead
-            )
-            made = decider.decide(
-                torch.stack([stream.score[::step] for stream in part]),
-                torch.stack([stream.is_valid[::step] for stream in part]),
-            )
-            if settings.onset is not None:
-                made = decider.join(made, torch.stack([stream.onset_score for stream in part]))
-            for row, stream in enumerate(part):
-                yield stream, made.row(row)
-
-
-def _length(stream: Stream) -> tuple[int, int]:
-    return len(stream.score), len(stream.onset_score)
+    for stream in sorted(streams, key=lambda own: (len(own.score), len(own.onset_score))):
+        decider = Decider(settings, timing.sample_rate_hz, timing.bin_samples, timing.look_ahead)
+        made = decider.decide(stream.score[::step], stream.is_valid[::step])
+        if settings.onset is not None:
+            made = decider.join(made, stream.onset_score)
+        yield stream, made
 
 
 def event_record(stream: Stream, decisions: Decisions) -> EventRecord:
