@@ -323,15 +323,6 @@ def test_bad_settings_are_refused_in_one_line(make, message):
     assert "\n" not in str(caught.value)
 
 
-# Gradients ---------------------------------------------------------------------------------------
-
-
-def test_gradients_are_those_of_differences():
-    evidence = evidence_of("GFFG", rate=200.0, hop=1)
-    x = samples_of(evidence, 1.1)[:, -evidence.context - evidence.memory :].requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: columns_of(evidence, x)[0], (x,), fast_mode=True)
-
-
 FILMS = HandLayout.paper24().indices("PVDF")
 SCORES = {"fast_band_power": fast_band_power, "largest_detail": largest_detail}
 

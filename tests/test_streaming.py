@@ -17,7 +17,6 @@ from test_rules import ORACLES, by_hand
 
 from tactslip_torch.features.sensing import without_stuck
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.native import reason_unavailable
 from tactslip_torch.onset.decisions import (
     AlarmSettings,
     Decider,
@@ -25,8 +24,7 @@ from tactslip_torch.onset.decisions import (
     score_stream,
     stream_statistic,
 )
-from tactslip_torch.onset.evidence import OnsetStream
-from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN
+from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.streaming import StreamingDetector
 
 HOP = 20
@@ -181,27 +179,6 @@ def test_fast_evidence_leaves_out_channels_that_are_masked(masked):
     found = in_pieces(stream, samples, range(0, 6000, 130)).onset_score
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
     assert bool((found > -1e30).any()) == (len(masked) < 2)
-
-
-@pytest.mark.parametrize("backend", ["native", "torch"])
-def test_fast_evidence_that_is_lost_is_as_if_it_had_not_been(backend):
-    """Up to ``hold_s`` of samples; beyond, the next second has none, as at the beginning."""
-    if backend == "native" and reason_unavailable():
-        pytest.skip(reason_unavailable())
-    onset, hop = WITH_ONSET.onset, 10
-    samples = signal(9000, 6)
-    for num_lost, is_kept in ((1, True), (500, True), (560, False)):
-        holed = samples.clone()
-        holed[2:, 4000 : 4000 + num_lost] = torch.nan
-        lost = range(400, -(-(4000 + num_lost + onset.evidence.context) // hop))
-        found = OnsetStream(onset, backend=backend).push(holed)
-        assert (found[list(lost)] == NOTHING_YET).all()
-        expected = onset.score_recording(samples)[:400]
-        torch.testing.assert_close(found[:400], expected, rtol=0, atol=1e-8)
-        after = found[lost.stop :]
-        first = 0 if is_kept else onset.evidence.memory - 1 + 2
-        assert (after[:first] == NOTHING_YET).all()
-        assert (after[first:] > NOTHING_YET).all()
 
 
 # Times ------------------------------------------------------------------------------------------
