@@ -32,10 +32,9 @@ from typing import Any
 
 import numpy as np
 
-from tactslip_torch.data.formats import Reading
+from tactslip_torch.data.formats import Reading, Refused
+from tactslip_torch.data.formats._inference import SECONDS, epoch_unit, time_unit_in
 from tactslip_torch.data.formats._messages import Message, Topic, TopicColumns, Types
-from tactslip_torch.data.formats._names import SECONDS, epoch_unit, time_unit_in
-from tactslip_torch.data.formats._reading import Refused
 from tactslip_torch.live.sinks import Block, Event, Sink
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import Decisions
