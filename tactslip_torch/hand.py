@@ -1,7 +1,6 @@
 """The hand: which tactile channels there are, in file order, and where each one sits.
 
-Section III-A of the paper (REFERENCE.md section 1). Everything that depends on the number or the
-kind of channels asks a ``HandLayout``, so another hand is another layout and nothing else.
+``HandLayout.paper24`` is the hand of He et al. 2026, arXiv:2603.18370, section III-A.
 """
 
 from __future__ import annotations

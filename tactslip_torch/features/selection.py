@@ -1,10 +1,6 @@
-"""Which features to keep: a t-test on class moments (paper section IV-D, REFERENCE.md section 5).
+"""Ranking of features by a t-test on class moments (paper section IV-D).
 
-Moments are gathered in passes over recordings and merge, so a ranking needs one look at each bin,
-and the ranking of a validation fold is a merge of what the other groups gathered.
-
-``rank_distinct``, ``rank_weighted`` and ``rank_per_cost`` know more than each feature's own score:
-what repeats, and what costs. Any number of threads gives the same ranking.
+Moments are gathered in passes over recordings and merge.
 """
 
 from __future__ import annotations

@@ -1,18 +1,9 @@
-"""The Savitzky-Golay filter of a hand, the first step (paper IV-B, REFERENCE.md section 2).
+"""Savitzky-Golay filters of a hand's channels (paper section IV-B), and bins of recordings.
 
-Order 1 is a moving average: -3 dB at 81 Hz for the 11-sample frame of the PVDF channels and at
-17 Hz for the 51-sample frame of the SG channels. Where in its frame a sample lies is a choice of
-noise and delay. Centred, it looks half a frame ahead: 2.5 ms and 12.5 ms. Causal (ours), the
-polynomial of the frame behind a sample is evaluated at that sample, the frame's last: no
-look-ahead, but at order 1 nearly four times the variance of white noise comes through, some tones
-below the corner are raised by a third, and the corners move to 200 Hz and 44 Hz. Trailing (ours), a
-sample gets what the sample half a frame before it gets if centred: no look-ahead and no more noise,
-but half a frame late.
-
-``savgol_filter`` is the filter of one frame; ``ChannelFilter`` has a frame of its own for every
-channel, of whole recordings and of bins, with Savitzky-Golay's weights or others.
-
-Cutting recordings into bins, the paper's 50 ms analysis unit (REFERENCE.md section 2).
+Order 1 is a moving average: -3 dB at 81 Hz for 11 samples, 17 Hz for 51, at 2 kHz. Centred, it
+looks half a frame ahead. Causal, the polynomial of the frame behind a sample is evaluated at its
+last sample: no look-ahead, and nearly four times the variance of white noise. Trailing, a sample
+gets what the sample half a frame before it gets if centred.
 """
 
 from __future__ import annotations
