@@ -1,13 +1,8 @@
-"""Which bins of a recording are slip and which are not (REFERENCE.md section 1, *Labels*).
+"""Bins of a recording and their labels, slip or not.
 
 ``whole_slide`` is what the authors' scripts do and the published confusion matrices fit: one second
 of non-slip before each onset, the whole slide as slip, the onset moved 10 ms earlier.
-``half_second`` is what the paper's text says: half a second on either side of each onset. Stretches
-in which the hand is handled without slip, which the paper did not record, are non-slip in both, and
-those that are known to be slip, but not since when, are slip in both.
-
-Bins that hold both labels are left out (``assign="whole"``), or get the label of most of their
-samples or of their last one, as sets of sliding windows are labelled.
+``half_second`` is what the paper's text says: half a second on either side of each onset.
 """
 
 from __future__ import annotations
@@ -132,8 +127,8 @@ def label_bins(
         hop = whole_samples(rule.hop_ms, sample_rate_hz, "labels.hop_ms")
     num_samples = round(duration_s * sample_rate_hz)
     strokes = _strokes(rule, onsets_s, sliding_s, num_samples, sample_rate_hz)
-    told = [(stretch, False) for stretch in non_slip_s] + [(stretch, True) for stretch in slip_s]
-    stretches = [(*_samples_of(s, num_samples, sample_rate_hz), is_slip) for s, is_slip in told]
+    given = [(stretch, False) for stretch in non_slip_s] + [(stretch, True) for stretch in slip_s]
+    stretches = [(*_samples_of(s, num_samples, sample_rate_hz), is_slip) for s, is_slip in given]
     if rule.assign != "whole":
         return _windows(rule, strokes, stretches, bin_samples, hop, num_samples)
     lead = 0 if not strokes else strokes[0].edge - strokes[0].first

@@ -1,10 +1,7 @@
-"""Who is trained on and who is not (REFERENCE.md section 5, *Split*).
+"""Splits: which recordings, or bins, are trained on, tested on, and held out as unseen.
 
-A split gives every bin of every recording a role. The default groups by cycle, stratified by
-material: neighbouring bins of one slide never stand on both sides. Of a set with several kinds of
-scenes, a cycle is on one side in all of them; cycles of different sessions have nothing to do with
-each other. The authors' split, random over bins, is here to show
-what that leaks.
+The default groups by cycle, stratified by material: neighbouring bins of one slide never stand on
+both sides. Cycles of different sessions are drawn apart.
 """
 
 from __future__ import annotations
