@@ -334,7 +334,8 @@ def unfolded(opened: Opened, how: Reading) -> Opened:
         )
     stems = [_INDEX.sub("", name) for name in opened.names or ()]
     named: dict[_RowOrder, tuple[str, ...]] = {}
-    for order, names in (("channel", stems[::k]), ("time", stems[: num // k])):
+    starts: dict[_RowOrder, list[str]] = {"channel": stems[::k], "time": stems[: num // k]}
+    for order, names in starts.items():
         wanted = [n for n in names for _ in range(k)] if order == "channel" else names * k
         if names and all(names) and len(set(names)) == len(names) and stems == wanted:
             named[order] = tuple(names)
