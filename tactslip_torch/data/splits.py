@@ -1,7 +1,7 @@
-"""Splits: which recordings, or bins, are trained on, tested on, and held out as unseen.
+"""Splits of recordings into training, test and held-out ones.
 
-The default groups by cycle, stratified by material: neighbouring bins of one slide never stand on
-both sides. Cycles of different sessions are drawn apart.
+The default groups by cycle, stratified by material; the authors' split, random over bins, shows
+what that leaks.
 """
 
 from __future__ import annotations
