@@ -33,7 +33,7 @@ from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import calibration_of
-from tactslip_torch.own_files import FORGED, MOST_BIN_SAMPLES, load_table, save_table
+from tactslip_torch.package_files import DAMAGE_ERRORS, MOST_BIN_SAMPLES, load_table, save_table
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.wavelet import SpectrumMethod
 from tactslip_torch.training.plan import Plan, TrainingPass, plan_detector, solve_metadata
@@ -621,7 +621,7 @@ class SlipClassifier(ClassifierMixin, _OfWindows):  # type: ignore[misc]
             if metadata["names"]:
                 made.feature_names_in_ = np.array(metadata["names"], dtype=object)
             return made
-        except FORGED as error:
+        except DAMAGE_ERRORS as error:
             raise ValueError(f"{os.fspath(path)} is a damaged classifier: {error}") from error
 
     def _take(self, info: dict[str, Any], labels: Any, num: int, columns: Sequence[Any]) -> None:

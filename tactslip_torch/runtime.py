@@ -63,14 +63,14 @@ def for_each(function: Callable[[Item], object], items: Iterable[Item]) -> None:
         >>> squares
         tensor([ 0.,  1.,  4.,  9., 16.])
     """
-    in_parts(function, list(items))
+    thread_map(function, list(items))
 
 
-def in_parts(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+def thread_map(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """What ``function`` returns for every item, in their order, called as by ``for_each``.
 
     Example:
-        >>> in_parts(torch.sum, torch.arange(6).split(4))
+        >>> thread_map(torch.sum, torch.arange(6).split(4))
         [tensor(6), tensor(9)]
     """
     number = torch.get_num_threads()

@@ -12,7 +12,7 @@ import torch
 from hypothesis import HealthCheck, is_hypothesis_test, seed, settings
 from matplotlib.figure import Figure
 
-from tactslip_torch.native import why_not
+from tactslip_torch.native import reason_unavailable
 
 settings.register_profile(
     "default",
@@ -40,7 +40,7 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.loadscopereorder = False  # the order is that of slow_files_first
         config.option.maxworkerrestart = "0"  # a crash ends the run and is told, in place of a wait
     if not hasattr(config, "workerinput"):
-        why_not()  # builds the native engine of a checkout, once, and not in the midst of a test
+        reason_unavailable()  # builds the native engine once, before any test
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

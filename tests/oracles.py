@@ -345,10 +345,10 @@ def assert_manners(
     assert operator(x[:0]).shape == (0, *whole.shape[1:])
 
 
-def pooled(values: np.ndarray, in_use: np.ndarray, knee: float, statistic: str) -> float:
+def pooled(values: np.ndarray, in_use: np.ndarray, scale: float, statistic: str) -> float:
     """A statistic over channels of the compressed values ``[m]`` of those in use."""
     x = values[in_use]
-    y = knee * np.sign(x) * np.log(1 + np.abs(x) / knee)
+    y = scale * np.sign(x) * np.log(1 + np.abs(x) / scale)
     if statistic == "mean":
         return float(np.mean(y))
     if statistic == "std":

@@ -57,8 +57,8 @@ def small_detector(
     machine = QuadraticForm(bend + bend.T, linear, torch.tensor(0.0, dtype=torch.float64))
     middle = -machine(centre).median()  # so that both decisions occur
     machine = QuadraticForm(bend + bend.T, linear, middle)
-    facts = {"simulated": True}
-    return SlipDetector(pool, channel_filter, selected, scaler, machine, facts, backend=backend)
+    metadata = {"simulated": True}
+    return SlipDetector(pool, channel_filter, selected, scaler, machine, metadata, backend=backend)
 
 
 def with_floors(detector: SlipDetector, min_alive: int, stuck_samples: int = 150) -> SlipDetector:

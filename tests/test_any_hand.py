@@ -49,7 +49,7 @@ def test_a_detector_tells_slip_and_comes_back_from_its_file(name, tmp_path):
     detector.save(one)
     loaded = SlipDetector.load(one, backend="auto")
     assert loaded.pool.hand == detector.pool.hand == hand.layout()
-    assert loaded.pool.facts() == detector.pool.facts()
+    assert loaded.pool.config() == detector.pool.config()
     assert loaded.channel_filter.config() == detector.channel_filter.config()
     assert torch.equal(loaded.score_raw(samples), score)
     loaded.save(again)
@@ -89,7 +89,7 @@ def test_train_takes_a_hand_from_its_configuration(tmp_path):
     assert train(config, run)["unseen/balanced_accuracy"] > 0.6
     detector = SlipDetector.load(run / "detector.pt")
     assert detector.pool.hand == hand.layout()
-    assert detector.pool.facts() == hand.pool().facts()
+    assert detector.pool.config() == hand.pool().config()
     assert detector.channel_filter.window_lengths == hand.channel_filter().window_lengths
     assert json.loads((run / "model.onnx.json").read_text())["unit"] == "counts"
     assert not json.loads((run / "metrics.json").read_text())["is_papers_hand"]

@@ -7,7 +7,7 @@ ROOT = Path(__file__).parents[1] / "tactslip_torch"
 _LOWER = ("hand", "native", "signals", "data", "features", "model")
 ARROWS = {
     "runtime": (),
-    "own_files": ("hand",),
+    "package_files": ("hand",),
     "hand": (),
     "native": (),
     "signals": ("hand",),
@@ -22,7 +22,7 @@ ARROWS = {
     "analysis": (*_LOWER, "onset", "deploy", "training"),
     "report": (),
 }
-"""Importer: what it may import beside itself, ``runtime`` and ``own_files``; others may all."""
+"""Importer: what it may import beside itself, ``runtime`` and ``package_files``; others may all."""
 KNOWN = (
     ("data.file_recordings", "signals.resampling"),
     ("deploy.check", "simulation."),
@@ -48,6 +48,6 @@ def test_parts_import_along_the_arrows() -> None:
             other = part_of(name)
             if any(module.startswith(a) and name.startswith(b) for a, b in KNOWN):
                 continue
-            if part in ARROWS and other not in (part, "runtime", "own_files", *ARROWS[part]):
+            if part in ARROWS and other not in (part, "runtime", "package_files", *ARROWS[part]):
                 wrong.add(f"{module} -> {node.module}")
     assert not wrong, "\n".join(sorted(wrong))

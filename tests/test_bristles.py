@@ -22,7 +22,7 @@ from tactslip_torch.simulation._bristles import (
     stage_times_s,
 )
 
-NO_ENGINE = native.why_not()
+NO_ENGINE = native.reason_unavailable()
 needs_engine = pytest.mark.skipif(bool(NO_ENGINE), reason=NO_ENGINE)
 BACKENDS = ("torch", "native")
 NATIVE = pytest.param("native", marks=needs_engine)

@@ -8,7 +8,7 @@ from tactslip_torch import FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.model.detector import FORMAT
 from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.own_files import load_table, save_table
+from tactslip_torch.package_files import load_table, save_table
 from tactslip_torch.signals.filtering import ChannelFilter
 
 PER_KIND = 3
@@ -55,9 +55,9 @@ def random_detector(seed=0, kernel=None, compress=False):
 
 VARIANTS = {
     "quadratic form": {},
-    "knee": {"compress": True},
+    "compression": {"compress": True},
     "kernel sum": {"kernel": Polynomial(2, 0.5)},
-    "kernel sum of degree 1 and knee": {"kernel": Polynomial(1, 0.5), "compress": True},
+    "kernel sum of degree 1 and compression": {"kernel": Polynomial(1, 0.5), "compress": True},
 }
 """Arguments of ``random_detector`` for every kind of head and scaler."""
 
@@ -75,9 +75,9 @@ def test_the_score_is_the_head_of_scaled_features_and_the_same_from_a_file(varia
     detector, samples = random_detector(**VARIANTS[variant]), noise(5)
     bins = detector.channel_filter.valid(samples)
     features = detector.pool(bins).numpy()[:, list(detector.selected)]
-    if detector.scaler.knee is not None:
-        knee = detector.scaler.knee.numpy()
-        features = np.sign(features) * knee * np.log1p(np.abs(features) / knee)
+    if detector.scaler.compression is not None:
+        compression = detector.scaler.compression.numpy()
+        features = np.sign(features) * compression * np.log1p(np.abs(features) / compression)
     low, high = detector.scaler.minimum.numpy(), detector.scaler.maximum.numpy()
     z = np.clip(2 * (features - low) / (high - low) - 1, -1, 1)
     state = {name: value.numpy() for name, value in detector.head.state_dict().items()}
@@ -137,16 +137,16 @@ NO_DETECTORS = [
 ]
 
 
-@pytest.mark.parametrize(("facts", "state"), NO_DETECTORS)
-def test_what_describes_no_detector_is_refused_in_one_line(facts, state, detector, tmp_path):
+@pytest.mark.parametrize(("metadata", "state"), NO_DETECTORS)
+def test_what_describes_no_detector_is_refused_in_one_line(metadata, state, detector, tmp_path):
     """Whole files, so the digest fits; another program wrote them."""
     path = tmp_path / "detector.pt"
     detector.save(path)
     own, kept = load_table(path, FORMAT)
-    if facts != []:
-        whole = own | facts | {"pool": own["pool"] | facts.get("pool", {})}
-        facts = {key: value for key, value in whole.items() if value is not ...}
-    save_table(path, FORMAT, facts, kept | state)
+    if metadata != []:
+        whole = own | metadata | {"pool": own["pool"] | metadata.get("pool", {})}
+        metadata = {key: value for key, value in whole.items() if value is not ...}
+    save_table(path, FORMAT, metadata, kept | state)
     with pytest.raises(ValueError, match="is damaged: "):
         SlipDetector.load(path)
 
@@ -181,7 +181,7 @@ def test_many_bins_are_judged_as_few_are(method):
 
 @pytest.mark.parametrize("head", ["quadratic", "watched", "constant feature"])
 def test_one_bin_is_judged_as_many_are(head):
-    """By NumPy or by modules: with a NaN, a dead channel, values beyond any knee, both dtypes."""
+    """By NumPy or by modules: with a NaN, a dead channel, values beyond any range, both dtypes."""
     detector, samples = random_detector(), noise(8)
     if head == "constant feature":
         detector.scaler.minimum[3] = detector.scaler.maximum[3]

@@ -42,7 +42,7 @@ from tactslip_torch.live import (
     StandardInput,
     TcpClient,
     TcpListener,
-    page_facts,
+    page_metadata,
     source_of,
     watch,
 )
@@ -729,7 +729,7 @@ def serve(detector, folders):
 
     def start(**options):
         stream = StreamingDetector(detector)
-        facts = page_facts(detector, stream.settings)
+        facts = page_metadata(detector, stream.settings)
         options = {"source": "test", "simulated": True, "counts": Counts()} | options
         made.append(PageServer(folders, facts, **options))
         return made[-1]

@@ -11,10 +11,10 @@ from sklearn.kernel_ridge import KernelRidge
 
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.moments import FORMAT, SufficientStats
-from tactslip_torch.own_files import load_table, save_table
+from tactslip_torch.package_files import load_table, save_table
 
 NUM = 4
-ABOUT = {"hand": {"name": "paper24", "channels": ["SG1", "PVDF1"]}, "scaler": "range"}
+METADATA = {"hand": {"name": "paper24", "channels": ["SG1", "PVDF1"]}, "scaler": "range"}
 
 
 def make_batches(num=8, seed=0, most=12):
@@ -30,8 +30,8 @@ def make_batches(num=8, seed=0, most=12):
     return batches
 
 
-def stats_of(batches, about=ABOUT, degree=2):
-    stats = SufficientStats(NUM, about, degree)
+def stats_of(batches, metadata=METADATA, degree=2):
+    stats = SufficientStats(NUM, metadata, degree)
     for batch in batches:
         stats.update(*batch)
     return stats
@@ -40,7 +40,7 @@ def stats_of(batches, about=ABOUT, degree=2):
 def assert_same(one, other):
     torch.testing.assert_close(one.sums, other.sums, rtol=1e-12, atol=1e-12)
     assert torch.equal(one.count, other.count)
-    assert (one.seen_batches, one.about) == (other.seen_batches, other.about)
+    assert (one.seen_batches, one.metadata) == (other.seen_batches, other.metadata)
 
 
 # Machines -------------------------------------------------------------------------------------
@@ -143,8 +143,8 @@ def test_a_batch_that_is_refused_changes_nothing(place, value, message):
 def test_sums_that_do_not_merge_stay_as_they_are():
     stats = stats_of(make_batches())
     for other, message in (
-        (SufficientStats(3, ABOUT), "num_features: 4 and 3"),
-        (SufficientStats(NUM, ABOUT | {"scaler": "x"}), "scaler: range and x"),
+        (SufficientStats(3, METADATA), "num_features: 4 and 3"),
+        (SufficientStats(NUM, METADATA | {"scaler": "x"}), "scaler: range and x"),
         (stats, "8 batches are in both statistics, such as 'M0/0'"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -172,7 +172,7 @@ def test_one_class_is_not_enough_and_neither_is_no_feature():
         stats.solve(1.0)
     with pytest.raises(ValueError, match="1 feature or more and degree 1 or 2, got 0 and 2"):
         SufficientStats(0)
-    with pytest.raises(ValueError, match="about must be what JSON holds"):
+    with pytest.raises(ValueError, match="metadata must be what JSON holds"):
         SufficientStats(1, {"x": float("nan")})
 
 

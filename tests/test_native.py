@@ -24,8 +24,14 @@ from tactslip_torch.native import build
 HAND = some_hand("GFF")
 POOL = FeaturePool(HAND, backend="torch")
 NAMES = POOL.names
-LEVELS = ("v2", "v3", "v4") if not native.why_not() and native.instruction_set() != "v1" else ()
-needs_engine = pytest.mark.skipif(bool(native.why_not()), reason=native.why_not())
+LEVELS = (
+    ("v2", "v3", "v4")
+    if not native.reason_unavailable() and native.instruction_set() != "v1"
+    else ()
+)
+needs_engine = pytest.mark.skipif(
+    bool(native.reason_unavailable()), reason=native.reason_unavailable()
+)
 
 
 def made(pool, selected=None, backend="auto"):
@@ -45,7 +51,7 @@ def assert_is_reference(bins, pool=POOL, selected=None, kinds=(False, True)):
     """Features in float64 and, mixed, by statistics in float32 of bins that float32 holds."""
     for mixed in kinds:
         arithmetic = "native" if mixed else "double"
-        maker = FeaturePool(pool.hand, **pool.facts() | {"arithmetic": arithmetic})
+        maker = FeaturePool(pool.hand, **pool.config() | {"arithmetic": arithmetic})
         given = bins.float() if mixed else bins
         found = made(maker, selected, "native")(given, torch.float64)
         expected = made(pool, selected, "torch")
@@ -245,7 +251,7 @@ def test_a_first_use_builds_into_the_users_cache_once(tmp_path):
         "import logging, sys; logging.basicConfig(); from pathlib import Path\n"
         "from tactslip_torch import native\n"
         "native.__file__ = sys.argv[1]\n"
-        "print(native.why_not() or native.instruction_set())"
+        "print(native.reason_unavailable() or native.instruction_set())"
     )
     taken = tmp_path / "file"
     taken.touch()
@@ -273,7 +279,7 @@ class HalfScaler(FeatureScaler):
 
 def of_half(detector):
     scaler = detector.scaler
-    detector.scaler = HalfScaler(scaler.minimum, scaler.maximum, scaler.knee)
+    detector.scaler = HalfScaler(scaler.minimum, scaler.maximum, scaler.compression)
 
 
 CHANGES = {

@@ -21,7 +21,7 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.native import why_not
+from tactslip_torch.native import reason_unavailable
 from tactslip_torch.onset.baselines import (
     VIBRATION_HZ,
     BaselineDetector,
@@ -35,12 +35,12 @@ from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.onset import OnsetTraining, kinds_of
 
 RATE = 2000.0
-FAST_KNEE, SLOW_KNEE = (0.01, 0.02, 0.03, 0.04), (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
-KNEES = {"fast_knee": FAST_KNEE, "slow_knee": SLOW_KNEE}
+FAST_SCALE, SLOW_SCALE = (0.01, 0.02, 0.03, 0.04), (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+SCALES = {"fast_compression": FAST_SCALE, "slow_compression": SLOW_SCALE}
 
 
 def evidence_of(kinds="GFFGFG", rate=RATE, hop=10, **changes):
-    return OnsetEvidence(some_hand(kinds), rate, hop, **(KNEES | changes))
+    return OnsetEvidence(some_hand(kinds), rate, hop, **(SCALES | changes))
 
 
 def samples_of(evidence, seconds=1.5, seed=0):
@@ -82,7 +82,9 @@ def oracle(evidence, x, masked=()):
     fast, slow = evidence.hand.indices("PVDF"), list(evidence.hand.indices("SG"))
     mains = evidence.mains_hz, evidence.comb_periods
     heard = np.stack([filtered(x[c], rate, *mains) for c in fast])
-    power = (cut(heard) ** 2).mean(-1) + np.square(evidence.fast_knee)[:, None]  # [F, B, blocks]
+    power = (cut(heard) ** 2).mean(-1) + np.square(evidence.fast_compression)[
+        :, None
+    ]  # [F, B, blocks]
     mean = cut(x[slow]).mean(-1)
     windows, second = [blocks(s) for s in (0.01, 0.025, 0.05)], blocks(1.0)
     of_comb = np.ceil(mains[1] * rate / mains[0]) + 2 * max(1, round(0.001 * rate)) - 1
@@ -98,12 +100,14 @@ def oracle(evidence, x, masked=()):
         rise = np.concatenate([level - floor for level in levels], -1)[in_use]
         row = [rise.mean(0)] + ([rise.max(0), rise.min(0)] if len(fast) > 1 else [])
         step, way = [], []
-        for lengths, knee in zip([*steps_s, (100, 100, 400)], evidence.slow_knee, strict=True):
+        for lengths, scale in zip(
+            [*steps_s, (100, 100, 400)], evidence.slow_compression, strict=True
+        ):
             late, early, back = (blocks(ms / 1000) for ms in lengths)
             latest = mean[:, b + 1 - late : b + 1].mean(-1)
             other = mean[:, b + 1 - back - early : b + 1 - back].mean(-1)
-            step.append(np.log(np.abs(latest - other) + knee))
-            way.append(np.sign(latest - other) * np.log1p(np.abs(latest - other) / knee))
+            step.append(np.log(np.abs(latest - other) + scale))
+            way.append(np.sign(latest - other) * np.log1p(np.abs(latest - other) / scale))
         heard = [i for i, c in enumerate(slow) if c not in masked]
         step, way = np.array(step)[:, heard], np.array(way)[:, heard]
         if len(slow):
@@ -185,7 +189,7 @@ SAMPLES = samples_of(CLASSIFIER.evidence, 2.0, seed=7)
 SAMPLES[1, 3100] = torch.nan
 
 
-BACKENDS = ["torch", *([] if why_not() else ["native"])]
+BACKENDS = ["torch", *([] if reason_unavailable() else ["native"])]
 
 
 def in_pieces(stream, samples, cuts, masked=None):
@@ -291,7 +295,7 @@ def kept(change, hand=HAND):
 BAD_SETTINGS = [
     (lambda: evidence_of("GG"), "needs fast channels, and this hand has none; take onset=deb"),
     (lambda: evidence_of(hop=0), "a hop of 0 samples at 2000 Hz is no hop of at most 5 ms"),
-    (lambda: evidence_of(fast_knee=(1.0,) * 3), "expected 10 positive and finite knees"),
+    (lambda: evidence_of(fast_compression=(1.0,) * 3), "expected 10 positive and finite scales"),
     (lambda: kept(dict, some_hand("F")), "expected 12 columns of evidence, got 72"),
     (lambda: kept(lambda plain: plain.pop("mains_hz")), "of this version: 'mains_hz'"),
 ]
@@ -523,17 +527,17 @@ def test_the_machine_is_kernel_ridge_on_hops_that_a_first_machine_finds_most_lik
     assert classifier.threshold == float("inf")
 
 
-def test_knees_are_a_tenth_of_the_usual_power_and_the_usual_step():
+def test_scales_are_a_tenth_of_the_usual_power_and_the_usual_step():
     source = Bursts(cycles=2)
     evidence = fitted(source, comb_periods=2)[0].evidence
     assert evidence.comb_periods == 2
     plain = type(evidence)(source.hand, TRAINING_HZ, 5, comb_periods=2)
     blocks = [plain.blocks_of_recording(source.load(r).samples) for r in source.ids]
     fast = np.median([np.median(own.power[0].sqrt(), -1) for own in blocks], 0)
-    assert evidence.fast_knee == pytest.approx(0.1 * fast, rel=0.02)
+    assert evidence.fast_compression == pytest.approx(0.1 * fast, rel=0.02)
     means = [own.mean[0, 96:].numpy() for own in blocks]  # the longest step takes 100 blocks
     steps = [np.median(np.abs(m[3:] + m[2:-1] - m[1:-2] - m[:-3])) / 2 for m in means]
-    assert evidence.slow_knee[0] == pytest.approx(np.median(steps), rel=0.02)
+    assert evidence.slow_compression[0] == pytest.approx(np.median(steps), rel=0.02)
 
 
 NOTHING_TO_LEARN = [

@@ -10,7 +10,7 @@ from tactslip_torch.data.splits import unseen4
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import FORMAT, SlipDetector
-from tactslip_torch.own_files import load_table, save_table
+from tactslip_torch.package_files import load_table, save_table
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker
 
@@ -41,10 +41,10 @@ def test_other_filters_are_another_entry_of_the_cache(tmp_path):
 
 
 DAMAGES = {
-    "kernel sum": lambda facts: facts["kernels"].update({"11": [0.1] * 11}),
-    "kernel length": lambda facts: facts["kernels"].update({"nine": [1.0]}),
-    "no wavelet": lambda facts: facts["pool"]["wavelet"].update({"dec_lo": [1.0] * 6}),
-    "no name": lambda facts: facts["pool"]["wavelet"].pop("name"),
+    "kernel sum": lambda metadata: metadata["kernels"].update({"11": [0.1] * 11}),
+    "kernel length": lambda metadata: metadata["kernels"].update({"nine": [1.0]}),
+    "no wavelet": lambda metadata: metadata["pool"]["wavelet"].update({"dec_lo": [1.0] * 6}),
+    "no name": lambda metadata: metadata["pool"]["wavelet"].pop("name"),
 }
 
 
@@ -52,9 +52,9 @@ DAMAGES = {
 def test_damaged_filters_are_named_in_one_line(tmp_path, change):
     path = tmp_path / "detector.pt"
     detector_of("own filters").save(path)
-    facts, tensors = load_table(path, FORMAT)
-    DAMAGES[change](facts)
-    save_table(path, FORMAT, facts, tensors)
+    metadata, tensors = load_table(path, FORMAT)
+    DAMAGES[change](metadata)
+    save_table(path, FORMAT, metadata, tensors)
     with pytest.raises(ValueError, match="is damaged: ") as error:
         SlipDetector.load(path)
     assert "\n" not in str(error.value)

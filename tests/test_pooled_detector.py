@@ -47,7 +47,7 @@ def noise_like(samples, size=1e-9):
 
 def test_a_damaged_pooling_is_refused(detector, tmp_path):
     broken = copy.deepcopy(detector)
-    broken.pooling.knee[0] = -1.0
+    broken.pooling.compression[0] = -1.0
     broken.save(tmp_path / "broken.pt")
     with pytest.raises(ValueError, match=r"broken\.pt") as caught:
         SlipDetector.load(tmp_path / "broken.pt")

@@ -39,7 +39,7 @@ def inputs_of(layer, features):
 
 def expected(layer, features, is_lost=None):
     out = np.empty((len(features), len(layer.names)))
-    knees = dict(zip(layer.families, layer.knee.tolist(), strict=True))
+    scales = dict(zip(layer.families, layer.compression.tolist(), strict=True))
     for column, name in enumerate(layer.names):
         channels = [HAND.names[c] for c in HAND.indices(name.channel)]
         family = replace(name, statistic="")
@@ -48,7 +48,7 @@ def expected(layer, features, is_lost=None):
             in_use = np.ones(len(channels), bool)
             if is_lost is not None:
                 in_use = ~is_lost[row, list(HAND.indices(name.channel))].numpy()
-            out[row, column] = pooled(values, in_use, knees[family], name.statistic)
+            out[row, column] = pooled(values, in_use, scales[family], name.statistic)
     return torch.from_numpy(out)
 
 
@@ -82,7 +82,7 @@ def test_without_any_channel_of_a_kind_a_column_is_its_training_median(rng):
 
 
 def test_one_dead_channel_in_training_does_not_move_the_others(rng):
-    """Knees and medians are those of the other channels alone."""
+    """Compression scales and medians are those of the other channels alone."""
     bins = torch.from_numpy(rng.standard_normal((60, 7, 100)))
     is_lost = (torch.arange(7) == 2).expand(60, 7)
     layers = []

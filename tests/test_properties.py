@@ -90,10 +90,10 @@ def test_gradients_are_finite(dtype, data):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_gradients_are_finite_at_both_ends_of_the_dtype(dtype):
     """Above 1e290 V, which float64 alone has, the gradient of a spectrum may overflow."""
-    facts, source = torch.finfo(dtype), generated.generator(0)
+    dtype_info, source = torch.finfo(dtype), generated.generator(0)
     few = torch.randint(-2, 3, (4, 24, NUM), generator=source).to(dtype)
-    highest = facts.max if dtype == torch.float32 else facts.max / 2.0**66
-    for bins in (few.sign() * highest, few * (facts.tiny * facts.eps)):
+    highest = dtype_info.max if dtype == torch.float32 else dtype_info.max / 2.0**66
+    for bins in (few.sign() * highest, few * (dtype_info.tiny * dtype_info.eps)):
         assert where_not_finite(bins) == []
 
 

@@ -194,7 +194,7 @@ def test_neither_order_nor_sums_change_the_machine(bins, balance, rng):
     recipe = Recipe(**FEW | {"num_features": 12}, balance=balance)
     plan, other = planned(recipe, parts), planned(recipe, parts[::-1])
     assert plan.validation == other.validation
-    assert plan.adds_up == (bins == 60)  # 91 monomials of 12 features
+    assert plan.uses_normal_equations == (bins == 60)  # 91 monomials of 12 features
     gathered, turned = passed(plan, parts), passed(other, parts[::-1])
     heads = [each.solve().state_dict() for each in (gathered, turned)]
     torch.testing.assert_close(heads[0], heads[1], rtol=1e-9, atol=1e-11)

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from tactslip_torch.own_files import load_table, save_table
+from tactslip_torch.package_files import load_table, save_table
 from tactslip_torch.runtime import (
     SeenBatches,
     content_digest,
     for_each,
-    in_parts,
     in_processes,
+    thread_map,
     whole_file,
 )
 
@@ -42,7 +42,7 @@ def test_every_item_is_worked_on_once_with_one_thread_inside(number):
         assert torch.get_num_threads() == number
     starts = range(0, 30, 4)
     expected = [sum(range(start, min(start + 4, 30))) for start in starts]
-    assert in_parts(lambda part: int(part.sum()), torch.arange(30).split(4)) == expected
+    assert thread_map(lambda part: int(part.sum()), torch.arange(30).split(4)) == expected
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -208,7 +208,7 @@ def test_a_flipped_byte_is_refused_in_one_line_wherever_it_counts(saved):
     assert num_refused > len(certain)
 
 
-MISFITS = [{"digest": "0" * 32}, {"facts": "{}"}, {"tensors": [1, 2]}]
+MISFITS = [{"digest": "0" * 32}, {"metadata": "{}"}, {"tensors": [1, 2]}]
 MISFITS += [{"tensors": {3: torch.zeros(2), "a": torch.zeros(2)}}]
 MISFITS += [{"tensors": {"float": torch.zeros(3).to_sparse()}}]
 
@@ -234,7 +234,7 @@ class Trap:
 
 def test_other_files_are_refused_and_nothing_in_them_is_executed(tmp_path):
     path, mark = tmp_path / "a.pt", tmp_path / "sprung"
-    trapped = {"format": FORM, "facts": "{}", "tensors": {}, "digest": Trap(mark)}
+    trapped = {"format": FORM, "metadata": "{}", "tensors": {}, "digest": Trap(mark)}
     for content in (torch.zeros(3), {"format": torch.zeros(3)}, [FORM], {}, None, trapped):
         torch.save(content, path)
         assert refusal(path) == f"{path} is damaged or no file of ours; make it again"

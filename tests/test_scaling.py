@@ -26,9 +26,12 @@ REFUSED = [
     (lambda: scaler_of([0.0, 1.0], [1.0, 0.0]), r"feature 1.*1 and 0"),
     (lambda: scaler_of([-3e38], [3e38]), r"feature 0.*-3e\+38 and 3e\+38"),
     (lambda: scaler_of(*ENDS, torch.ones(3)), r"agree in shape, got \(2,\), \(2,\), \(3,\)"),
-    (lambda: scaler_of(*ENDS, [1.0, -1.0]), "feature 1: knee .* positive and finite, got -1"),
-    (lambda: scaler_of(*ENDS, [1.0, 0.0]), "feature 1: knee .* positive and finite, got 0"),
-    (lambda: scaler_of(*ENDS, [1.0, math.nan]), "feature 1: knee .* got nan"),
+    (
+        lambda: scaler_of(*ENDS, [1.0, -1.0]),
+        "feature 1: compression .* positive and finite, got -1",
+    ),
+    (lambda: scaler_of(*ENDS, [1.0, 0.0]), "feature 1: compression .* positive and finite, got 0"),
+    (lambda: scaler_of(*ENDS, [1.0, math.nan]), "feature 1: compression .* got nan"),
     (lambda: fit(torch.zeros(0, 2)), r"at least one bin, got \(0, 2\)"),
     (lambda: fit([[0.0, 1.0]], tail=-0.1), r"\[0, 0\.5\), got -0\.1"),
     (lambda: fit([[0.0, 1.0]], tail=0.5), r"\[0, 0\.5\), got 0\.5"),
@@ -51,10 +54,10 @@ TINY, HUGE = 1e-30, 1e30
 DTYPES = [torch.float32, torch.float64]
 
 
-def signed_log_of(features, knee):
+def signed_log_of(features, scale):
     """The definition in float64, which holds every ratio of two float32 numbers."""
-    features, knee = np.float64(features), np.float64(knee)
-    return np.sign(features) * knee * np.log1p(np.abs(features) / knee)
+    features, scale = np.float64(features), np.float64(scale)
+    return np.sign(features) * scale * np.log1p(np.abs(features) / scale)
 
 
 def magnitudes(low=TINY, high=HUGE):
@@ -77,21 +80,21 @@ def heavy_tailed(rng, num_bins=301, num_features=7):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@given(features=st.lists(signed(), min_size=1, max_size=8), knee=magnitudes())
-def test_signed_log_equals_numpy_at_any_magnitude(dtype, features, knee):
-    features, knee = torch.tensor(features, dtype=dtype), torch.tensor([knee], dtype=dtype)
-    actual = signed_log(features[:, None], knee)[:, 0]
-    expected = signed_log_of(features.numpy(), knee.numpy())
+@given(features=st.lists(signed(), min_size=1, max_size=8), scale=magnitudes())
+def test_signed_log_equals_numpy_at_any_magnitude(dtype, features, scale):
+    features, scale = torch.tensor(features, dtype=dtype), torch.tensor([scale], dtype=dtype)
+    actual = signed_log(features[:, None], scale)[:, 0]
+    expected = signed_log_of(features.numpy(), scale.numpy())
     eps, tiny = torch.finfo(dtype).eps, torch.finfo(dtype).tiny
-    np.testing.assert_allclose(actual.numpy(), expected, rtol=8 * eps, atol=2 * tiny * float(knee))
+    np.testing.assert_allclose(actual.numpy(), expected, rtol=8 * eps, atol=2 * tiny * float(scale))
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script. is deprecated")  # torch's own, in jvp
-def test_gradcheck_with_a_knee(rng):
+def test_gradcheck_with_compression(rng):
     features = torch.from_numpy(rng.standard_normal((4, 3))).requires_grad_()
-    knee = torch.tensor([0.1, 1.0, 30.0], dtype=torch.float64)
-    edge = signed_log(torch.full((3,), 9.0, dtype=torch.float64), knee)
-    scaler = FeatureScaler(-edge, edge, knee)
+    scale = torch.tensor([0.1, 1.0, 30.0], dtype=torch.float64)
+    edge = signed_log(torch.full((3,), 9.0, dtype=torch.float64), scale)
+    scaler = FeatureScaler(-edge, edge, scale)
     assert torch.autograd.gradcheck(scaler, features, check_forward_ad=True)
     assert torch.autograd.gradgradcheck(scaler, features)
 
@@ -105,13 +108,13 @@ def test_fit_equals_numpy(dtype, compress, tail, rng):
     values = train.numpy().astype(np.float64)
     if compress:
         size = np.abs(values)
-        knee = np.median(size, axis=0)
-        knee = np.where(knee > 0, knee, size.max(0))
-        knee = np.where(knee > 0, knee, 1.0)
-        np.testing.assert_allclose(scaler.knee, knee, rtol=1e-6)
-        values = signed_log_of(values, knee)
+        scale = np.median(size, axis=0)
+        scale = np.where(scale > 0, scale, size.max(0))
+        scale = np.where(scale > 0, scale, 1.0)
+        np.testing.assert_allclose(scaler.compression, scale, rtol=1e-6)
+        values = signed_log_of(values, scale)
     else:
-        assert scaler.knee is None
+        assert scaler.compression is None
     low, high = np.quantile(values, [tail, 1 - tail], axis=0)
     low, high = np.where(low < high, [low, high], [values.min(0), values.max(0)])
     rtol = 1e-5 if dtype == torch.float32 else 1e-12
@@ -119,7 +122,7 @@ def test_fit_equals_numpy(dtype, compress, tail, rng):
     np.testing.assert_allclose(scaler.maximum, high, rtol=rtol)
     assert scaler.minimum.dtype == scaler.maximum.dtype == dtype
     new = np.concatenate([train.numpy(), heavy_tailed(rng) * 3]).astype(np.float64)
-    bent = signed_log_of(new, knee) if compress else new
+    bent = signed_log_of(new, scale) if compress else new
     width = np.where(high > low, high - low, 1.0)
     expected = np.where(high > low, np.clip(2 * (bent - low) / width - 1, -1, 1), 0)
     actual = scaler(torch.from_numpy(new).to(dtype))

@@ -408,7 +408,7 @@ def test_a_batch_in_float32_or_by_the_eager_engine_is_the_same_to_rounding():
             np.testing.assert_allclose(one.onsets_s, other.onsets_s, atol=1e-4)
 
 
-@pytest.mark.skipif(bool(native.why_not()), reason=native.why_not())
+@pytest.mark.skipif(bool(native.reason_unavailable()), reason=native.reason_unavailable())
 def test_provenance_and_keys_name_the_backend_of_bristles(monkeypatch):
     strokes = (Stroke(60.0, 16.0, 0.1),)
     scene = scene_on("many", "M2", strokes=strokes)

@@ -139,7 +139,7 @@ def test_the_stated_errors_are_true_or_the_system_refused(kind, spread, penalty)
             (machine(*tensors(others)).numpy(), outside),
         ):
             assert np.abs(found - exact).max() <= report.elsewhere * np.abs(exact).max() + 1e-300
-        json.dumps(report.facts(), allow_nan=False)
+        json.dumps(report.metadata(), allow_nan=False)
 
 
 # Refusals -------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from test_rules import ORACLES, by_hand
 
 from tactslip_torch.features.sensing import without_stuck
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.native import why_not
+from tactslip_torch.native import reason_unavailable
 from tactslip_torch.onset.decisions import (
     AlarmSettings,
     Decider,
@@ -160,8 +160,8 @@ def test_fast_evidence_leaves_out_channels_that_are_masked(masked):
 @pytest.mark.parametrize("backend", ["native", "torch"])
 def test_fast_evidence_that_is_lost_is_as_if_it_had_not_been(backend):
     """Up to ``hold_s`` of samples; beyond, the next second has none, as at the beginning."""
-    if backend == "native" and why_not():
-        pytest.skip(why_not())
+    if backend == "native" and reason_unavailable():
+        pytest.skip(reason_unavailable())
     onset, hop = WITH_ONSET.onset, 10
     samples = signal(9000, 6)
     for num_lost, is_kept in ((1, True), (500, True), (560, False)):

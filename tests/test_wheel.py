@@ -70,7 +70,9 @@ def test_the_wheel_holds_the_engine_of_its_platform(unpacked, tmp_path):
     assert tag.startswith("py3-none-")
     assert tag != "py3-none-any"
     assert len(list((unpacked / "tactslip_torch" / "native").glob("library.*"))) == 1
-    code = "from tactslip_torch import native; print(native.why_not() or native._library_path())"
+    code = (
+        "from tactslip_torch import native as n; print(n.reason_unavailable() or n._library_path())"
+    )
     done = run(unpacked, tmp_path, "-c", code)
     assert Path(done.stdout.strip()).parent == unpacked / "tactslip_torch" / "native"
 

@@ -25,7 +25,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import HeldOut, TrainingBins
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.runtime import bar, in_parts
+from tactslip_torch.runtime import bar, thread_map
 from tactslip_torch.training.recipe import FeatureSelection
 
 _COVERAGE = 0.95
@@ -245,8 +245,8 @@ class Refit:
         if self.selection.pooling is not None:
             return self._pooled(self.selection.pooling, bins, set(features))
         index, whole = list(features), self.selection.scaler
-        ranges, knee = (whole.minimum[index], whole.maximum[index]), whole.knee
-        scaler = FeatureScaler(*ranges, None if knee is None else knee[index])
+        ranges, compression = (whole.minimum[index], whole.maximum[index]), whole.compression
+        scaler = FeatureScaler(*ranges, None if compression is None else compression[index])
         scaled: Tensor = scaler(bins.features[:, index].double())
         return scaled
 
@@ -358,7 +358,7 @@ def best_first(
     for number in bar(range(min(most, len(left))), what):
         near = [steps[-1][1].penalty] if number else refit.penalties
         selections = [select(taken | units[name]) for name in left]
-        results = in_parts(partial(refit.held_out, penalties=near), selections)
+        results = thread_map(partial(refit.held_out, penalties=near), selections)
         best = max(range(len(left)), key=lambda place: (*results[place].merit, -place))
         taken |= units[left[best]]
         steps.append((left.pop(best), refit(selections[best])))
@@ -477,7 +477,7 @@ def measure(
                 ranking(everything - channels),
                 ranking(channels),
             ]
-            fewer, again, alone = in_parts(refit, choices)
+            fewer, again, alone = thread_map(refit, choices)
             rows.append(
                 {
                     "unit": unit,

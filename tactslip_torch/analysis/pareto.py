@@ -55,7 +55,7 @@ from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.runtime import bar, check_number, in_parts, one_thread, steps
+from tactslip_torch.runtime import bar, check_number, one_thread, steps, thread_map
 from tactslip_torch.signals.filtering import Align
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule, training_origin
 from tactslip_torch.training.plan import (
@@ -488,7 +488,7 @@ class ParetoSearch:
                 shown.update()
                 return found
 
-            return in_parts(work, jobs)
+            return thread_map(work, jobs)
 
     def _of_channels(self, group: Group, ranking: str, degrees: Sequence[int]) -> list[Candidate]:
         """The candidates of one ranking: of each degree and size the best C."""
@@ -629,8 +629,8 @@ class ParetoSearch:
             "solve": solve_metadata(head),
             "features_dtype": "float32" if candidate.arithmetic == "native" else "float64",
         }
-        facts = self.pool.facts() | {"arithmetic": candidate.arithmetic}
-        pool = FeaturePool(self.pool.hand, **facts)
+        options = self.pool.config() | {"arithmetic": candidate.arithmetic}
+        pool = FeaturePool(self.pool.hand, **options)
         channel_filter = self.makers[align].channel_filter
         return plan.detector(pool, channel_filter, head, info, self.backend)
 

@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.data.file_recordings import hand_file
-from tactslip_torch.data.folder import file_facts, recording_files
+from tactslip_torch.data.folder import file_metadata, recording_files
 from tactslip_torch.data.formats import Reading, open_file, pieces
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.features.cache import versions
@@ -149,7 +149,7 @@ def _detect_in(
     written = csv_writer(table, columns) if config.decisions else nullcontext()
     with given as opened, written as write, ExitStack() as stack:
         samples, archived = opened.samples, opened.archived
-        entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
+        entry = file_metadata(path, archived) | {"duration_s": samples.num_samples / rate}
         masked = config.masked_channels or ()
         stream = StreamingDetector(
             detector, context.settings, dtype=samples.dtype, masked_channels=masked

@@ -26,7 +26,7 @@ from tactslip_torch.live.frames import Frames
 from tactslip_torch.live.mcap_log import McapLog
 from tactslip_torch.live.pump import watch
 from tactslip_torch.live.ros2 import RosTopic
-from tactslip_torch.live.server import PageServer, page_facts
+from tactslip_torch.live.server import PageServer, page_metadata
 from tactslip_torch.live.sinks import Callback, Counts, Event, JsonLines, LineServer, Sink, Source
 from tactslip_torch.live.sources import FileInTime, address_of, source_of
 from tactslip_torch.model.detector import SlipDetector
@@ -135,7 +135,7 @@ def _page(
         raise ValueError(f"port must be a whole number from 0 to 65535, got {port!r}")
     return PageServer(
         {"": place / "web", "node": place / "node"},
-        page_facts(watching.detector, watching.settings),
+        page_metadata(watching.detector, watching.settings),
         source=source.name,
         simulated=source.simulated,
         counts=counts,

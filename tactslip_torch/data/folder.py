@@ -58,7 +58,7 @@ def recording_files(place: Path, *, in_folders: bool = False) -> list[Path]:
     return found
 
 
-def file_facts(path: Path, archived: Archived | None) -> dict[str, Any]:
+def file_metadata(path: Path, archived: Archived | None) -> dict[str, Any]:
     """What a file says of itself, in plain values; of samples alone nothing is known."""
     recording = archived.recording if archived else None
     key = archived.key.get("recording") if archived else None

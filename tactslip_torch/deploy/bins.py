@@ -26,7 +26,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
 from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetEvidence
 from tactslip_torch.onset.rules import NOTHING_YET, KOfN, Rule
-from tactslip_torch.own_files import SIDECAR as FORMAT
+from tactslip_torch.package_files import SIDECAR as FORMAT
 from tactslip_torch.runtime import __version__
 from tactslip_torch.signals.filtering import overlap_matrix
 
@@ -130,7 +130,7 @@ def memory_size(evidence: OnsetEvidence) -> int:
 
 def memory_shapes(evidence: OnsetEvidence) -> list[tuple[int, int]]:
     """Of fast and slow channels, a row a block."""
-    num_logs = len(evidence.hand.fast) * len(evidence.fast_knee)
+    num_logs = len(evidence.hand.fast) * len(evidence.fast_compression)
     return [
         (evidence.memory - 1, num_logs),
         (len(evidence.step_matrix) - 1, len(evidence.hand.slow)),

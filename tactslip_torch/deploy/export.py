@@ -25,8 +25,8 @@ from tactslip_torch.deploy.check import GraphKind, check_model
 from tactslip_torch.deploy.stream import stream_graph
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import KEY, AlarmSettings
-from tactslip_torch.own_files import SIDECAR as FORMAT
-from tactslip_torch.own_files import read_json
+from tactslip_torch.package_files import SIDECAR as FORMAT
+from tactslip_torch.package_files import read_json
 from tactslip_torch.runtime import plain, whole_file
 
 FILES: dict[GraphKind, str] = {"bin": "model.onnx", "stream": "stream.onnx"}

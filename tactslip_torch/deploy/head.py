@@ -54,8 +54,8 @@ def _pooled(features: Value, is_lost: Value, detector: SlipDetector) -> Value:
         in_use: Any = ~is_lost.take([used.index(channel) for channel in group.channels], 1)
         is_some.append(in_use.any(1, keepdim=True))
         values = features.take(group.columns, 1).reshape(0, len(group.families), num)
-        knee = layer.knee[list(group.families), None].double()
-        bent: Any = (values.abs() * (1 / knee) + 1.0).log() * values.sign() * knee
+        scale = layer.compression[list(group.families), None].double()
+        bent: Any = (values.abs() * (1 / scale) + 1.0).log() * values.sign() * scale
         columns += over_channels(bent, in_use.unsqueeze(1), group.statistics, num)
     always = is_some[0] | ~is_some[0]
     known = graph.concat(*is_some, always, axis=1).cast(F32).take(layer.kind_of, 1) > 0.0
@@ -66,7 +66,7 @@ def _pooled(features: Value, is_lost: Value, detector: SlipDetector) -> Value:
 def scaled(features: Value, scaler: FeatureScaler) -> Value:
     """Features in [-1, 1], ``[B, K]``, float64: ``FeatureScaler``.
 
-    ONNX has no ``log1p``: the knee becomes ``Log(1 + x)``, off by some eps of the knee.
+    ONNX has no ``log1p``: the logarithm becomes ``Log(1 + x)``, off by some eps of the scale.
     """
     least, width = scaler.minimum.double(), (scaler.maximum - scaler.minimum).double()
     is_point = width == 0
@@ -74,10 +74,10 @@ def scaled(features: Value, scaler: FeatureScaler) -> Value:
     offset = torch.where(is_point, 0.0, -1 - slope * least)
     if bool(is_point.any()):  # 0 times Inf
         features = features.clamp(-_LARGEST, _LARGEST)
-    if scaler.knee is not None:
-        knee = scaler.knee.double()
-        slope = slope * knee
-        features = (features.abs() * (1 / knee) + 1.0).log() * features.sign()
+    if scaler.compression is not None:
+        scale = scaler.compression.double()
+        slope = slope * scale
+        features = (features.abs() * (1 / scale) + 1.0).log() * features.sign()
     return (features * slope + _float64(features, offset)).clamp(-1.0, 1.0)
 
 

@@ -482,14 +482,18 @@ def onset_scores(
     """
     evidence, graph = classifier.evidence, samples.graph
     fast, slow = evidence.hand.fast, evidence.hand.slow
-    hop, context, num_filters = evidence.hop_samples, evidence.context, len(evidence.fast_knee)
+    hop, context, num_filters = (
+        evidence.hop_samples,
+        evidence.context,
+        len(evidence.fast_compression),
+    )
     num_windows, first = len(evidence.windows), places.unsqueeze(1)
     frames = _rows(samples.take(fast, 1), first * hop, range(context + hop)).cast(F64)
     filters = evidence.filter_matrix.reshape(context + hop, -1).T
     heard = graph.constant(filters, F64) @ (frames - frames.slice(0, 1, 1))
     to_power = np.kron(np.eye(num_filters), np.full(hop, 1 / hop))
     square = graph.constant(to_power, F64) @ (heard * heard)  # [k, B, F]
-    power = square + np.square(evidence.fast_knee)[:, None]
+    power = square + np.square(evidence.fast_compression)[:, None]
     made = [power.reshape(0, num_filters * len(fast)).log() * 0.5]
     if slow:
         block = _rows(samples.take(slow, 1), first * hop, range(context, context + hop))

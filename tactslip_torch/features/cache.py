@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 _MAKE_FEATURES = (
     "hand.py",
     "runtime.py",
-    "own_files.py",
+    "package_files.py",
     "signals",
     "data",
     "features",
@@ -40,14 +40,14 @@ def default_cache_folder() -> Path:
     return (Path(root) if root else Path.home() / ".cache") / "tactslip_torch"
 
 
-def cache_key(facts: Mapping[str, Any]) -> str:
-    """A file name for JSON-able facts: equal facts, equal name.
+def cache_key(metadata: Mapping[str, Any]) -> str:
+    """A file name for JSON-able metadata: equal metadata, equal name.
 
     Example:
         >>> cache_key({"a": 1, "b": 2}) == cache_key({"b": 2, "a": 1})
         True
     """
-    text = json.dumps(facts, sort_keys=True, allow_nan=False)
+    text = json.dumps(metadata, sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 

@@ -139,7 +139,7 @@ def power_of_two_below(magnitude: Tensor) -> Tensor:
     return magnitude.detach().clamp(min=tiny).log2().floor().exp2()
 
 
-def is_nowhere(mask: Tensor) -> bool:
+def is_all_false(mask: Tensor) -> bool:
     """Whether a mask is known to hold nowhere, so that what depends on it can be passed over."""
     return mask.device.type == "cpu" and has_values(mask) and not bool(mask.any())
 
@@ -170,31 +170,31 @@ def saturating(x: Tensor, dtype: torch.dtype) -> Tensor:
     return x.clamp(-most, most).to(dtype)
 
 
-def signed_log(features: Tensor, knee: Tensor) -> Tensor:
-    """``sign(f) * knee * log1p(|f| / knee)``: nearly ``f`` below the knee, logarithmic above.
+def signed_log(features: Tensor, scale: Tensor) -> Tensor:
+    """``sign(f) * scale * log1p(|f| / scale)``: nearly ``f`` below the scale, logarithmic above.
 
-    Monotone, odd, with derivative ``knee / (knee + |f|)``, 1 at 0. Finite for every finite ``f``,
-    also where ``|f| / knee`` passes the largest float; NaN stays NaN.
+    Monotone, odd, with derivative ``scale / (scale + |f|)``, 1 at 0. Finite for every finite ``f``,
+    also where ``|f| / scale`` passes the largest float; NaN stays NaN.
 
     Shape:
         - features, output: ``[*, K]``
-        - knee: broadcasts with ``features``, positive
+        - scale: broadcasts with ``features``, positive
     """
-    facts = torch.finfo(features.dtype)
-    if is_concrete(features) and is_concrete(knee):  # the same in fewer passes
-        ratio = features.abs() / knee
+    dtype_info = torch.finfo(features.dtype)
+    if is_concrete(features) and is_concrete(scale):  # the same in fewer passes
+        ratio = features.abs() / scale
         if ratio.numel() and bool(ratio.amax().isfinite()):
-            bent, is_tiny = ratio.log1p().mul_(knee), ratio < facts.tiny
+            bent, is_tiny = ratio.log1p().mul_(scale), ratio < dtype_info.tiny
             if bool(is_tiny.any()):
                 bent = torch.where(is_tiny, features.abs(), bent)
             return bent.copysign_(features)
     is_negative = features < 0
     size = torch.where(is_negative, -features, features)  # abs() has derivative 0 at 0
-    ratio = size / knee
-    bent = knee * ratio.log1p()
+    ratio = size / scale
+    bent = scale * ratio.log1p()
     if not has_values(features) or bool(ratio.isinf().any()):
-        far = torch.maximum(size, knee).log() - knee.log()
-        far = far.clamp(min=math.log(facts.max))  # no step back where log1p ends
-        bent = torch.where(ratio.isinf(), knee * far, bent)
-    bent = torch.where(ratio < facts.tiny, size, bent)  # a denormal ratio has lost its digits
+        far = torch.maximum(size, scale).log() - scale.log()
+        far = far.clamp(min=math.log(dtype_info.max))  # no step back where log1p ends
+        bent = torch.where(ratio.isinf(), scale * far, bent)
+    bent = torch.where(ratio < dtype_info.tiny, size, bent)  # a denormal ratio has lost its digits
     return torch.where(is_negative, -bent, bent)

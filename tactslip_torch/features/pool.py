@@ -41,7 +41,7 @@ from tactslip_torch.features.ops import (
 )
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.native import BackendName
-from tactslip_torch.own_files import MOST_BIN_SAMPLES
+from tactslip_torch.package_files import MOST_BIN_SAMPLES
 from tactslip_torch.runtime import check_choice, for_each
 from tactslip_torch.signals.filtering import check_samples
 from tactslip_torch.signals.wavelet import (
@@ -90,7 +90,7 @@ class FeaturePool(nn.Module):
         level: number of wavelet levels; ``None``: as many as the bin allows, at most 4.
         spectrum: ``"reference"`` (the authors') or ``"clean"`` (ours).
         arithmetic: ``"double"``, or ``"native"`` to compute in the dtype of the bins.
-        backend: ``"auto"`` takes the native one where it can be used (``native.why_not``).
+        backend: ``"auto"`` takes the native one where there is one (``native.reason_unavailable``).
 
     Attributes:
         names: of the features, in the order of the output.
@@ -162,7 +162,7 @@ class FeaturePool(nn.Module):
             raise ValueError(
                 f"selected features must lie in 0..{num - 1}, the pool's {num}, got {outside[0]}"
             )
-        pool = FeaturePool(self.hand, **self.facts(), backend=backend or self.backend)
+        pool = FeaturePool(self.hand, **self.config(), backend=backend or self.backend)
         pool.names = tuple(self.names[i] for i in chosen)
         pool.selected = tuple(self.selected[i] for i in chosen)
         _ = pool.plan  # refuses an empty one
@@ -189,8 +189,8 @@ class FeaturePool(nn.Module):
         """The least work for the features."""
         return make_plan(self.hand, self.level, self.names)
 
-    def facts(self) -> dict[str, Any]:
-        """All arguments but hand and backend, as JSON-able values: ``FeaturePool(hand, **facts)``.
+    def config(self) -> dict[str, Any]:
+        """All arguments but hand and backend, as JSON-able values: ``FeaturePool(hand, **config)``.
 
         Of a selection, those of the whole pool.
         """

@@ -141,7 +141,7 @@ class ChannelPooling(nn.Module):
     Args:
         hand: the channels.
         names: what comes out, K features, pooled or of channels.
-        knee: ``k`` of the compression, one for each of ``families``.
+        compression: compression scales ``k``, one for each of ``families``.
         fill: what a pooled column is where no channel of its kind is in use; others are not read.
 
     Attributes:
@@ -151,17 +151,17 @@ class ChannelPooling(nn.Module):
         families: descriptors that are pooled, as names without statistic, kind by kind.
 
     Shape:
-        - knee: ``[families]``; fill: ``[K]``
+        - compression: ``[families]``; fill: ``[K]``
 
     Raises:
         ValueError: if shapes disagree or a value is not finite, or a name is unknown.
     """
 
-    knee: Tensor
+    compression: Tensor
     fill: Tensor
 
     def __init__(
-        self, hand: HandLayout, names: Sequence[FeatureName], knee: Tensor, fill: Tensor
+        self, hand: HandLayout, names: Sequence[FeatureName], compression: Tensor, fill: Tensor
     ) -> None:
         super().__init__()
         self.hand, self.names = hand, tuple(names)
@@ -176,13 +176,13 @@ class ChannelPooling(nn.Module):
             if not (name.statistic in STATISTICS or _RANK.fullmatch(name.statistic)):
                 raise ValueError(f"unknown statistic over channels in {str(name)!r}")
         self.families = _families(self.kinds, pooled)
-        shapes = [tuple(each.shape) for each in (knee, fill)]
+        shapes = [tuple(each.shape) for each in (compression, fill)]
         wanted = [(len(self.families),), (len(self.names),)]
         if shapes != wanted:
-            raise ValueError(f"expected knee and fill of shapes {wanted}, got {shapes}")
-        if not bool((knee > 0).all() & knee.isfinite().all() & fill.isfinite().all()):
-            raise ValueError("pooling constants must be finite and knees positive; fit again")
-        self.register_buffer("knee", knee.double().clone())
+            raise ValueError(f"expected compression and fill of shapes {wanted}, got {shapes}")
+        if not bool((compression > 0).all() & compression.isfinite().all() & fill.isfinite().all()):
+            raise ValueError("pooling constants must be finite and scales positive; fit again")
+        self.register_buffer("compression", compression.double().clone())
         self.register_buffer("fill", fill.double().clone())
         self._lay_out(by_kind)
 
@@ -257,7 +257,9 @@ class ChannelPooling(nn.Module):
             if is_lost is not None:
                 lost = is_lost[:, None, list(group.channels)]
                 values = values.masked_fill(lost, torch.nan)
-            layer.knee[list(group.families)] = _knees(values.transpose(0, 1).flatten(1))
+            layer.compression[list(group.families)] = _compression_scales(
+                values.transpose(0, 1).flatten(1)
+            )
         parts = torch.arange(len(features)).split(CHUNK_BINS)
         columns = [
             layer(features[part][:, inputs].double(), None if is_lost is None else is_lost[part])
@@ -296,7 +298,7 @@ class ChannelPooling(nn.Module):
             is_some.append(in_use.any(-1))
             num_channels = len(group.channels)
             values = features[..., list(group.columns)].unflatten(-1, (-1, num_channels))
-            values = signed_log(values, self.knee[list(group.families), None].to(features))
+            values = signed_log(values, self.compression[list(group.families), None].to(features))
             parts += over_channels(values, in_use[..., None, :], group.statistics, num_channels)
         columns = torch.cat(parts, dim=-1)[..., list(self.order)]
         known = torch.stack([*is_some, torch.ones_like(is_some[0])], -1)[..., list(self.kind_of)]
@@ -304,7 +306,7 @@ class ChannelPooling(nn.Module):
 
     def _by_native(self, features: Tensor, is_lost: Tensor | None) -> Tensor:
         with torch.inference_mode(False), torch.no_grad():
-            buffers = [self.knee, self.fill]
+            buffers = [self.compression, self.fill]
             if self._engine is None or not are_unchanged(buffers, self._engine[1]):
                 self._engine = self.machine(), stamps_of(buffers)
             machine = self._engine[0]
@@ -339,7 +341,7 @@ class ChannelPooling(nn.Module):
                         for s in group.statistics
                     ],
                     columns=np.reshape([column.get(made, -1) for made in own], shape),
-                    knees=self.knee[list(group.families)].cpu().numpy(),
+                    scales=self.compression[list(group.families)].cpu().numpy(),
                 )
             )
         return native.Machine(
@@ -374,7 +376,7 @@ class ChannelPooling(nn.Module):
         pooled = [name for name in names if name.is_pooled]
         kinds = [kind for kind in self.kinds if any(name.channel == kind for name in pooled)]
         families = [self.families.index(family) for family in _families(kinds, pooled)]
-        return ChannelPooling(self.hand, names, self.knee[families], fill)
+        return ChannelPooling(self.hand, names, self.compression[families], fill)
 
     def to_dict(self) -> dict[str, Any]:
         """Names of the columns as JSON-able rows; ``from_dict`` takes them with the tensors."""
@@ -420,7 +422,7 @@ def _family(name: FeatureName) -> FeatureName:
     return replace(name, statistic="")
 
 
-def _knees(sizes: Tensor) -> Tensor:
+def _compression_scales(sizes: Tensor) -> Tensor:
     """Median of each row without NaN; its largest where that is 0, and 1 where that is 0 too."""
     middle = sizes.nanmedian(-1).values.nan_to_num(0.0)
     largest = sizes.nan_to_num(0.0).amax(-1)

@@ -10,7 +10,7 @@ Example:
 
 from tactslip_torch.live.frames import Frames
 from tactslip_torch.live.pump import watch
-from tactslip_torch.live.server import PageServer, page_facts
+from tactslip_torch.live.server import PageServer, page_metadata
 from tactslip_torch.live.sinks import (
     Block,
     Callback,
@@ -46,7 +46,7 @@ __all__ = [
     "StandardInput",
     "TcpClient",
     "TcpListener",
-    "page_facts",
+    "page_metadata",
     "source_of",
     "watch",
 ]

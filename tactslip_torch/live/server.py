@@ -70,7 +70,7 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def page_facts(detector: SlipDetector, settings: AlarmSettings) -> dict[str, Any]:
+def page_metadata(detector: SlipDetector, settings: AlarmSettings) -> dict[str, Any]:
     """What the page is told of a detector: the metadata of its ``stream.onnx``, and more."""
     from tactslip_torch.deploy.bins import host_metadata  # brings onnx
 
@@ -103,7 +103,7 @@ class PageServer(Sink):
 
     Args:
         folders: by the path that they are served under, ``""`` for the top, what holds the page.
-        facts: of the detector (``page_facts``).
+        facts: of the detector (``page_metadata``).
         source: name of the source.
         simulated: whether samples are known to be simulated.
         counts: of the stream, which change.

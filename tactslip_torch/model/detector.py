@@ -18,8 +18,8 @@ from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import (
     are_unchanged,
     full_precision,
+    is_all_false,
     is_concrete,
-    is_nowhere,
     is_traced,
     saturating,
     stamps_of,
@@ -47,8 +47,8 @@ from tactslip_torch.model.prediction import (
 )
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName, Channels, Filters, Machine, backend_of
-from tactslip_torch.own_files import DETECTOR as FORMAT
-from tactslip_torch.own_files import FORGED, load_table, save_table
+from tactslip_torch.package_files import DAMAGE_ERRORS, load_table, save_table
+from tactslip_torch.package_files import DETECTOR as FORMAT
 from tactslip_torch.runtime import PACKAGE
 from tactslip_torch.signals.filtering import ChannelFilter, check_samples
 
@@ -72,7 +72,7 @@ class SlipDetector(nn.Module):
             or, with ``pooling``, its inputs.
         scaler: of the K columns.
         head: the machine on scaled features.
-        info: JSON-able facts about the training, kept in the file.
+        info: JSON-able metadata about the training, kept in the file.
         imputation: scaled columns in place of those of a lost channel, ``[K]``; default 0.
         pooling: from the features that are read to the columns; ``None``: they are the columns.
         sensing: what training tells of channels that work, by which lost channels and decisions
@@ -394,11 +394,11 @@ class SlipDetector(nn.Module):
             alive & is_used, span, self.counted, self.sensing, range(len(self.pool.hand))
         )
         bins = self.pool.widen(bins)
-        is_whole = is_nowhere(~is_known)
+        is_whole = is_all_false(~is_known)
         if not is_whole:
             bins = torch.where(is_known[..., None], bins, 0.0)
         features = self._features(bins)
-        scaled = self.scaled(features, None if is_whole and is_nowhere(is_lost) else is_lost)
+        scaled = self.scaled(features, None if is_whole and is_all_false(is_lost) else is_lost)
         score = saturating(self.head(scaled), given)
         is_valid = is_valid & score.isfinite()
         score = torch.where(is_valid, score, torch.nan)
@@ -476,7 +476,7 @@ class SlipDetector(nn.Module):
         """Write the detector to one file, whole or not at all."""
         metadata = {
             "channels": self.pool.hand.to_rows(),
-            "pool": self.pool.facts(),
+            "pool": self.pool.config(),
             **self.channel_filter.config(),
             "selected": list(self.selected),
             "pooling": None if self.pooling is None else self.pooling.to_dict(),
@@ -505,7 +505,7 @@ class SlipDetector(nn.Module):
             with torch.inference_mode(False):  # it may be differentiated later
                 state = {key: value.clone() for key, value in state.items()}
                 return cls._from_table(metadata, state, backend)
-        except FORGED as error:
+        except DAMAGE_ERRORS as error:
             reason = str(error).splitlines()[0]
             raise ValueError(f"{name} is damaged: {reason}") from error
 
@@ -582,7 +582,7 @@ class _Engine:
         more: dict[str, Any] = {
             "scaling": tuple(
                 None if each is None else each.double().numpy()
-                for each in (scaler.minimum, scaler.maximum, scaler.knee)
+                for each in (scaler.minimum, scaler.maximum, scaler.compression)
             )
         }
         if type(head) is QuadraticForm:

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.solve import check_weights
-from tactslip_torch.own_files import FORGED, load_table, save_table
-from tactslip_torch.own_files import SUMS as FORMAT
+from tactslip_torch.package_files import DAMAGE_ERRORS, load_table, save_table
+from tactslip_torch.package_files import SUMS as FORMAT
 from tactslip_torch.runtime import SeenBatches, content_digest
 
 _CLASSES = ("non-slip", "slip")
@@ -39,7 +39,7 @@ class SufficientStats:
 
     Args:
         num_features: ``K``.
-        about: what the features are (hand, names, scaling), as JSON holds it; only sums that
+        metadata: what the features are (hand, names, scaling), as JSON holds it; only sums that
             agree in it merge.
         degree: of the machine, 1 or 2.
 
@@ -47,10 +47,10 @@ class SufficientStats:
         sums: ``[2, num_held]``, float64: of non-slip and slip, as ``ProductSums`` lays them out.
         count: ``[2]``, int64: number of bins.
         seen_batches: names and digests of batches.
-        about: as given.
+        metadata: as given.
 
     Raises:
-        ValueError: if JSON does not hold ``about``, or for another degree.
+        ValueError: if JSON does not hold ``metadata``, or for another degree.
 
     Example:
         >>> stats = SufficientStats(2)
@@ -63,13 +63,13 @@ class SufficientStats:
     """
 
     def __init__(
-        self, num_features: int, about: Mapping[str, Any] | None = None, degree: int = 2
+        self, num_features: int, metadata: Mapping[str, Any] | None = None, degree: int = 2
     ) -> None:
         try:
-            text = json.dumps(about or {}, sort_keys=True, allow_nan=False)
+            text = json.dumps(metadata or {}, sort_keys=True, allow_nan=False)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"about must be what JSON holds: {error}") from None
-        self.about: dict[str, Any] = json.loads(text)
+            raise ValueError(f"metadata must be what JSON holds: {error}") from None
+        self.metadata: dict[str, Any] = json.loads(text)
         self.num_features, self.degree = num_features, degree
         self._layout = ProductSums(num_features, degree)
         self.sums = torch.zeros(2, self._layout.num_held, dtype=torch.float64)
@@ -133,11 +133,11 @@ class SufficientStats:
         """Add the batches of other sums: all of them or, on an error, none.
 
         Raises:
-            ValueError: if a batch is in both, or if the two differ in what they are about, in
+            ValueError: if a batch is in both, or if the two differ in metadata, in
                 degree or in the number of features.
         """
-        ours = {"num_features": self.num_features, "degree": self.degree, **self.about}
-        theirs = {"num_features": other.num_features, "degree": other.degree, **other.about}
+        ours = {"num_features": self.num_features, "degree": self.degree, **self.metadata}
+        theirs = {"num_features": other.num_features, "degree": other.degree, **other.metadata}
         for key in ours | theirs:
             if ours.get(key) != theirs.get(key):
                 raise ValueError(
@@ -150,13 +150,13 @@ class SufficientStats:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a file, whole or not at all."""
-        facts = {
+        metadata = {
             "num_features": self.num_features,
             "degree": self.degree,
-            "about": self.about,
+            "metadata": self.metadata,
             "batches": self.seen_batches,
         }
-        save_table(path, FORMAT, facts, {"sums": self.sums, "count": self.count})
+        save_table(path, FORMAT, metadata, {"sums": self.sums, "count": self.count})
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SufficientStats:
@@ -170,14 +170,14 @@ class SufficientStats:
         parts: dict[str, Any] = metadata | tensors
         try:
             return cls.restored(**parts)
-        except FORGED as error:
+        except DAMAGE_ERRORS as error:
             raise ValueError(f"{os.fspath(path)} is damaged: {error}; make it again") from error
 
     @classmethod
     def restored(
         cls,
         num_features: int,
-        about: Mapping[str, Any],
+        metadata: Mapping[str, Any],
         batches: Mapping[str, str],
         sums: Tensor,
         count: Tensor,
@@ -193,7 +193,7 @@ class SufficientStats:
             raise ValueError(f"sums must be float64 {list(wanted)}, got {list(sums.shape)}")
         if count.shape != (2,) or count.dtype != torch.int64 or bool((count < 0).any()):
             raise ValueError(f"count must be two whole numbers from 0, got {count!r:.60}")
-        stats = cls(num_features, about, degree)
+        stats = cls(num_features, metadata, degree)
         stats.seen_batches = SeenBatches(batches)
         stats.sums, stats.count = sums, count
         return stats

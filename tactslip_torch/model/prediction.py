@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features.ops import full_precision, is_concrete
-from tactslip_torch.runtime import in_parts
+from tactslip_torch.runtime import thread_map
 from tactslip_torch.signals.filtering import refuse_nonfinite
 
 ChannelMask = Sequence[str] | Tensor
@@ -66,7 +66,7 @@ def predict_in_parts(predict: Callable[[Tensor], Prediction], x: Tensor) -> Pred
     with full_precision(x):
         if x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS or not is_concrete(x):
             return predict(x)
-        found = in_parts(predict, x.flatten(0, -3).split(_PART_BINS))
+        found = thread_map(predict, x.flatten(0, -3).split(_PART_BINS))
     whole = (torch.cat(parts).unflatten(0, x.shape[:-2]) for parts in zip(*found, strict=True))
     return Prediction(*whole)
 

@@ -23,26 +23,27 @@ class FeatureScaler(nn.Module):
     A feature whose range is a point becomes 0.
 
     Args:
-        minimum: ``[K]``, what becomes -1, of the compressed feature if there is a knee.
+        minimum: ``[K]``, what becomes -1, of the compressed feature where there is compression.
         maximum: ``[K]``, what becomes 1.
-        knee: ``[K]``, of ``signed_log``, which comes first; without it features are not
-            compressed.
+        compression: ``[K]``, compression scales of ``signed_log``, which comes first; without it
+            features are not compressed.
 
     Raises:
         ValueError: if shapes disagree, a range is not finite, a minimum exceeds its maximum or a
-            knee is not positive and finite.
+            compression is not positive and finite.
     """
 
     minimum: Tensor
     maximum: Tensor
-    knee: Tensor | None
+    compression: Tensor | None
 
-    def __init__(self, minimum: Tensor, maximum: Tensor, knee: Tensor | None = None) -> None:
+    def __init__(self, minimum: Tensor, maximum: Tensor, compression: Tensor | None = None) -> None:
         super().__init__()
-        shapes = [tuple(x.shape) for x in (minimum, maximum, knee) if x is not None]
+        shapes = [tuple(x.shape) for x in (minimum, maximum, compression) if x is not None]
         if len(set(shapes)) > 1:
             raise ValueError(
-                f"minimum, maximum and knee must agree in shape, got {', '.join(map(str, shapes))}"
+                f"minimum, maximum and compression must agree in shape, got "
+                f"{', '.join(map(str, shapes))}"
             )
         bad = ~(minimum.isfinite() & maximum.isfinite() & (minimum <= maximum))
         bad |= ~(maximum - minimum).isfinite()
@@ -52,16 +53,17 @@ class FeatureScaler(nn.Module):
                 f"feature {i}: expected finite minimum <= maximum, got "
                 f"{float(minimum[i]):g} and {float(maximum[i]):g}"
             )
-        if knee is not None:
-            bad = ~(knee.isfinite() & (knee > 0))
+        if compression is not None:
+            bad = ~(compression.isfinite() & (compression > 0))
             if bool(bad.any()):
                 i = int(bad.nonzero()[0])
                 raise ValueError(
-                    f"feature {i}: knee must be positive and finite, got {float(knee[i]):g}"
+                    f"feature {i}: compression must be positive and finite, got "
+                    f"{float(compression[i]):g}"
                 )
         self.register_buffer("minimum", minimum.clone())
         self.register_buffer("maximum", maximum.clone())
-        self.register_buffer("knee", None if knee is None else knee.clone())
+        self.register_buffer("compression", None if compression is None else compression.clone())
 
     @classmethod
     def fit(cls, features: Tensor, *, compress: bool = False, tail: float = 0.0) -> FeatureScaler:
@@ -69,8 +71,8 @@ class FeatureScaler(nn.Module):
 
         Args:
             features: the bins, at least one, finite.
-            compress: put a knee at the median of ``|f|`` of each feature; at its maximum where
-                the median is 0, at 1 where that is 0 too.
+            compress: by the median of ``|f|`` of each feature; its maximum where
+                the median is 0, 1 where that is 0 too.
             tail: share of the bins at either end of a feature that may be clipped: the range
                 lies between the quantiles ``tail`` and ``1 - tail`` of the compressed values,
                 interpolated linearly as ``numpy.quantile`` does, and is that of all bins where
@@ -92,8 +94,8 @@ class FeatureScaler(nn.Module):
             return cls(features.amin(0), features.amax(0))
         cls(features.amin(0), features.amax(0))  # refuses what is not finite, by feature
         columns = [_ranges_of(part, compress, tail) for part in features.split(_COLUMNS, 1)]
-        minimum, maximum, knee = (torch.cat(part) for part in zip(*columns, strict=True))
-        return cls(minimum, maximum, knee if compress else None)
+        minimum, maximum, compression = (torch.cat(part) for part in zip(*columns, strict=True))
+        return cls(minimum, maximum, compression if compress else None)
 
     def forward(self, features: Tensor) -> Tensor:
         """Scale bins; NaN stays NaN, gradients are 0 where a value is clipped.
@@ -101,8 +103,8 @@ class FeatureScaler(nn.Module):
         Shape:
             - features, output: ``[*, K]``
         """
-        if self.knee is not None:
-            features = signed_log(features, self.knee)
+        if self.compression is not None:
+            features = signed_log(features, self.compression)
         width = self.maximum - self.minimum
         if is_concrete(width) and width.numel() and width.numpy().min() > 0:
             return (2 * ((features - self.minimum) / width) - 1).clamp(-1, 1)
@@ -113,20 +115,22 @@ class FeatureScaler(nn.Module):
 
 
 def _ranges_of(columns: Tensor, compress: bool, tail: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Minimum, maximum and knee of some features ``[N, k]``; ``[k]`` each, with gradients."""
+    """Minimum, maximum, compression scale of features ``[N, k]``, ``[k]`` each, with gradients."""
     ordered = ascending(columns.mT, len(columns))
-    knee = torch.ones_like(ordered[:, 0])
+    compression = torch.ones_like(ordered[:, 0])
     if compress:
         size = ascending(columns.mT.abs(), len(columns))
         middle, largest = _quantile(size, 0.5), size[:, -1]
-        knee = torch.where(middle > 0, middle, torch.where(largest > 0, largest, knee))
-        ordered = signed_log(ordered, knee[:, None])
+        compression = torch.where(
+            middle > 0, middle, torch.where(largest > 0, largest, compression)
+        )
+        ordered = signed_log(ordered, compression[:, None])
     low, high = _quantile(ordered, tail), -_quantile(-ordered.flip(1), tail)
     is_range = low < high
     return (
         torch.where(is_range, low, ordered[:, 0]),
         torch.where(is_range, high, ordered[:, -1]),
-        knee,
+        compression,
     )
 
 

@@ -70,7 +70,7 @@ class SolveReport:
     left_out: float | None = None
     elsewhere: float | None = None
 
-    def facts(self) -> dict[str, Any]:
+    def metadata(self) -> dict[str, Any]:
         """All of it as JSON holds it; an infinite number is the string ``"inf"``."""
         return {
             name: str(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,9 +1,9 @@
-"""The door to the native engine (``engine.cpp`` and its neighbours), through ctypes.
+"""ctypes bindings of the native engine (``engine.cpp`` and its neighbours).
 
 The library lies beside this file if the package was installed, or is built at the first use, into
-this folder or the user's cache. Without it (no compiler, or the environment has
-``TACTSLIP_NATIVE=0``) what it does is done by torch; ``why_not`` tells. ``TACTSLIP_NATIVE=v3`` uses
-no instruction set beyond AVX2, ``v2`` the one of any 64-bit processor.
+this folder or the user's cache. Without it (no compiler, or ``TACTSLIP_NATIVE=0``) what it does is
+done by torch; ``reason_unavailable`` tells why. ``TACTSLIP_NATIVE=v3`` uses no instruction set
+beyond AVX2, ``v2`` the one of any 64-bit processor.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class _Pool(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("num_channels", "num_families", "num_statistics")),
         *((name, ctypes.c_void_p) for name in (
-            "channels", "inputs", "statistics", "columns", "fractions", "knees")),
+            "channels", "inputs", "statistics", "columns", "fractions", "scales")),
     )  # fmt: skip
 
 
@@ -98,7 +98,7 @@ class _Machine(ctypes.Structure):
             "most_channels")),
         *((name, ctypes.c_void_p) for name in (
             "single_inputs", "single_columns", "single_channels", "pools", "fill", "minimum",
-            "maximum", "knee", "imputation", "quadratic", "linear")),
+            "maximum", "compression", "imputation", "quadratic", "linear")),
         ("constant", ctypes.c_double),
     )  # fmt: skip
 
@@ -120,8 +120,8 @@ class _Onset(ctypes.Structure):
             "num_fast", "num_slow", "num_filters", "num_windows", "num_steps", "num_columns",
             "hop", "context", "memory", "step_length")),
         *((name, ctypes.c_void_p) for name in (
-            "fast", "slow", "windows", "filters", "steps", "fast_knee", "slow_knee", "slope",
-            "offset", "quadratic", "linear", "silence")),
+            "fast", "slow", "windows", "filters", "steps", "fast_compression", "slow_compression",
+            "slope", "offset", "quadratic", "linear", "silence")),
         ("constant", ctypes.c_double),
         ("min_alive", ctypes.c_int64),
         ("most_lost", ctypes.c_int64),
@@ -364,14 +364,14 @@ class Pool:
         inputs: each descriptor of all channels, ``[R, m]``.
         statistics: mean, std, min, max, or the place of an order statistic, from 0 to 1.
         columns: that they are, ``[statistics, R]``; -1: not wanted.
-        knees: of the descriptors, ``[R]``.
+        scales: compression scales of the descriptors, ``[R]``.
     """
 
     channels: Sequence[int]
     inputs: Array
     statistics: Sequence[str | float]
     columns: Array
-    knees: Array
+    scales: Array
 
 
 class Machine(_Kept):
@@ -384,7 +384,7 @@ class Machine(_Kept):
         pools: what is; their columns and the singles' are all there are.
         fill: columns where no channel of their kind is in use.
         imputation: scaled columns of lost channels; None: they stay as they are.
-        scaling: minimum, maximum and, if columns are compressed, knee; None: nothing is scaled.
+        scaling: minimum, maximum and compression scales (or None); None: nothing is scaled.
         head: quadratic part ``[K, K]`` (or empty), linear part and constant; None: no score.
     """
 
@@ -408,7 +408,7 @@ class Machine(_Kept):
             kinds = ("mean", "std", "min", "max")
             codes = [kinds.index(s) if isinstance(s, str) else len(kinds) for s in pool.statistics]
             fractions = [0.0 if isinstance(s, str) else s for s in pool.statistics]
-            to.num_channels, to.num_families = len(pool.channels), len(pool.knees)
+            to.num_channels, to.num_families = len(pool.channels), len(pool.scales)
             to.num_statistics = len(codes)
             for name, values in (
                 ("channels", pool.channels),
@@ -418,7 +418,7 @@ class Machine(_Kept):
             ):
                 setattr(to, name, self._array(values, np.int64))
             to.fractions = self._array(fractions, np.float64)
-            to.knees = self._array(pool.knees, np.float64)
+            to.scales = self._array(pool.scales, np.float64)
         self._held.append(made)
         places = np.array(singles, np.int64).reshape(-1, 3)
         self.of = _Machine(
@@ -430,7 +430,7 @@ class Machine(_Kept):
             self.of.fill = self._array(fill, np.float64)
         if imputation is not None:
             self.of.imputation = self._array(imputation, np.float64)
-        for name, array in zip(("minimum", "maximum", "knee"), scaling or (), strict=False):
+        for name, array in zip(("minimum", "maximum", "compression"), scaling or (), strict=False):
             setattr(self.of, name, None if array is None else self._array(array, np.float64))
         if head is not None:
             quadratic, linear, constant = head
@@ -505,7 +505,7 @@ class OnsetEngine(_Kept):
         memory: blocks that a score rests on.
         filters: a block with its context to the outputs of all filters.
         steps: means of the last blocks to steps.
-        knees: of the filters and of the steps.
+        scales: compression scales of the filters and of the steps.
         scaling: factor and offset of each column, which is then clipped to [-1, 1].
         head: quadratic part (or empty), linear part and constant.
         silence: half the log power of a silent channel.
@@ -529,7 +529,7 @@ class OnsetEngine(_Kept):
         memory: int,
         filters: Array,
         steps: Array,
-        knees: tuple[Sequence[float], Sequence[float]],
+        scales: tuple[Sequence[float], Sequence[float]],
         scaling: tuple[Array, Array],
         head: tuple[Array, Array, float],
         silence: Array,
@@ -539,7 +539,7 @@ class OnsetEngine(_Kept):
         super().__init__()
         length, num_filters, hop = filters.shape
         quadratic, linear, constant = head
-        arrays = filters, steps, *knees, *scaling, quadratic, linear, silence
+        arrays = filters, steps, *scales, *scaling, quadratic, linear, silence
         places = [self._array(each, np.float64) if len(each) else None for each in arrays]
         self._of = _Onset(
             len(fast), len(slow), num_filters, len(windows), steps.shape[1], len(linear),
@@ -640,13 +640,13 @@ def backend_of(name: BackendName) -> Literal["native", "torch"]:
     if name not in get_args(BackendName):
         known = ", ".join(get_args(BackendName))
         raise ValueError(f"backend must be one of {known}, got {name!r}")
-    trouble = "" if name == "torch" else why_not()
+    trouble = "" if name == "torch" else reason_unavailable()
     if trouble and name == "native":
         raise ValueError(f'backend "native" cannot be used: {trouble}')
     return "torch" if trouble or name == "torch" else "native"
 
 
-def why_not() -> str:
+def reason_unavailable() -> str:
     """Why the engine cannot be used here, and the remedy; empty if it can. Builds it if need be."""
     loaded = _loaded()
     return loaded if isinstance(loaded, str) else ""

@@ -24,7 +24,7 @@ REMEDY = (
     "(features and simulation are then several times slower)"
 )
 _HERE = Path(__file__).parent
-_SOURCES = ("engine.h", "vectors.h", "engine.cpp", "bristles.cpp", "onset.cpp", "door.cpp")
+_SOURCES = ("engine.h", "vectors.h", "engine.cpp", "bristles.cpp", "onset.cpp", "dispatch.cpp")
 _FLAGS = [
     *(
         "-O3",
@@ -76,7 +76,7 @@ def build_library(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as name:
         there = Path(name)
-        jobs = [(["door.cpp"], "door.o")]
+        jobs = [(["dispatch.cpp"], "dispatch.o")]
         for level in (2, 3, 4) if _is_x86() else (1,):
             entries = {"engine": "features", "bristles": "bristles", "onset": "onset"}
             for source, entry in entries.items():

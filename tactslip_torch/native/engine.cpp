@@ -6,7 +6,7 @@
 // before it is described: row = centre + span * d, with d in double or float. One sort of d feeds
 // median, mode, iqr and entropy.
 //
-// This file is compiled once for each instruction set (door.cpp chooses). Only vector types are
+// This file is compiled once for each instruction set (dispatch.cpp chooses). Only vector types are
 // used that GCC and clang share, no intrinsics, and nothing of the C++ runtime.
 
 #include <stdlib.h>
@@ -709,13 +709,13 @@ INLINE D log1p_of(D x) {
   return k * ln2_hi - ((half - (s * (half + r) + (k * ln2_lo + lost / u))) - f);
 }
 
-// sign(x) knee log(1 + |x| / knee)
-INLINE D signed_log(D x, D knee) {
-  D size = x < 0 ? -x : x, ratio = size / knee, bent = knee * log1p_of(ratio);
+// sign(x) scale log(1 + |x| / scale)
+INLINE D signed_log(D x, D scale) {
+  D size = x < 0 ? -x : x, ratio = size / scale, bent = scale * log1p_of(ratio);
   auto is_far = ratio > LARGEST;
   if (any(is_far))
     for (int k = 0; k < DL; ++k)
-      if (is_far[k]) bent[k] = knee[k] * fmax(log(fmax(size[k], knee[k])) - log(knee[k]), 0x1.62e42fefa39efp9);
+      if (is_far[k]) bent[k] = scale[k] * fmax(log(fmax(size[k], scale[k])) - log(scale[k]), 0x1.62e42fefa39efp9);
   bent = ratio < 0x1p-1022 ? size : bent;  // a denormal ratio has lost its digits
   return x < 0 ? -bent : bent;
 }
@@ -774,9 +774,9 @@ struct Judge {
       count += in_use[c];
     }
     for (int64_t r = 0; r < p.num_families; ++r) {
-      D mean = {}, square = {}, low = {}, high = {}, last = {}, knee = D{} + p.knees[r];
+      D mean = {}, square = {}, low = {}, high = {}, last = {}, scale = D{} + p.scales[r];
       for (int64_t c = 0; c < p.num_channels; ++c) {
-        D value = signed_log(x[p.inputs[r * p.num_channels + c]], knee);
+        D value = signed_log(x[p.inputs[r * p.num_channels + c]], scale);
         values[c] = in_use[c] > 0 ? value : D{};
         mean += values[c];
         last = larger(last, values[c]);
@@ -814,7 +814,7 @@ struct Judge {
   }
 
   D scale(int64_t i, D value) {
-    if (machine.knee) value = signed_log(value, D{} + machine.knee[i]);
+    if (machine.compression) value = signed_log(value, D{} + machine.compression[i]);
     double width = machine.maximum[i] - machine.minimum[i];
     if (!(width > 0)) return value - value;  // 0; NaN stays NaN
     value = 2 * ((value - machine.minimum[i]) / width) - 1;

@@ -66,7 +66,7 @@ struct Pool {
   int64_t num_channels, num_families, num_statistics;
   const int64_t *channels, *inputs;  // in the hand; [families, channels]
   const int64_t *statistics, *columns;  // [statistics]; [statistics, families], -1: not wanted
-  const double *fractions, *knees;  // of orders among ascending values, from 0 to 1; [families]
+  const double *fractions, *scales;  // of orders among ascending values, from 0 to 1; [families]
 };
 
 // From inputs (features) to columns, to scaled columns, and to a score.
@@ -74,7 +74,7 @@ struct Machine {
   int64_t num_channels, num_inputs, num_columns, num_singles, num_pools, most_channels;
   const int64_t *single_inputs, *single_columns, *single_channels;  // columns that are not pooled
   const Pool* pools;
-  const double *fill, *minimum, *maximum, *knee;  // [columns]; null: not pooled, scaled, compressed
+  const double *fill, *minimum, *maximum, *compression;  // [columns]; null: not pooled, scaled, compressed
   const double* imputation;  // [columns], scaled, of a lost channel; null: columns stay as they are
   const double *quadratic, *linear;  // lower triangle, off its diagonal twice; null: none
   double constant;
@@ -96,7 +96,7 @@ struct Onset {
   int64_t hop, context, memory, step_length;  // samples, samples, blocks, blocks
   const int64_t *fast, *slow, *windows;       // channels; blocks, ascending
   const double *filters, *steps;  // [context + hop, filters, hop], [step_length, steps]
-  const double *fast_knee, *slow_knee, *slope, *offset, *quadratic, *linear;  // quadratic may be null
+  const double *fast_compression, *slow_compression, *slope, *offset, *quadratic, *linear;  // quadratic may be null
   const double* silence;  // [fast, filters], half the log power of a silent channel
   double constant;
   int64_t min_alive, most_lost;  // fast channels; lost blocks in a row until all begins anew

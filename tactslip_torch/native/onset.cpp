@@ -44,9 +44,9 @@ struct Hop {
         for (int64_t j = 0; j < num_heard; ++j) heard[j] += x * weights[j];
       }
       for (int64_t b = 0; b < num_filters; ++b) {
-        double square = 0.0, knee = own.fast_knee[b];
+        double square = 0.0, scale = own.fast_compression[b];
         for (int64_t i = b * own.hop; i < (b + 1) * own.hop; ++i) square += heard[i] * heard[i];
-        row[f * num_filters + b] = 0.5 * log(square / (double)own.hop + knee * knee);
+        row[f * num_filters + b] = 0.5 * log(square / (double)own.hop + scale * scale);
       }
     }
     for (int64_t s = 0; s < own.num_slow; ++s) {
@@ -142,7 +142,7 @@ struct Hop {
       for (int64_t d = 0; d < num_steps; ++d)
         for (int64_t s = 0; s < num_slow; ++s) {
           double& step = steps[d * num_slow + s];
-          double knee = own.slow_knee[d], size = log(fabs(step) + knee), over = size - log(knee);
+          double scale = own.slow_compression[d], size = log(fabs(step) + scale), over = size - log(scale);
           way[d * num_slow + s] = step > 0.0 ? over : step < 0.0 ? -over : 0.0 * over;
           step = size;
         }

@@ -186,7 +186,7 @@ class BaselineDetector:
             "window_lengths": frames,
             "kernels": {k: v for k, v in self.channel_filter.kernels.items() if k in frames},
         }
-        return FeaturePool(hand, **self.pool.facts(), backend="torch"), ChannelFilter(**settings)
+        return FeaturePool(hand, **self.pool.config(), backend="torch"), ChannelFilter(**settings)
 
 
 def _log_of_largest(

@@ -55,7 +55,7 @@ STEPS_S = (
 MEAN_HOPS = 3
 """Over which the score is averaged: a knock is over sooner than a slip begins."""
 _NUMBERS: Mapping[str, Any] = {"hop_samples": int, "mains_hz": float, "comb_periods": int}
-_KNEES = ("fast_knee", "slow_knee")
+_SCALES = ("fast_compression", "slow_compression")
 FEWEST_BLOCK_SAMPLES = 4
 """Of a block that counts as still where all its samples are one value."""
 _LEAST_RISE = 1e-6  # of a floor over that of silence, in half the log power
@@ -65,7 +65,7 @@ class Blocks(NamedTuple):
     """What is kept of a stream: a column for each block of ``hop_samples``.
 
     Attributes:
-        power: of each fast channel and filter, mean square and knee, ``[F, B, m]``.
+        power: of each fast channel and filter, mean square and compression scale, ``[F, B, m]``.
         mean: of each slow channel, ``[S, m]``.
         moves: whether the block's own samples of a fast channel are not all one value,
             ``[F, m]``, bool; of blocks of fewer than 4 samples always. Not kept.
@@ -84,8 +84,8 @@ class OnsetEvidence:
         hand: the channels; at least one is fast.
         sample_rate_hz: of the stream.
         hop_samples: length of a block, and distance of decisions.
-        fast_knee: root mean square that counts as silence, of each filter, ``[B]``.
-        slow_knee: step that counts as none, of each of ``STEPS_S``, ``[D]``.
+        fast_compression: root mean square that counts as silence, of each filter, ``[B]``.
+        slow_compression: step that counts as none, of each of ``STEPS_S``, ``[D]``.
         mains_hz: whose period the comb has.
         comb_periods: over how many it takes the mean.
         least_rms: root mean square of each fast channel and filter, ``[F, B]``, below which the
@@ -93,15 +93,15 @@ class OnsetEvidence:
         min_alive: fast channels that must be alive for evidence; ``None``: half of them.
 
     Raises:
-        ValueError: if the hand has no fast channel, a hop is longer than 5 ms, or a knee is not
+        ValueError: if the hand has no fast channel, a hop is longer than 5 ms, or a scale is not
             positive and finite.
     """
 
     hand: HandLayout
     sample_rate_hz: float
     hop_samples: int
-    fast_knee: tuple[float, ...] = (1e-30,) * (len(WIDTHS_S) + 1)
-    slow_knee: tuple[float, ...] = (1e-30,) * len(STEPS_S)
+    fast_compression: tuple[float, ...] = (1e-30,) * (len(WIDTHS_S) + 1)
+    slow_compression: tuple[float, ...] = (1e-30,) * len(STEPS_S)
     mains_hz: float = 50.0
     comb_periods: int = 1
     least_rms: tuple[tuple[float, ...], ...] = ()
@@ -118,11 +118,11 @@ class OnsetEvidence:
                 f"a hop of {self.hop_samples} samples at {self.sample_rate_hz:g} Hz is no hop of "
                 "at most 5 ms"
             )
-        knees = [*self.fast_knee, *self.slow_knee]
-        num_knees = len(WIDTHS_S) + 1 + len(STEPS_S)
-        if len(knees) != num_knees or not all(0 < knee < float("inf") for knee in knees):
-            raise ValueError(f"expected {num_knees} positive and finite knees, got {knees}")
-        shape = (len(self.hand.fast), len(self.fast_knee))
+        scales = [*self.fast_compression, *self.slow_compression]
+        num_scales = len(WIDTHS_S) + 1 + len(STEPS_S)
+        if len(scales) != num_scales or not all(0 < scale < float("inf") for scale in scales):
+            raise ValueError(f"expected {num_scales} positive and finite scales, got {scales}")
+        shape = (len(self.hand.fast), len(self.fast_compression))
         least = np.array(self.least_rms or np.zeros(shape), np.float64)
         if least.shape != shape or not (np.isfinite(least) & (least >= 0)).all():
             raise ValueError(f"least_rms must be finite, at least 0 and {list(shape)}")
@@ -140,9 +140,9 @@ class OnsetEvidence:
         Minus infinity for a channel that was still in the usual block of training, such as one of
         few counts: it is never silent.
         """
-        knee = np.array(self.fast_knee)
-        least = np.array(self.least_rms or np.zeros((len(self.hand.fast), len(knee))))
-        silence = np.log(np.hypot(knee, least)) + _LEAST_RISE
+        scale = np.array(self.fast_compression)
+        least = np.array(self.least_rms or np.zeros((len(self.hand.fast), len(scale))))
+        silence = np.log(np.hypot(scale, least)) + _LEAST_RISE
         if self.least_rms:
             silence[(least == 0).all(-1)] = -np.inf
         return torch.from_numpy(silence.T.copy())
@@ -170,7 +170,7 @@ class OnsetEvidence:
     @cached_property
     def num_columns(self) -> int:
         """``K``."""
-        num_rows = len(WINDOWS_S) * len(self.fast_knee)
+        num_rows = len(WINDOWS_S) * len(self.fast_compression)
         num = num_rows * (3 if len(self.hand.fast) > 1 else 1)
         num_slow = len(self.hand.slow)
         return num + 2 * len(STEPS_S) * (3 if num_slow > 1 else num_slow)
@@ -227,8 +227,10 @@ class OnsetEvidence:
         hop, context = self.hop_samples, self.context
         frames = x[list(self.hand.fast)].unfold(-1, context + hop, hop)  # [F, k, context + hop]
         heard = (frames - frames[..., :1]) @ torch.from_numpy(self.filter_matrix).flatten(1)
-        square = heard.unflatten(-1, (len(self.fast_knee), hop)).square().mean(-1)  # [F, k, B]
-        power = square.mT + torch.from_numpy(np.square(self.fast_knee))[:, None]
+        square = (
+            heard.unflatten(-1, (len(self.fast_compression), hop)).square().mean(-1)
+        )  # [F, k, B]
+        power = square.mT + torch.from_numpy(np.square(self.fast_compression))[:, None]
         mean = x[list(self.hand.slow), context:].unfold(-1, hop, hop).mean(-1)
         own = frames[..., context:]
         moves = (own != own[..., :1]).any(-1) | (hop < FEWEST_BLOCK_SAMPLES)
@@ -294,9 +296,9 @@ class OnsetEvidence:
         columns = _over_channels(rises, in_use, len(self.hand.fast))
         columns = [torch.cat(columns, 1).flatten(-2)]
         if num_slow := len(self.hand.slow):
-            knee = torch.tensor(self.slow_knee, dtype=torch.float64)[:, None]
-            size = (steps.abs() + knee).log()
-            way = steps.sign() * (size - knee.log())
+            scale = torch.tensor(self.slow_compression, dtype=torch.float64)[:, None]
+            size = (steps.abs() + scale).log()
+            way = steps.sign() * (size - scale.log())
             both = torch.cat([size.unsqueeze(1), way.unsqueeze(1)], 1)  # [k, 2, D, S]
             pools = _over_channels(both, size.sum(1).isfinite() & slow, num_slow)
             columns.append(torch.cat(pools, -1).flatten(-2))
@@ -307,7 +309,7 @@ class OnsetEvidence:
         """All but the hand and the sample rate, which are the detector's."""
         plain = {name: getattr(self, name) for name in (*_NUMBERS, "min_alive")}
         plain["least_rms"] = [list(row) for row in self.least_rms]
-        return plain | {name: list(getattr(self, name)) for name in _KNEES}
+        return plain | {name: list(getattr(self, name)) for name in _SCALES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,7 +378,7 @@ class OnsetClassifier:
             return torch.tensor(plain[name], dtype=torch.float64)
 
         numbers = {name: kind(plain[name]) for name, kind in _NUMBERS.items()}
-        numbers |= {name: tuple(map(float, plain[name])) for name in _KNEES}
+        numbers |= {name: tuple(map(float, plain[name])) for name in _SCALES}
         numbers["least_rms"] = tuple(tuple(map(float, row)) for row in plain["least_rms"])
         numbers["min_alive"] = int(plain["min_alive"])
         evidence, num = OnsetEvidence(hand, sample_rate_hz, **numbers), len(plain["linear"])
@@ -423,7 +425,7 @@ class OnsetStream:
         self._held: Array | None = None
         self._all = np.ones(len(evidence.hand), bool)
         # half the log powers of blocks, and behind them the means
-        width = len(evidence.hand.fast) * len(evidence.fast_knee) + len(evidence.hand.slow)
+        width = len(evidence.hand.fast) * len(evidence.fast_compression) + len(evidence.hand.slow)
         self._rows, self._num_rows = np.empty((4 * evidence.memory, width)), 0
         self._num_lost = 0
         self._scores = np.full(MEAN_HOPS - 1, math.nan)  # of the last blocks that are not lost
@@ -484,7 +486,10 @@ class OnsetStream:
         self, x: Array, rows: Array, num_rows: int, num_lost: int, listened: Array
     ) -> tuple[Array, Array, int, int]:
         """As ``native.OnsetEngine``."""
-        evidence, num_filters = self._classifier.evidence, len(self._classifier.evidence.fast_knee)
+        evidence, num_filters = (
+            self._classifier.evidence,
+            len(self._classifier.evidence.fast_compression),
+        )
         made = evidence.blocks(torch.from_numpy(x))
         logs = (made.power.log() * 0.5).transpose(1, 2)  # [F, k, B]
         fast = listened[list(evidence.hand.fast)]
@@ -530,7 +535,7 @@ def _engine_of(classifier: OnsetClassifier, most_lost: int) -> OnsetEngine:
         memory=evidence.memory,
         filters=evidence.filter_matrix,
         steps=evidence.step_matrix.numpy(),
-        knees=(evidence.fast_knee, evidence.slow_knee),
+        scales=(evidence.fast_compression, evidence.slow_compression),
         scaling=(slope, offset),
         head=(quadratic, head.linear.numpy(), float(head.constant)),
         silence=evidence.silence.T.numpy(),

@@ -178,7 +178,7 @@ def timing_table(timing_s: Mapping[str, float]) -> str:
 
 
 def solve_line(solve: Mapping[str, Any]) -> str:
-    """How the machine was solved for, in a line: ``SolveReport.facts`` in words."""
+    """How the machine was solved for, in a line: ``SolveReport.metadata`` in words."""
     line = (
         f"solved by {solve['method']}: {solve['rank']} of {solve['size']} unknowns, condition "
         f"{float(solve['condition']):.1e}, relative error of the weights about "

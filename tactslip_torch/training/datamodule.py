@@ -296,7 +296,7 @@ class FeatureMaker:
             "recording": dict(self.source.key(recording)),
             "starts": bins.starts.tolist(),
             "bin_samples": bins.bin_samples,
-            "wavelet": [pool.facts()["wavelet"], pool.level],
+            "wavelet": [pool.config()["wavelet"], pool.level],
             "spectrum": [pool.spectrum, pool.arithmetic],
             "filter": list(self.channel_filter.config().values()),
             "dtype": str(self.dtype),

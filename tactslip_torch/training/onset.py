@@ -37,9 +37,9 @@ _BEFORE_S = 0.3  # before a slip, a kind of negatives of its own
 _MOST_HOPS, _MOST_LIKE = 20, 60  # of a recording and kind: at even distances; most like a slip
 _FIRST_HOPS, _FIRST_RECORDINGS = 100, 60  # of the first machine
 _KERNEL = Polynomial(2)
-_FAST_KNEE, _SLOW_KNEE = 0.1, 1.0  # of what is usual in training
-_LEAST_KNEE = 1e-30
-_KNEE_RECORDINGS = 12
+_FAST_SCALE, _SLOW_SCALE = 0.1, 1.0  # of what is usual in training
+_LEAST_SCALE = 1e-30
+_SCALE_RECORDINGS = 12
 _TAIL = 0.001  # of hops whose columns are clipped at either end
 _ONSET = "onset"
 Array = NDArray[np.float64]
@@ -92,14 +92,17 @@ class OnsetTraining:
             mains_hz=self.mains_hz,
             comb_periods=self.comb_periods,
         )
-        usual, some = partial(_knees, source, evidence), _some(recordings, _KNEE_RECORDINGS)
-        knees = in_processes(usual, some, "onsets, scales", "recording", num_workers)
-        *usual_of, rms = zip(*knees, strict=True)
+        usual, some = (
+            partial(_compression_scales, source, evidence),
+            _some(recordings, _SCALE_RECORDINGS),
+        )
+        scales = in_processes(usual, some, "onsets, scales", "recording", num_workers)
+        *usual_of, rms = zip(*scales, strict=True)
         fast, slow = (
-            tuple(np.maximum(np.median(np.stack(of), 0), _LEAST_KNEE).tolist()) for of in usual_of
+            tuple(np.maximum(np.median(np.stack(of), 0), _LEAST_SCALE).tolist()) for of in usual_of
         )
         least = SILENT_FRACTION * np.min(np.stack(rms), 0)
-        evidence, first = replace(evidence, fast_knee=fast, slow_knee=slow), None
+        evidence, first = replace(evidence, fast_compression=fast, slow_compression=slow), None
         evidence = replace(evidence, least_rms=tuple(map(tuple, least.tolist())))
         for own in (_some(recordings, _FIRST_RECORDINGS), recordings):
             read = partial(_hops, source, evidence, first)
@@ -136,20 +139,20 @@ def _some(recordings: Sequence[RecordingId], number: int) -> Sequence[RecordingI
     return recordings[:: -(-len(recordings) // number)]
 
 
-def _knees(
+def _compression_scales(
     source: RecordingSource, evidence: OnsetEvidence, recording: RecordingId
 ) -> tuple[Array, Array, Array]:
     """A tenth of the usual root power of each filter, the usual step, each channel's own power."""
     blocks = evidence.blocks_of_recording(source.load(recording).samples)
     rms = blocks.power.sqrt()  # [F, B, k]
     fast = rms.transpose(0, 1).flatten(1).nanmedian(-1).values
-    steps = torch.zeros(1, 1, len(evidence.slow_knee))
+    steps = torch.zeros(1, 1, len(evidence.slow_compression))
     if source.hand.slow:
         steps = blocks.mean.unfold(-1, len(evidence.step_matrix), 1) @ evidence.step_matrix
     slow = steps.abs().flatten(0, 1).nanmedian(0).values
-    knee = torch.tensor(evidence.fast_knee).square()[:, None]
-    usual = (blocks.power - knee).clamp(min=0).sqrt().nanmedian(-1).values.nan_to_num(0.0)
-    return _FAST_KNEE * fast.numpy(), _SLOW_KNEE * slow.numpy(), usual.numpy()
+    scale = torch.tensor(evidence.fast_compression).square()[:, None]
+    usual = (blocks.power - scale).clamp(min=0).sqrt().nanmedian(-1).values.nan_to_num(0.0)
+    return _FAST_SCALE * fast.numpy(), _SLOW_SCALE * slow.numpy(), usual.numpy()
 
 
 def _hops(

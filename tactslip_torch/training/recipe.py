@@ -118,7 +118,7 @@ class Fit(_Plan):
             "validation": self.validation,
             "nested_validation": self.nested,
             "head": self.head.cost._asdict(),
-            "solve": {} if self.head.solved is None else self.head.solved.facts(),
+            "solve": {} if self.head.solved is None else self.head.solved.metadata(),
             "feature_filter": self.feature_filter,
         }
 
@@ -137,7 +137,7 @@ class Fit(_Plan):
             metadata: to be kept with it, JSON-able.
             backend: of features; by default that of the pool.
         """
-        whole = FeaturePool(pool.hand, **pool.facts(), backend=backend or pool.backend)
+        whole = FeaturePool(pool.hand, **pool.config(), backend=backend or pool.backend)
         selection = self.selection
         return SlipDetector(
             whole,

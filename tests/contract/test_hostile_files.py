@@ -36,7 +36,7 @@ from tactslip_torch.data.formats import pieces
 from tactslip_torch.data.manifest import read_manifest
 from tactslip_torch.deploy.export import export_detector, read_sidecar, summary
 from tactslip_torch.model.moments import SufficientStats
-from tactslip_torch.own_files import (
+from tactslip_torch.package_files import (
     DETECTOR,
     SUMS,
     load_table,

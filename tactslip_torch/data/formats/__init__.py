@@ -91,7 +91,7 @@ class Format:
             path: of the file or folder.
             recording: samples in float32 or float64; tuples in its provenance come back as lists.
             hand: its channels, in the order of its rows.
-            key: JSON-able facts that determined the samples, kept to find the file again.
+            key: JSON-able metadata that determined the samples, kept to find the file again.
 
         Raises:
             ValueError: if the format's library is absent, the hand has another number of channels,

@@ -22,7 +22,7 @@ from torch import Tensor
 from tactslip_torch.hand import Adapting
 from tactslip_torch.runtime import content_digest, regular_file, whole_file
 
-FORGED = (
+DAMAGE_ERRORS = (
     ArithmeticError,
     AttributeError,
     EOFError,
@@ -55,7 +55,7 @@ def save_table(
     text = json.dumps(metadata, sort_keys=True)
     content = {
         "format": form,
-        "facts": text,
+        "metadata": text,
         "tensors": {name: _alone(tensors[name]) for name in sorted(tensors)},
         "digest": _digest(text, tensors),
     }
@@ -88,7 +88,7 @@ def load_table(
     if content["format"] != form:
         raise ValueError(f"{name} must be of format {form!r}, got {content['format']!r:.80}")
     try:
-        metadata, tensors = content["facts"], content["tensors"]
+        metadata, tensors = content["metadata"], content["tensors"]
         is_whole = all(map(Tensor.is_contiguous, tensors.values()))  # else larger than the file
         is_whole = is_whole and content["digest"] == _digest(metadata, tensors)
         metadata = json.loads(metadata)
@@ -320,8 +320,8 @@ _ONSET = {
     "hop_samples": _number(1, 10**5, whole=True),
     "mains_hz": _number(10, 1000),
     "comb_periods": _number(1, 16, whole=True),
-    "fast_knee": [_positive, 64],
-    "slow_knee": [_positive, 64],
+    "fast_compression": [_positive, 64],
+    "slow_compression": [_positive, 64],
     **{name: [_finite, 4096] for name in ("minimum", "maximum", "linear")},
     "quadratic": [[_finite, 4096], 4096],
     "constant": _finite,
@@ -385,8 +385,8 @@ _CHECKPOINT = {
     },
     "*": object,
 }
-DETECTOR = "tactslip_torch detector 4"
-SUMS = "tactslip_torch sums 2"
+DETECTOR = "tactslip_torch detector 5"
+SUMS = "tactslip_torch sums 3"
 SIDECAR = "tactslip_torch onnx 2"
 SCHEMAS: Mapping[str, Wanted] = {
     DETECTOR: {
@@ -405,7 +405,7 @@ SCHEMAS: Mapping[str, Wanted] = {
     SUMS: {
         "num_features": _number(1, 10**5, whole=True),
         "degree?": _one_of(1, 2),
-        "about?": {"*": object},
+        "metadata?": {"*": object},
         "batches": {"*": str},
     },
     SIDECAR: {
