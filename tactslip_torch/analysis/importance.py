@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.bin_sample import SampledBins
+from tactslip_torch.analysis.old.bin_sample import SampledBins
+from tactslip_torch.analysis.old.recipe import FeatureSelection
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.selection import rank_distinct
 from tactslip_torch.hand import HandLayout
@@ -26,7 +27,6 @@ from tactslip_torch.model.fit import HeldOut, TrainingBins
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import bar, thread_map
-from tactslip_torch.training.recipe import FeatureSelection
 
 _COVERAGE = 0.95
 

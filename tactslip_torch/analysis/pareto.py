@@ -34,13 +34,30 @@ from tactslip_torch.analysis.latency import (
     time_calls,
     time_detector,
 )
+from tactslip_torch.analysis.old.bin_sample import SampledBins
+from tactslip_torch.analysis.old.plan import (
+    Structure,
+    TrainingPass,
+    choose_model,
+    fitted_selection,
+    plan_detector,
+    solve_metadata,
+    validate,
+)
+from tactslip_torch.analysis.old.recipe import (
+    FeatureSelection,
+    Recipe,
+    balanced_accuracy,
+    sample_weight,
+    scaled_selection,
+)
+from tactslip_torch.analysis.old.statistics import TrainingStatistics
 from tactslip_torch.analysis.raw_bins import bins_inside
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
 from tactslip_torch.deploy.bins import bin_graph
 from tactslip_torch.deploy.check import session_of
 from tactslip_torch.features.bank import make_plan
-from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.groups import Channels, Components, allowed, of_fingers
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import Arithmetic, FeaturePool
@@ -51,29 +68,12 @@ from tactslip_torch.features.selection import (
     rank_weighted,
     t_scores,
 )
-from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.runtime import bar, check_number, one_thread, steps, thread_map
 from tactslip_torch.signals.filtering import Align
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule, training_origin
-from tactslip_torch.training.plan import (
-    Structure,
-    TrainingPass,
-    choose_model,
-    fitted_selection,
-    plan_detector,
-    solve_metadata,
-    validate,
-)
-from tactslip_torch.training.recipe import (
-    FeatureSelection,
-    Recipe,
-    balanced_accuracy,
-    sample_weight,
-    scaled_selection,
-)
 
 _MODEL_ERRS = (1.5, 1.0, 1 / 1.5)  # modelled compute over what will be measured
 _FEW_NUMBERS = 20
@@ -402,7 +402,7 @@ class ParetoSearch:
         self.training_statistics: dict[Align, TrainingStatistics] = {}
         self._samples: dict[Align, SampledBins] = {}
         self._data = {
-            align: SlipDataModule(maker, fold, num_workers) for align, maker in makers.items()
+            align: SlipDataModule(maker, [fold], num_workers) for align, maker in makers.items()
         }
         first = next(iter(makers.values()))
         self.pool, self.source, self.backend = first.pool, first.source, first.extractor.backend
@@ -432,7 +432,8 @@ class ParetoSearch:
     def _training(self, align: Align, what: str) -> Iterator[tuple[RecordingId, Tensor, Tensor]]:
         """Features of the training bins of each recording, and whether they are slip."""
         with one_thread():  # the processors belong to those who make features
-            for batch in bar(self._data[align].loader(["train"]), what, "recording"):
+            self._data[align].setup()
+            for batch in bar(self._data[align].having("train"), what, "recording"):
                 mask = batch.roles["train"]
                 yield batch.recording, batch.features[mask], batch.is_slip[mask]
 

@@ -21,19 +21,19 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
+from tactslip_torch.analysis.old.bin_sample import BinSample, SampledBins
+from tactslip_torch.analysis.old.plan import plan_detector
+from tactslip_torch.analysis.old.recipe import Recipe, balanced_accuracy, of_recipe
+from tactslip_torch.analysis.old.statistics import TrainingStatistics
 from tactslip_torch.commands.entry import entry_point, leave_results, save_config
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import seen6
-from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.fit import fit_machine
 from tactslip_torch.report.crossval import crossval_figure, crossval_table
-from tactslip_torch.runtime import bar, in_processes, one_thread
+from tactslip_torch.runtime import in_processes, one_thread
 from tactslip_torch.training.datamodule import SlipDataModule
 from tactslip_torch.training.experiment import feature_cache, feature_maker
-from tactslip_torch.training.plan import plan_detector
-from tactslip_torch.training.recipe import Recipe, balanced_accuracy
 
 
 class Materials:
@@ -138,7 +138,7 @@ def crossval(config: DictConfig, folder: Path) -> dict[str, Any]:
             f"num_unseen must leave two of {len(names)} materials to train on, got {num_unseen}"
         )
     recipes: dict[str, Recipe] = {
-        name: replace(recipe, sample_bins=config.train_bins)
+        name: replace(of_recipe(recipe), sample_bins=config.train_bins)
         for name, recipe in instantiate(config.recipes, _convert_="all").items()
     }
     save_config(config, folder)
@@ -188,8 +188,9 @@ def read_materials(
         recipe.allowed(maker.pool)  # refuses before any work
     materials = Materials(maker.pool, config.train_bins, config.scored_bins)
     with feature_cache(config.cache) as maker.cache, one_thread():  # workers need the processors
-        data = SlipDataModule(maker, by_cycle, config.num_workers)
-        for batch in bar(data.loader(["train", "test"]), "features of all materials", "recording"):
+        data = SlipDataModule(maker, [by_cycle], config.num_workers)
+        data.setup()
+        for batch in data.having("train", "test"):
             materials.update(batch, by_cycle.roles[batch.recording])
     return materials
 

@@ -26,27 +26,28 @@ from tactslip_torch.analysis.importance import (
     measure,
     score_gradients,
 )
+from tactslip_torch.analysis.old.bin_sample import BinSample
+from tactslip_torch.analysis.old.recipe import (
+    FeatureSelection,
+    Recipe,
+    of_recipe,
+    sample_groups,
+    sample_weight,
+    scaled_selection,
+)
+from tactslip_torch.analysis.old.statistics import TrainingStatistics
 from tactslip_torch.analysis.raw_bins import draw_bins
 from tactslip_torch.commands.entry import entry_point, leave_results, save_config
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import ROLES, Split
-from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.cache import versions
 from tactslip_torch.features.selection import t_scores
-from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.report.importance import best_table, sensors_csv, sensors_figure, sensors_table
 from tactslip_torch.runtime import bar, check_number, one_thread
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule, training_origin
 from tactslip_torch.training.experiment import feature_cache, features_of
-from tactslip_torch.training.recipe import (
-    FeatureSelection,
-    Recipe,
-    sample_groups,
-    sample_weight,
-    scaled_selection,
-)
 
 FORMAT = "tactslip_torch sensors 1"
 _WHOLE_NUMBERS = {
@@ -94,7 +95,7 @@ def sensors(config: DictConfig, folder: Path) -> dict[str, Any]:
         if trained.detector.pooling is not None and (few is not None or reselect != "ranked"):
             raise ValueError(
                 "this detector pools all features over channels, none are selected again among "
-                "channels; leave out num_features and reselect, or train with recipe=robust"
+                "channels; leave out num_features and reselect, or train with recipe=paper"
             )
         save_config(config, folder)
         refit, ranking = _read(config, trained)
@@ -142,8 +143,10 @@ def _trained(model: Path, cache: Any) -> Trained:
             f"the training recordings of {found} are not those that {model.name} was trained on; "
             "keep both files of a training together, and its data unchanged"
         )
-    maker = features_of(detector, source, instantiate(config.labels), cache)
-    return Trained(detector, source, fold, instantiate(config.recipe, _convert_="all"), maker)
+    maker = features_of(detector, source, instantiate(config.labels), cache, whole=True)
+    return Trained(
+        detector, source, fold, of_recipe(instantiate(config.recipe, _convert_="all")), maker
+    )
 
 
 def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
@@ -151,9 +154,10 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
     pool, recipe = trained.detector.pool, trained.recipe
     statistics = TrainingStatistics(len(pool.names), config.bins)
     others = {role: BinSample(config.scored_bins) for role in ROLES if role != "train"}
-    data = SlipDataModule(trained.maker, trained.fold, config.num_workers)
+    data = SlipDataModule(trained.maker, [trained.fold], config.num_workers)
+    data.setup()
     with one_thread():  # workers need the processors
-        for batch in bar(data.loader(ROLES), "features", "recording"):
+        for batch in bar(data.having(*ROLES), "features", "recording"):
             name, recording = str(batch.recording), batch.recording
             if bool((mask := batch.roles["train"]).any()):
                 stratum = recipe.stratum(recording)

@@ -32,6 +32,7 @@ from tactslip_torch.analysis.latency import (
     Limits,
     time_in_fresh_process,
 )
+from tactslip_torch.analysis.old.recipe import of_recipe
 from tactslip_torch.analysis.pareto import (
     Candidate,
     ParetoSearch,
@@ -94,7 +95,7 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
         timed.sort(key=_preference)
         trial = folder / "trial.pt"
         try:
-            found = common_metadata(search.source, search.pool, config)
+            found = common_metadata(next(iter(search.makers.values())), config)
             found |= _searched(limits, search, candidates, timed)
             found |= {"headroom": config.headroom} | _chosen(config, limits, search, timed, trial)
             found["seconds"] = time.perf_counter() - started
@@ -115,7 +116,7 @@ def _prepared(config: DictConfig, cache: FeatureCache) -> tuple[Limits, ParetoSe
         check_number(name, config[name], whole=True)
     check_number("most_summed", config.most_summed, least=0, whole=True)
     rule: LabelRule = instantiate(config.labels)
-    recipe = instantiate(config.recipe, _convert_="all")
+    recipe = of_recipe(instantiate(config.recipe, _convert_="all"))
     source: RecordingSource = instantiate(config.data, _convert_="all")
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
     if len(folds) > 1:

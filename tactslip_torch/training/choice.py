@@ -256,6 +256,7 @@ class CandidateBins:
         names = inputs = [columns.names[place] for place in chosen.tolist()]
         layer, silence = columns.pooling, None
         if layer is not None:
+            assert self.span_features is not None  # of the pool that layers are of
             if structure.use == "both":
                 layer = layer.with_channels(self.names)
             layer = layer.select([layer.names.index(name) for name in names])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -151,9 +152,8 @@ class FeatureMaker:
         """Hold the features of a recording in memory, unless there is no room for them."""
         size = made.features.numel() * made.features.element_size()
         if has_room := self._kept_bytes + size <= self.memory_gib * 2**30:
-            # copies: tensors of a worker lie in shared memory, and each keeps a file open
-            tensors = {k: v.clone() for k, v in made._asdict().items() if isinstance(v, Tensor)}
-            self._kept[made.recording] = made._replace(**tensors)
+            # a copy: tensors of a worker lie in shared memory, and each keeps a file open
+            self._kept[made.recording] = copy.deepcopy(made)
             self._kept_bytes += size
         return has_room
 
@@ -374,11 +374,11 @@ class SlipDataModule(L.LightningDataModule):
         workers = self.num_workers
         if self._shares_processors and self.trainer is not None:
             workers = max(1, workers // self.trainer.num_devices)
-        loader = DataLoader(
+        loader: DataLoader[RecordingFeatures] = DataLoader(
             recordings,  # type: ignore[arg-type]  # a list is a dataset
             batch_size=None,
             num_workers=workers,
-            collate_fn=self.maker,
+            collate_fn=self.maker,  # type: ignore[arg-type]  # of one
         )
         with one_thread():  # the processors belong to the workers
             for made in bar(loader, "features", "recording", total=len(recordings)):

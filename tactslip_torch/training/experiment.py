@@ -301,11 +301,16 @@ def feature_maker(
 
 
 def features_of(
-    detector: SlipDetector, source: RecordingSource, rule: LabelRule, cache: FeatureCache
+    detector: SlipDetector,
+    source: RecordingSource,
+    rule: LabelRule,
+    cache: FeatureCache,
+    *,
+    whole: bool = False,
 ) -> FeatureMaker:
     """The features that a detector and the baseline it keeps read, computed as in its training."""
     pool, dtype = detector.pool, DTYPES[detector.info.get("features_dtype", "float64")]
-    wanted = set(detector.selected)
+    wanted = set(range(len(pool.names)) if whole else detector.selected)
     if BASELINES in detector.info:
         wanted |= set(Baselines.from_dict(pool, detector.info[BASELINES]).pooled.inputs)
     pool = pool.select(sorted(wanted))

@@ -1,0 +1,1 @@
+"""Machinery of pareto, importance and crossval until they use ``training.recipe``."""
