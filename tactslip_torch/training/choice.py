@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import Sensing, SpanFeatures
@@ -185,8 +186,8 @@ class CandidateBins:
     Args:
         sample: the bins.
         weights: of each of them, ``[n]``.
-        pool: of the features; ``None`` for others, which are not pooled.
-        allowed: which features may be used, ``[F]``, bool; ``None``: all.
+        pool: of the features.
+        allowed: which features may be used, ``[F]``, bool.
         pooling: statistics over channels, as ``ChannelPooling.fit`` takes them.
     """
 
@@ -194,26 +195,19 @@ class CandidateBins:
         self,
         sample: SampledBins,
         weights: Tensor,
-        pool: FeaturePool | None = None,
-        allowed: Tensor | None = None,
+        pool: FeaturePool,
+        allowed: Tensor,
         pooling: str | Sequence[str] | None = None,
     ) -> None:
         self.sample, self.weights, self.pooling = sample, weights, pooling
-        self.is_slip, self.groups, self.group_names = (
-            sample.is_slip,
-            sample.group,
-            sample.group_names,
-        )
-        self.hand = None if pool is None else pool.hand
-        self.span_features, self.spans = None, None
-        names: Sequence[Any] = range(sample.features.shape[1])
-        if pool is not None:
-            names = pool.names
-            self.span_features = SpanFeatures(pool.hand, names, pool.bin_samples)
-            self.spans = self.span_features(sample.features)
-        places = torch.arange(len(names)) if allowed is None else allowed.nonzero()[:, 0]
+        self.is_slip, self.groups = sample.is_slip, sample.group
+        self.group_names = sample.group_names
+        self.hand = pool.hand
+        self.span_features = SpanFeatures(pool.hand, pool.names, pool.bin_samples)
+        self.spans = self.span_features(sample.features)
+        places = allowed.nonzero()[:, 0]
         self.places = places.tolist()
-        self.names = [names[place] for place in self.places]
+        self.names = [pool.names[place] for place in self.places]
         self.features = sample.features[:, places]
         self.is_kept = torch.ones_like(sample.is_slip)
 
@@ -256,7 +250,6 @@ class CandidateBins:
         names = inputs = [columns.names[place] for place in chosen.tolist()]
         layer, silence = columns.pooling, None
         if layer is not None:
-            assert self.span_features is not None  # of the pool that layers are of
             if structure.use == "both":
                 layer = layer.with_channels(self.names)
             layer = layer.select([layer.names.index(name) for name in names])
@@ -290,15 +283,12 @@ class _Columns:
         self.train = train[rows]
         self._is_slip, self._groups = bins.is_slip[train], bins.groups[train]
         features, scaled = bins.features[rows], list[Tensor]()
-        self.names, self.pooling = list[Any](), None
+        self.names, self.pooling = list[FeatureName](), None
         self._places, self._products = dict[str, Tensor](), dict[str, Tensor]()
         for part in sorted(parts):
             x, names = features, bins.names
             if part == "pooled":
-                assert bins.hand is not None  # General.fit
-                assert bins.pooling is not None
-                assert bins.spans is not None
-                assert bins.span_features is not None
+                assert bins.pooling is not None  # General
                 spans = bins.spans[rows]
                 self.sensing = Sensing.fit(spans[self.train], 1, 1)
                 self.is_lost = bins.span_features.is_silent(spans, self.sensing)

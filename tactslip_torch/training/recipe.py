@@ -71,7 +71,7 @@ class _Plan:
     kernel: Polynomial
     penalty: float
     imputation: Tensor
-    sensing: Sensing | None
+    sensing: Sensing
     num_bins: int
     validation: list[dict[str, Any]]
     nested: dict[str, Any] | None = None
@@ -87,7 +87,7 @@ class Fit(_Plan):
         kernel: of the machine.
         penalty: the paper's ``C``.
         imputation: mean of the scaled columns, both classes counting alike; for lost channels.
-        sensing: spans of channels that work, of the training bins; ``None`` without a pool.
+        sensing: spans of channels that work, of the training bins.
         num_bins: how many bins are trained on; about, where classes are undersampled.
         validation: one row per candidate, with the balanced accuracy of each held-out group; the
             one that was taken has ``chosen`` and the ``calibration`` of its held-out scores.
@@ -232,9 +232,9 @@ class _Recipe:
         """
         self.allowed(pool)
 
-    def _filtered(self, allowed: Tensor | None) -> dict[str, Any] | None:
+    def _filtered(self, allowed: Tensor) -> dict[str, Any] | None:
         """What features are restricted to, for files."""
-        if self.feature_filter is None or allowed is None:
+        if self.feature_filter is None:
             return None
         wanted = {
             name: [values] if isinstance(values, str) else list(values)
@@ -244,15 +244,13 @@ class _Recipe:
 
     def _sensing(
         self,
-        pool: FeaturePool | None,
+        pool: FeaturePool,
         selection: FeatureSelection,
         sample: SampledBins,
         longest_run: int | None,
         alive_fraction: float,
-    ) -> Sensing | None:
+    ) -> Sensing:
         """Spans of channels that work, of the training bins of a selection."""
-        if pool is None:
-            return None
         channels = pool.hand.names
         used = sorted({channels.index(pool.names[i].channel) for i in selection.selected})
         num_counted = len(counted_channels(pool.hand, used, selection.pooling is not None))
@@ -338,7 +336,7 @@ class General(_Recipe):
     def fit(
         self,
         bins: Iterable[RecordingBins],
-        pool: FeaturePool | None = None,
+        pool: FeaturePool,
         *,
         is_nested: bool = True,
         show: bool = False,
@@ -347,12 +345,12 @@ class General(_Recipe):
 
         Args:
             bins: training bins; they are gone through twice.
-            pool: of their features; features that are pooled over channels need it.
+            pool: of their features, whole or a selection.
             is_nested: whether to evaluate the choice itself by leaving out two groups.
             show: progress bars.
 
         Raises:
-            ValueError: if a class is absent, a solve fails, or the recipe needs the pool.
+            ValueError: if a class is absent, or a solve fails.
         """
         watch = _Watch()
         drawn, runs = BinSample(self.sample_bins), list[int]()
@@ -392,15 +390,13 @@ class General(_Recipe):
     def _plan(
         self,
         sample: SampledBins,
-        pool: FeaturePool | None,
+        pool: FeaturePool,
         longest_run: int | None,
         is_nested: bool,
         show: bool,
     ) -> tuple[_Plan, dict[str, tuple[float, float]]]:
         """Features, kernel and penalty; and the weights of bins by scene."""
-        if pool is None and set(_several(self.use)) != {"channel"}:
-            raise ValueError("recipe.use=pooled needs the pool of features; hand it over as pool=")
-        allowed = None if pool is None else self.allowed(pool)
+        allowed = self.allowed(pool)
         weights = self.weights(sample)
         table = torch.tensor([weights[scene] for scene in sample.scene_names])
         weight = sample.weight * table.double()[sample.scene, sample.is_slip.long()]
@@ -538,7 +534,7 @@ class Paper(_Recipe):
     def fit(
         self,
         bins: Iterable[RecordingBins],
-        pool: FeaturePool | None = None,
+        pool: FeaturePool,
         *,
         is_nested: bool = True,
         show: bool = False,
@@ -572,21 +568,14 @@ class Paper(_Recipe):
         statistics: _Statistics,
         sample: SampledBins,
         weight: Tensor,
-        pool: FeaturePool | None,
+        pool: FeaturePool,
         show: bool,
     ) -> _Plan:
         """Features, scaling and penalty."""
         moments = statistics.moments
         assert moments is not None  # class_counts
-        places = torch.arange(moments.num_features)
-        allowed = None
-        if pool is not None:
-            allowed = self.allowed(pool)
-            places = places[allowed]
-        elif self.feature_filter is not None:
-            raise ValueError(
-                "recipe.feature_filter needs the names of features; hand over the pool"
-            )
+        allowed = self.allowed(pool)
+        places = allowed.nonzero()[:, 0]
         size = self._size(len(places))
         if size < self.num_features:
             log.warning(

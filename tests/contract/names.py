@@ -20,8 +20,6 @@ from tactslip_torch import (
 )
 
 PACKAGE = "tactslip_torch"
-REPLACED_NEXT = ("features/", "deploy/")
-"""Of the package, what the issue behind this one replaces; not counted in ``modules.py``."""
 BACKENDS = ("torch", "auto")
 """Of ``FeaturePool``: the definitions, and the fastest there is."""
 
