@@ -25,8 +25,8 @@ class Crossval(Benchmark):
     page, has_headings = "docs/recipes.md", False
     quick = (
         'overrides=[data.cycles=4,"materials=[M1,M2,iron]",num_unseen=1,train_bins=20,'
-        'scored_bins=20,"~recipes.paper","~recipes.general",recipes.robust.num_features=10,'
-        '"recipes.robust.penalties=[0.001]"]'
+        'scored_bins=20,"~recipes.general",recipes.paper.num_features=10,'
+        '"recipes.paper.penalties=[0.001]"]'
     )
     drawn: ClassVar = {"crossval.png": ""}
     overrides: tuple[str, ...] = ()

@@ -14,7 +14,7 @@ from benchmarks.crossval import Crossval
 class CrossvalGeneral(Crossval):
     """The general recipe alone."""
 
-    overrides: tuple[str, ...] = ("~recipes.paper", "~recipes.robust")
+    overrides: tuple[str, ...] = ("~recipes.paper",)
     seeds: tuple[int, ...] = (0, 4)
 
 

@@ -33,12 +33,12 @@ class Sensors(Benchmark):
         "selected anew in two ways"
     )
     quick = (
-        'training=[+exp=quick,recipe=robust,recipe.num_features=12,"recipe.penalties=[0.001]",'
+        'training=[+exp=quick,recipe=paper,recipe.num_features=12,"recipe.penalties=[0.001]",'
         '"data.materials=[M1,M4,iron]","split.seen=[M1,M4]",baselines=false,num_workers=0] '
         "overrides=[bins=10,scored_bins=20,gradient_bins=20,most_channels=3,draws=20,num_workers=0]"
     )
     drawn: ClassVar = {"sensors.png": ""}
-    training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
+    training: tuple[str, ...] = ("+exp=unseen4", "recipe=paper")
     overrides: tuple[str, ...] = ()
 
     def measure(self, job: Job) -> dict[str, Any]:

@@ -32,7 +32,6 @@ from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, 
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.calibration import Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
-from tactslip_torch.model.kernels import Head
 from tactslip_torch.onset.decisions import calibration_of
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.training.bins import RecordingBins

@@ -470,7 +470,7 @@ def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
         *("onset=alarms", "onset.learn_scenes=[paper,held]", "onset.learn_cycles=1"),
         *(f"~onset.{key}" for key in replaced),
         *(f"+onset.{key}={value}" for key, value in replaced.items()),
-        *("recipe=robust", "recipe.num_features=10", "cache=off", "num_workers=0", "export=false"),
+        *("recipe=paper", "recipe.num_features=10", "cache=off", "num_workers=0", "export=false"),
     )
     train(config, tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())

@@ -12,19 +12,19 @@ from small_detector import HAND
 from small_set import SmallSet, small_maker
 from test_learner import learn, trainer, unseen_c
 
-from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.training.datamodule import SlipDataModule
-from tactslip_torch.training.learner import (
+from tactslip_torch.training.baselines import (
     BASELINES,
     Baselines,
     PooledNumber,
     SimpleStatistics,
-    SlipLearner,
+    best_threshold,
 )
-from tactslip_torch.training.recipe import best_threshold
+from tactslip_torch.training.bins import BinSample, RecordingBins
+from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.learner import SlipLearner
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",
@@ -49,7 +49,7 @@ def sampled(num=160):
     pool, sample = FeaturePool(HAND), BinSample(400)
     for seed, group in enumerate("ab"):
         bins, is_slip = bins_of(num, seed)
-        sample.update(f"{group}/0", group, pool(bins).float(), is_slip)
+        sample.update(RecordingBins(f"{group}/0", group, pool(bins).float(), is_slip))
     return pool, sample.bins()
 
 
@@ -138,7 +138,7 @@ def test_a_learner_evaluates_them_and_a_saved_detector_those_it_keeps(tmp_path):
     assert list(detector.info[BASELINES]) == NAMES[:1]
     maker = small_maker(source)
     again = SlipLearner(maker.pool, maker.channel_filter, detector=detector)
-    data = SlipDataModule(maker, unseen_c(source), num_workers=0)
+    data = SlipDataModule(maker, [unseen_c(source)], num_workers=0)
     trainer().test(again, datamodule=data, verbose=False)
     splits = metrics["baselines"][NAMES[0]]["splits"]
     assert {n: b["splits"] for n, b in again.metrics["baselines"].items()} == {NAMES[0]: splits}

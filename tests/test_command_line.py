@@ -54,7 +54,7 @@ MISTAKES = {
     "train exp=quick": "+exp=quick",
     "train +exp quick": "+exp=quick",
     "train +exp=quik": "'known: quick,'",
-    "train recipe=robst": "'known: robust,'",
+    "train recipe=robst": "'known: general,'",
     "train -m split=seen6,seen7": "'unknown split seen7; known: seen6,'",
     "train data=mine --config-dir recordings": "'unknown data mine; known: authors_raw,'",
     "train data=webcam": "simulated",
@@ -67,7 +67,6 @@ MISTAKES = {
     "train 'seed=range(0,3)'": "-m",
     "train seed=first": "seed first whole",
     "train split.seen=M7": "M7 M1",
-    "train ckpt_path=nowhere": "nowhere",
     "train --config-dir own +exp=odd": "recipe.us 'did you mean recipe.use?'",  # in its file
     "train hydra.run.dir=notes.txt/run": "hydra.run.dir notes.txt directory",
     "train data=files": "data.root=",
@@ -181,7 +180,7 @@ TAKEN = [
     "train data=mine --config-dir own",
     "train -m +exp=quick,unseen4 'seed=range(0,3)' 'data.materials=[M1],[M2]'",
     "data action=label_template root=a=b 'pattern={material}_{trial}'",
-    "crossval -m recipe@recipes.paper=robust,paper",
+    "crossval -m recipe@recipes.paper=general,paper",
 ]
 
 

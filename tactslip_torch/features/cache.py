@@ -28,6 +28,7 @@ _MAKE_FEATURES = (
     "data",
     "features",
     "native",
+    "training/bins.py",
     "training/datamodule.py",
 )
 _KEPT = ("features", "columns", "longest_run")

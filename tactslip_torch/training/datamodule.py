@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, NamedTuple
@@ -32,6 +32,7 @@ from tactslip_torch.features.sensing import longest_runs
 from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import bar, check_number, num_processes, one_thread
 from tactslip_torch.signals.filtering import ChannelFilter, bins_at, extended
+from tactslip_torch.training.bins import RecordingBins
 
 
 class RecordingFeatures(NamedTuple):
@@ -328,6 +329,30 @@ class FoldRecordings:
 
     def __iter__(self) -> Iterator[RecordingFeatures]:
         return (self[index] for index in range(len(self)))
+
+    def training_bins(self, group: Callable[[RecordingId], str]) -> _TrainingBins:
+        """Their training bins, by the validation group of each recording."""
+        return _TrainingBins(self, group)
+
+
+@dataclass(frozen=True)
+class _TrainingBins:
+    """Training bins of recordings, as often as they are asked for."""
+
+    recordings: FoldRecordings
+    group: Callable[[RecordingId], str]
+
+    def __iter__(self) -> Iterator[RecordingBins]:
+        for made in self.recordings:
+            some, recording = made.of(made.roles["train"]), made.recording
+            yield RecordingBins(
+                str(recording),
+                self.group(recording),
+                some.features,
+                some.is_slip,
+                recording.scene,
+                made.longest_run,
+            )
 
 
 class SlipDataModule(L.LightningDataModule):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import lightning as L
@@ -17,7 +15,6 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.events import LatencyParts, RecordingEvents
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.baselines import BASELINES, Baselines
-from tactslip_torch.training.bins import RecordingBins
 from tactslip_torch.training.datamodule import FoldRecordings, RecordingFeatures
 from tactslip_torch.training.evaluation import (
     EvaluatedBins,
@@ -86,7 +83,7 @@ class SlipLearner(L.LightningModule):
     @torch.no_grad()
     def training_step(self, batch: FoldRecordings, batch_idx: int) -> None:
         """Fit to the training bins of this process and of those beside it."""
-        fit = self.recipe.fit(_TrainingBins(batch, self.recipe), self.pool, show=True)
+        fit = self.recipe.fit(batch.training_bins(self.recipe.group), self.pool, show=True)
         self.log("penalty", fit.penalty, batch_size=1)
         self.seconds |= fit.seconds
         self.metadata = {"recipe": self.recipe.name} | fit.metadata
@@ -150,23 +147,3 @@ class SlipLearner(L.LightningModule):
                     self.log(f"{role}/{name}", scores[name], batch_size=1)
         self.metrics["events"] = event_numbers(self.events)
         self.metrics["baselines"] = baselines
-
-
-@dataclass(frozen=True)
-class _TrainingBins:
-    """Training bins of recordings, as often as they are asked for."""
-
-    recordings: FoldRecordings
-    recipe: Recipe
-
-    def __iter__(self) -> Iterator[RecordingBins]:
-        for made in self.recordings:
-            some, recording = made.of(made.roles["train"]), made.recording
-            yield RecordingBins(
-                str(recording),
-                self.recipe.group(recording),
-                some.features,
-                some.is_slip,
-                recording.scene,
-                made.longest_run,
-            )
