@@ -2,8 +2,6 @@
 
 import importlib
 import json
-import os
-import pickle
 from types import SimpleNamespace
 
 import pytest
