@@ -83,8 +83,7 @@ class Generalisation(Benchmark):
         "a row says otherwise; all data are **simulated**. Everything was chosen by validation on "
         "training materials. *Worst* is the worst seed; *wanted* was set before. Baselines were "
         "fitted on the same training bins. `+exp=hard` is the protocol on a simulated hand whose "
-        "channels differ without slip, as real ones do ([how it was held against a real one]"
-        "(../benchmarks/results/realism.json): `python -m benchmarks.realism data.root=FOLDER`)"
+        "channels differ without slip, as those of a real BioTac SP do"
     )
     page, is_page = "docs/generalisation.md", True
     quick = (

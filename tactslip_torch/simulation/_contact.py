@@ -6,15 +6,9 @@ shares, lifted elements, presliding, offsets vary again, and less. An *element* 
 finger, with all the channels in it. Every draw is made for the whole hand, whichever channels
 are asked for.
 
-While an element sticks, the arm's travel stretches its skin and the friction force grows in
-proportion. At ``mu_s N`` it lets go, falls to ``mu_k N`` and slides until, shortly before the arm
-stops, the remaining travel is taken up by the skin again. Over the pause the shear relaxes;
-the next stroke starts with what is left and needs only the rest of the presliding travel.
-PHYSICS.md, friction and skin; the rules are those of a Coulomb slider behind a spring.
-
-Truth, vibration and sensors are made from what a contact says, whichever it is.
-
-*Kinematic*: every sample is a formula; bursts are drawn where skin lets go.
+*Kinematic* contact is a Coulomb slider behind a spring, every sample a formula: while an element
+sticks, friction grows with the arm's travel. At ``mu_s N`` it lets go, falls to ``mu_k N`` and
+slides until shortly before the arm stops. Over the pause the shear relaxes.
 
 *Bristles*: each stroke that slides is integrated alone (``_bristles.py``), element by element: from
 the shear that the quasi-static contact has at its start, spring and bristles at rest and in

@@ -1,15 +1,13 @@
-"""From the skin to volts: what sliding sounds like, the strain gauge, the film, the front end.
+"""From the skin to volts: vibration of sliding, slow and fast channels, what disturbs them.
 
-*Vibration* is in volts at a PVDF film of unit gain. Three parts while an element slides: a *high*
+*Vibration* is in volts at a fast channel of unit gain. Three parts while an element slides: a *high*
 part, broadband behind the skin's resonance (friction noise of every contact, and the texture's
 ``k^-a`` part, whose spectrum keeps its shape at any speed); a *low* part below 25 Hz; and *lines*
 at speed over wavelength, which run with the arm's position. Then a burst where it lets go.
 
-An SG channel follows force slowly and stays: preload, shear, creep, offset, drift. A PVDF channel
-gives the rate of strain: nothing of what stays passes its high-pass. Both end in white noise and a
-converter with rails. Last links of the chain in PHYSICS.md.
-
-What is in a recording and is no slip of the hand: disturbances, handling, imperfections, faults.
+A slow channel (SG, strain gauge) follows force and stays: preload, shear, creep, offset, drift. A
+fast one (PVDF film) gives the rate of strain, behind a high-pass. Both end in white noise and a
+converter with rails.
 
 *Disturbances* reach every channel: arm, motor, mains, knocks, a machine beside the hand, pick-up.
 Each is a common signal (or a few) times one coupling per channel.

@@ -1,13 +1,8 @@
-"""A scene: everything that determines one simulated recording, and how its arm moves.
+"""Scenes: everything that determines one simulated recording, and how its arm moves.
 
-Defaults are the starting values of PHYSICS.md unless marked. Every ``*_spread`` is the standard
-deviation of the logarithm of a factor of median 1. Times are in seconds from the start of the
-recording, positions in millimetres from where the arm was then.
-
-Three parameters are *calibrated*: set once, by ``tactslip calibrate``, on seen-material test
-accuracy and the signal checks alone, and frozen with where they come from in ``calibrated.json``.
-They move together along one line of difficulty: ``d`` prior standard deviations harder means less
-friction noise, longer presliding and more bursts, each by its own spread to the power ``d``.
+Every ``*_spread`` is the standard deviation of the logarithm of a factor of median 1. Times are in
+seconds from the start of the recording, positions in millimetres from where the arm was then. Three
+parameters were calibrated once on test accuracy of seen materials (``calibrated.json``).
 """
 
 from __future__ import annotations
@@ -258,7 +253,7 @@ class Disturbances(_Parameters):
 
     Args:
         mains_mv: amplitude of the mains' fundamental, the session's median (prior, ours: at
-            PHYSICS.md's 4 to 10 mV rest would exceed the 1.5 to 4 mV rms it asks for).
+            4 to 10 mV would exceed the 1.5 to 4 mV rms of rest).
         mains_session_spread: its spread between sessions.
         mains_hz: nominal frequency; harmonics up to the ninth share a common phase.
         arm_transient_mv: ringing of the arm's modes at each start and stop, in every channel.
@@ -365,7 +360,7 @@ class Dynamics(_Parameters):
     """Friction and steps of fidelity ``"bristles"``; the kinematic one has none.
 
     Stiffness, mass and damping of the skin follow from what both share: the presliding travel,
-    the resonance and its damping ratio. PHYSICS.md, *Stiffness*.
+    the resonance and its damping ratio.
 
     Args:
         step_us: of the integration; a whole number of steps makes a sample.
@@ -386,7 +381,7 @@ class Dynamics(_Parameters):
         viscous_n_s_m: viscous friction, which the closed forms do not have.
         release_v_per_n: PVDF volts per newton of the skin's inertia: what a film at the
             surface hears when the skin lets go (prior, ours: so that the bursts of M2 to M5
-            stand out of their slides with a single bristle, REFERENCE.md section 6, *signals*).
+            stand out of their slides with a single bristle, as the paper shows).
 
     Raises:
         ValueError: if a parameter is negative or not finite, a step is longer than 5 ms or zero, or
@@ -425,7 +420,7 @@ class Imperfections(_Parameters):
             elements, rms at a PVDF film at 1 N. It stands for creep and settling of asperities
             behind the skin's resonance, so it has the spectrum of friction noise; its level wanders
             within the recording and differs between elements (prior, ours: below the 1.5 to 4 mV
-            rms that PHYSICS.md gives rest; independent, as a real fingertip's electrodes in touch).
+            rms of rest; independent, as a real fingertip's electrodes in touch).
         share_wander: spread of the logarithm of each element's load while a grasp lasts, over
             half a second to ten (prior: in the real set a channel's level wanders about the mean
             over channels by .2 to .3 within seconds).
@@ -475,7 +470,7 @@ class Material:
             rest is the broad ``k^-a`` part.
         mu_ratio: lowest and highest kinetic over static friction, dimensionless.
         stribeck_mm_s: speed over which static becomes kinetic friction of bristles;
-            near the speeds of sliding it makes a material stick and slip (PHYSICS.md).
+            near the speeds of sliding it makes a material stick and slip.
         fast_ratio: kinetic over static friction far above that speed, of bristles, where
             it is not ``mu_ratio``: a tacky material's is the mean over sticking and slipping at
             the speeds of sliding. The range is drawn with ``mu_ratio``, low with low.
@@ -506,7 +501,7 @@ class Material:
             )
 
 
-# Friction, Ra and wavelengths: PHYSICS.md's table, as priors: none was measured on this hand.
+# Friction, Ra and wavelengths are usual values of such materials; none was measured on this hand.
 # Each session draws its own from the ranges. Texture levels: rough 150 mV and smooth 10 mV
 # (its starting values), the materials between by roughness and softness (prior, ours). The tacky
 # fast_ratio: with it the force oscillates by about a quarter (prior, ours).
