@@ -30,7 +30,7 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, most_stuck_samples
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.model.calibration import Platt, probability
+from tactslip_torch.model.calibration import Calibration, Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.onset.decisions import calibration_of
 from tactslip_torch.signals.filtering import Align, ChannelFilter
@@ -100,6 +100,9 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         >>> TactileFeatures(2000.0).fit_transform(windows).shape
         (8, 1120)
     """
+
+    _pool: FeaturePool
+    context_: tuple[int, int]
 
     def __init__(
         self,
@@ -221,7 +224,8 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         hand, frames = self.hand, FRAMES if self.frames is None else self.frames
         if hand is None:
             alike = range(1, windows.shape[1] + 1)
-            hand = HandLayout([Channel(f"C{i}", "taxel", "any", "any", "fast") for i in alike])
+            channels = (Channel(f"C{i}", "taxel", "any", "any", "fast") for i in alike)
+            hand = HandLayout(tuple(channels))
         if self.frames and (unknown := sorted(set(frames) - set(hand.kinds))):
             raise ValueError(
                 f"frames names the kind {unknown[0]!r}, which no channel is of; take some of "
@@ -236,12 +240,12 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
                 f"{before} before and {after} behind; give longer ones, filtered ones with "
                 "filtered=True, or frames={} for no filter"
             )
-        options = {"bin_samples": num, "wavelet": self.wavelet, "level": None}
+        options: dict[str, Any] = {"bin_samples": num, "wavelet": self.wavelet, "level": None}
         self._pool = FeaturePool(hand, float(self.sample_rate_hz), **options)
         return windows
 
     def _take(self, pool: Any, channel_filter: ChannelFilter, hand: HandLayout) -> None:
-        self._pool: FeaturePool = pool
+        self._pool = pool
         self._filter, self.hand_ = channel_filter, hand
         self.context_ = (channel_filter.context_before, channel_filter.context_after)
         if self.filtered:
@@ -306,6 +310,8 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         >>> classifier.predict(X[:1]), classifier.predict_proba(X).shape
         (array(['grip'], dtype='<U4'), (60, 2))
     """
+
+    _slope: Calibration
 
     def __init__(
         self,

@@ -127,7 +127,7 @@ def test_a_fit_is_refused_without_both_classes_and_unvalidated_with_one_group(re
     with pytest.raises(ValueError, match="no non-slip bin"):
         recipe.fit([replace(of, is_slip=of.is_slip | True) for of in bins], POOL)
     apart = [replace(of, is_slip=of.is_slip & False | (of.group in "ab")) for of in bins]
-    with pytest.raises(ValueError, match="both classes|without group"):
+    with pytest.raises(ValueError, match=r"both classes|without group"):
         recipe.fit(apart, POOL)
     fit = recipe.fit([replace(of, group="a") for of in bins], POOL)
     assert (fit.penalty, fit.validation, fit.calibration) == (3.0, [], None)

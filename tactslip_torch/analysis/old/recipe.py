@@ -265,7 +265,14 @@ class Recipe:
 
 def of_recipe(recipe: General | Paper) -> Recipe:
     """The same recipe in these terms."""
-    both = ("name", "penalties", "group_by", "sample_bins", "feature_filter", "descriptors")
+    both: tuple[str, ...] = (
+        "name",
+        "penalties",
+        "group_by",
+        "sample_bins",
+        "feature_filter",
+        "descriptors",
+    )
     both += ("min_alive", "num_features", "degree")
     same: dict[str, Any] = {name: getattr(recipe, name) for name in both}
     if isinstance(recipe, Paper):
