@@ -311,7 +311,7 @@ def methods_of(
 def _ours(windows: Windows, recipe: Recipe, train: Array, _: SlipDetector | None) -> Fitted:
     """The detector that ``train`` makes of these windows."""
     bins = [
-        RecordingBins(str(recording), recipe.group(recording), features, is_slip)
+        RecordingBins(str(recording), recording.material, features, is_slip)
         for recording, features, is_slip in windows.by_recording(train)
     ]
     fit = recipe.fit(bins, windows.maker.pool, is_nested=False)

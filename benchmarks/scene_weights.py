@@ -99,7 +99,7 @@ def _training_bins(
     with feature_cache(str(cache)) as maker.cache:
         data = SlipDataModule(maker, [fold], config.num_workers)
         data.setup()
-        bins = list(data.having("train").training_bins(recipe.group))
+        bins = list(data.training_bins())
     return replace(recipe, drop_channels=0.0, penalties=PENALTY), maker.pool, bins
 
 

@@ -147,11 +147,10 @@ def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> list[dict[str, s
         kept[level].setup()
     rows = []
     for level, data in kept.items():
-        training = data.having("train").training_bins(recipe.group)
-        fit = recipe.fit(training, data.maker.pool, is_nested=False)
+        fit = recipe.fit(data.training_bins(), data.maker.pool, is_nested=False)
         row: dict[str, str] = {"balanced accuracy, %": f"trained on {level}"}
         for other, its in kept.items():
-            made = list(its.having("test"))
+            made = list(its.features("test"))
             says = torch.cat([fit.head(fit.selection(each.features)) >= 0 for each in made])
             is_slip = torch.cat([each.is_slip for each in made])
             row[f"on {other}"] = percent(balanced_accuracy(says, is_slip))

@@ -195,4 +195,4 @@ def features_of_some(
         fold = Split("benchmark", dict.fromkeys(chosen, "unseen"))
         data = SlipDataModule(maker, [fold], config.num_workers)
         data.setup()
-        yield from data.having("unseen")
+        yield from data.features("unseen")

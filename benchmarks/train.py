@@ -92,7 +92,6 @@ class Train(Benchmark):
 _TOTALS = {
     "whole process, s": ("wall_s", 1.0),
     "peak memory, GB": ("peak_bytes", 1e-9),
-    "workers, s in all": ("worker_s", 1.0),
     "bins a second of making features": ("bins_a_second", 1.0),
 }
 
@@ -131,7 +130,6 @@ def _training(overrides: list[str], folder: Path, kind: str, sample_s: float) ->
         "peak_bytes": peak_bytes,
         "memory": memory,
         "stages": {"start-up": wall_s - timing_s["total"], **stages, "other": other_s},
-        "worker_s": sum(metrics["worker_s"].values()),
         "num_bins": num_bins,
         "bins_a_second": num_bins / max(passes_s, 1e-9),
     }

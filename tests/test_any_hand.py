@@ -144,6 +144,6 @@ def test_features_that_a_hand_cannot_have_are_refused_in_one_line(bin_ms, change
 def test_more_features_than_a_small_hand_has_are_refused(name, num):
     assert len(HANDS[name].pool().names) == num
     pool = HANDS[name].pool()
-    Paper(num_features=num).check_pool(pool)
+    Paper(num_features=num).allowed(pool)
     with pytest.raises(ValueError, match=f"={num + 1} exceeds the pool's {num}; give at most"):
-        Paper(num_features=num + 1).check_pool(pool)
+        Paper(num_features=num + 1).allowed(pool)

@@ -32,7 +32,7 @@ def test_the_cache_saves_the_work_and_a_damaged_entry_is_made_anew(tmp_path, cap
         return maker(RecordingId("a", 0))
 
     first, second = made(), made()
-    assert (source.loads, set(second.seconds)) == (1, {"read_cache"})
+    assert source.loads == 1
     (path,) = tmp_path.glob("*/*.npz")
     path.write_bytes(path.read_bytes()[:-4])
     third = made()
@@ -92,14 +92,13 @@ def test_features_are_made_once_for_all_folds_in_memory_or_in_the_cache(
     folds = leave_one_material_out(source.ids)
     data = SlipDataModule(maker, folds, num_workers)
     data.setup()
-    made = set(data.worker_seconds)
-    assert "features" in made
     for data.fold in folds:
         (trained,) = data.train_dataloader()
-        assert [batch.recording for batch in trained] == data.fold.having("train")
+        for _ in range(2):
+            assert [bins.name for bins in trained] == [str(r) for r in data.fold.having("train")]
         tested = list(data.test_dataloader())
         assert [batch.recording for batch in tested] == sorted(source.ids)
-        for batch in [*trained, *tested]:
+        for batch in tested:
             roles = data.fold.bin_roles(batch.recording, len(batch.is_slip))
             assert {role: mask.tolist() for role, mask in batch.roles.items()} == {
                 role: mask.tolist() for role, mask in roles.items()
@@ -121,5 +120,5 @@ def test_a_selection_of_the_pool_has_its_columns_and_reads_those_of_a_larger_one
     assert source.loads == 2  # the first one lacks columns
     assert torch.equal(first.features, everything.features[:, [250, 3, 17]])
     again = few(source.ids[0])
-    assert (source.loads, set(again.seconds)) == (2, {"read_cache"})
+    assert source.loads == 2
     assert torch.equal(again.features, first.features)

@@ -433,7 +433,7 @@ class ParetoSearch:
         """Features of the training bins of each recording, and whether they are slip."""
         with one_thread():  # the processors belong to those who make features
             self._data[align].setup()
-            for batch in bar(self._data[align].having("train"), what, "recording"):
+            for batch in bar(self._data[align].features("train"), what, "recording"):
                 mask = batch.roles["train"]
                 yield batch.recording, batch.features[mask], batch.is_slip[mask]
 

@@ -190,7 +190,7 @@ def read_materials(
     with feature_cache(config.cache) as maker.cache, one_thread():  # workers need the processors
         data = SlipDataModule(maker, [by_cycle], config.num_workers)
         data.setup()
-        for batch in data.having("train", "test"):
+        for batch in data.features("train", "test"):
             materials.update(batch, by_cycle.roles[batch.recording])
     return materials
 

@@ -157,7 +157,7 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
     data = SlipDataModule(trained.maker, [trained.fold], config.num_workers)
     data.setup()
     with one_thread():  # workers need the processors
-        for batch in bar(data.having(*ROLES), "features", "recording"):
+        for batch in bar(data.features(*ROLES), "features", "recording"):
             name, recording = str(batch.recording), batch.recording
             if bool((mask := batch.roles["train"]).any()):
                 stratum = recipe.stratum(recording)

@@ -82,7 +82,7 @@ def _experiment(config: DictConfig) -> Experiment:
         with_baselines=config.baselines,
         **config.features,
     )
-    recipe.check_pool(maker.pool)
+    recipe.allowed(maker.pool)  # refused before any work
     return Experiment(
         maker=maker,
         folds=folds,

@@ -13,8 +13,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,8 +27,6 @@ from tactslip_torch.training.bins import SampledBins
 from tactslip_torch.training.choice import has_both_classes
 
 POOLED_NUMBER = "best_pooled_number"
-BASELINES = "baselines"
-"""Where a detector's ``info`` has the best pooled number."""
 CONSTANT_BINS = 1200  # at most, of which compression learns its medians
 NUM_TREES = 100  # as scikit-learn has it
 MOST_FOLDS = 6  # with 3, C of simple statistics costs two points on held-out materials
@@ -42,14 +38,8 @@ is fixed. On 672 pooled columns of the simulated hand 1e-3 to 1 differ by .3 poi
 LOG_FLOOR = 1e-2  # of the training median of a magnitude, below which its logarithm levels out
 
 
+_BRANCHES = ("A1", "D1")
 _OF_SLOW, _OF_FAST = ("mean", "std", "energy"), ("mean", "std", "correlation")
-
-
-def _names(
-    pool: FeaturePool, channels: Sequence[int], component: str, descriptor: str
-) -> list[FeatureName]:
-    names = pool.hand.names
-    return [FeatureName(names[c], component, "time", descriptor) for c in channels]
 
 
 class SimpleStatistics:
@@ -65,21 +55,20 @@ class SimpleStatistics:
 
     def __init__(self, pool: FeaturePool) -> None:
         self.num_samples = pool.bin_samples
-        slow, fast = pool.hand.slow, pool.hand.fast
-        self._slow = [pool.places(_names(pool, slow, "raw", d)) for d in _OF_SLOW]
-        self._fast = {
-            d: [pool.places(_names(pool, fast, branch, d)) for branch in ("A1", "D1")]
-            for d in _OF_FAST
-        }
+        names = self.names(pool)
+        self._slow = [pool.places(names["raw", d]) for d in _OF_SLOW]
+        self._fast = {d: [pool.places(names[b, d]) for b in _BRANCHES] for d in _OF_FAST}
 
     @staticmethod
-    def names(pool: FeaturePool) -> list[FeatureName]:
-        """The features that are read."""
-        slow, fast = pool.hand.slow, pool.hand.fast
-        found = [name for d in _OF_SLOW for name in _names(pool, slow, "raw", d)]
-        for branch in ("A1", "D1"):
-            found += [name for d in _OF_FAST for name in _names(pool, fast, branch, d)]
-        return found
+    def names(pool: FeaturePool) -> dict[tuple[str, str], list[FeatureName]]:
+        """The features that are read, of all channels, by component and descriptor."""
+        names, hand = pool.hand.names, pool.hand
+        kinds = [("raw", d, hand.slow) for d in _OF_SLOW]
+        kinds += [(branch, d, hand.fast) for branch in _BRANCHES for d in _OF_FAST]
+        return {
+            (component, d): [FeatureName(names[c], component, "time", d) for c in channels]
+            for component, d, channels in kinds
+        }
 
     def __call__(self, features: Tensor) -> Tensor:
         """All means, then standard deviations, then rms, of slow channels and then of fast ones.
@@ -152,188 +141,106 @@ def _fit_forest(columns: Tensor, sample: SampledBins) -> Any:
     return made.fit(columns.numpy(), truth, sample_weight=weights).set_params(n_jobs=None)
 
 
-@dataclass(frozen=True)
 class PooledNumber:
-    """One statistic over channels of one descriptor, and a threshold.
+    """The mean or deviation over channels of one descriptor with the best balanced accuracy.
 
     Args:
-        pooling: with one column.
-        inputs: pool indices of the features that it takes.
-        rule: of that column, which is compressed (``features.pooling``).
+        pool: of the features.
+        sample: of training bins.
+
+    Attributes:
+        name: of the statistic.
+        metadata: what it is, and its threshold, JSON-able.
+
+    Raises:
+        ValueError: if a class is absent.
     """
 
-    pooling: ChannelPooling
-    inputs: tuple[int, ...]
-    rule: FeatureThreshold
-
-    @classmethod
-    def fit(cls, pool: FeaturePool, sample: SampledBins) -> PooledNumber:
-        """The mean or standard deviation over channels with the best balanced accuracy.
-
-        Raises:
-            ValueError: if a class is absent.
-        """
+    def __init__(self, pool: FeaturePool, sample: SampledBins) -> None:
         places = (~is_rounding(pool)).nonzero().flatten()
         names = [pool.names[place] for place in places.tolist()]
         features = sample.features[:: -(-len(sample.features) // CONSTANT_BINS)][:, places]
         layer = ChannelPooling.fit(pool.hand, names, features, ["mean", "std"])
         columns = layer(sample.features[:, pool.places(layer.inputs)].double())
-        rule = best_threshold(columns, sample.is_slip, sample.weight)
-        layer = layer.select([rule.index])
-        return cls(layer, tuple(pool.places(layer.inputs)), replace(rule, index=0))
-
-    @property
-    def name(self) -> FeatureName:
-        """What the number is."""
-        return self.pooling.names[0]
-
-    def metadata(self) -> dict[str, Any]:
-        """What it is, and its threshold, JSON-able."""
-        rule = self.rule
-        return {"feature": str(self.name), "threshold": rule.threshold, "sign": rule.sign}
+        index, self._threshold, self._sign = best_threshold(columns, sample.is_slip, sample.weight)
+        self._layer = layer.select([index])
+        self._inputs = pool.places(self._layer.inputs)
+        self.name = self._layer.names[0]
+        self.metadata: dict[str, Any] = {
+            "feature": str(self.name),
+            "threshold": self._threshold,
+            "sign": self._sign,
+        }
 
     def __call__(self, features: Tensor) -> Tensor:
-        """Decisions from features of the whole pool, ``[N, F] -> [N]``, bool."""
-        return self.rule(self.pooling(features[:, list(self.inputs)].double()))
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able values; ``from_dict`` takes them."""
-        constants = {name: x.tolist() for name, x in self.pooling.state_dict().items()}
-        rule = {"threshold": self.rule.threshold, "sign": self.rule.sign}
-        return self.pooling.to_dict() | {"constants": constants} | rule
-
-    @classmethod
-    def from_dict(cls, pool: FeaturePool, plain: Mapping[str, Any]) -> PooledNumber:
-        """The number that ``to_dict`` described."""
-        constants = {
-            name: torch.tensor(x, dtype=torch.float64) for name, x in plain["constants"].items()
-        }
-        layer = ChannelPooling.from_dict(pool.hand, plain, constants)
-        rule = FeatureThreshold(0, plain["threshold"], plain["sign"])
-        return cls(layer, tuple(pool.places(layer.inputs)), rule)
+        """Decisions, ``[N, F] -> [N]``, bool."""
+        value = self._layer(features[:, self._inputs].double())[..., 0]
+        decision: Tensor = self._sign * value > self._sign * self._threshold
+        return decision
 
 
 class Baselines:
-    """Fitted baselines.
+    """All baselines, fitted to sampled training bins.
 
     Args:
         pool: of the features.
-        pooled: the best pooled number.
-        others: estimators of scikit-learn by name.
+        scaled: columns of the detector of the sampled bins, ``[n, K]``.
+        sample: of training bins.
+
+    Attributes:
         metadata: of each, by name, JSON-able.
+
+    Raises:
+        ValueError: if a class is absent.
     """
 
-    def __init__(
-        self,
-        pool: FeaturePool,
-        pooled: PooledNumber,
-        others: Mapping[str, Any] | None = None,
-        metadata: Mapping[str, Mapping[str, Any]] | None = None,
-    ) -> None:
-        self.pooled, self._others = pooled, dict(others or {})
-        self._metadata = {POOLED_NUMBER: pooled.metadata()} | dict(metadata or {})
-        self._statistics = SimpleStatistics(pool) if self._others else None
-
-    @classmethod
-    def fit(cls, pool: FeaturePool, scaled: Tensor, sample: SampledBins) -> Baselines:
-        """Fit all of them to sampled training bins.
-
-        Args:
-            pool: of the features.
-            scaled: columns of the detector of the sampled bins, ``[n, K]``.
-            sample: as the first pass keeps it.
-
-        Raises:
-            ValueError: if a class is absent.
-        """
+    def __init__(self, pool: FeaturePool, scaled: Tensor, sample: SampledBins) -> None:
         from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # sklearn's own
 
-        pooled = PooledNumber.fit(pool, sample)  # refuses one class
-        x = SimpleStatistics(pool)(sample.features)
+        self._pooled = PooledNumber(pool, sample)  # refuses one class
+        self._statistics = SimpleStatistics(pool)
+        x = self._statistics(sample.features)
         with warnings.catch_warnings(), threadpool_limits(1):  # small: threads would wait
             warnings.simplefilter("ignore")  # newton-cholesky falls back to lbfgs by itself
-            on_scaled = _fit_regression(scaled, sample)
-            on_simple = _fit_regression(x, sample, with_logs=True)
-            others = {
-                "logistic_regression": on_scaled,
-                "logistic_regression_simple": on_simple,
+            self._others = {
+                "logistic_regression": _fit_regression(scaled, sample),
+                "logistic_regression_simple": _fit_regression(x, sample, with_logs=True),
                 "random_forest_simple": _fit_forest(x, sample),
             }
-        metadata = {
-            POOLED_NUMBER: pooled.metadata(),
-            "logistic_regression": {"C": on_scaled[-1].C},
-            "logistic_regression_simple": {"C": on_simple[-1].C},
-            "random_forest_simple": {"trees": NUM_TREES},
-        }
-        num_bins = len(sample.is_slip)
-        metadata = {name: own | {"num_bins": num_bins} for name, own in metadata.items()}
-        return cls(pool, pooled, others, metadata)
+        num_bins = {"num_bins": len(sample.is_slip)}
+        self.metadata: dict[str, dict[str, Any]] = {POOLED_NUMBER: self._pooled.metadata | num_bins}
+        for name, made in self._others.items():
+            own = {"trees": NUM_TREES} if "forest" in name else {"C": made[-1].C}
+            self.metadata[name] = own | num_bins
 
     def __call__(self, features: Tensor, scaled: Tensor) -> dict[str, Tensor]:
         """Decisions by name.
 
         Shape:
-            - features: ``[N, F]``, of the whole pool
+            - features: ``[N, F]``, of the pool
             - scaled: ``[N, K]``, columns of the detector
             - output: each ``[N]``, bool
         """
-        found = {POOLED_NUMBER: self.pooled(features)}
-        if self._statistics is not None:
-            simple = self._statistics(features)
-            for name, made in self._others.items():
-                x = (simple if name.endswith("_simple") else scaled.double()).numpy()
-                found[name] = torch.from_numpy(made.predict(x) if len(x) else np.zeros(0, bool))
+        found, simple = {POOLED_NUMBER: self._pooled(features)}, self._statistics(features)
+        for name, made in self._others.items():
+            x = (simple if name.endswith("_simple") else scaled.double()).numpy()
+            found[name] = torch.from_numpy(made.predict(x) if len(x) else np.zeros(0, bool))
         return found
 
-    def metadata(self) -> dict[str, dict[str, Any]]:
-        """What each is, by name, JSON-able."""
-        return {name: dict(own) for name, own in self._metadata.items()}
 
-    def to_dict(self) -> dict[str, Any]:
-        """What a detector keeps: the best pooled number, JSON-able; the others are too large."""
-        return {POOLED_NUMBER: self.pooled.to_dict()}
+def best_threshold(features: Tensor, is_slip: Tensor, weights: Tensor) -> tuple[int, float, int]:
+    """The single feature, threshold and sign of the best balanced accuracy on training bins.
 
-    @classmethod
-    def from_dict(cls, pool: FeaturePool, plain: Mapping[str, Any]) -> Baselines:
-        """The baselines that ``to_dict`` kept."""
-        return cls(pool, PooledNumber.from_dict(pool, plain[POOLED_NUMBER]))
-
-
-@dataclass(frozen=True)
-class FeatureThreshold:
-    """Says slip where ``sign * feature > sign * threshold``.
-
-    Args:
-        index: position of the feature.
-        threshold: in the feature's unit.
-        sign: +1 if slip has the larger values, -1 otherwise.
-    """
-
-    index: int
-    threshold: float
-    sign: int
-
-    def __call__(self, features: Tensor) -> Tensor:
-        """Decisions: ``[*, K] -> [*]``, bool."""
-        decision: Tensor = self.sign * features[..., self.index] > self.sign * self.threshold
-        return decision
-
-
-def best_threshold(
-    features: Tensor, is_slip: Tensor, weights: Tensor | None = None
-) -> FeatureThreshold:
-    """The single feature and threshold of the best balanced accuracy on training bins.
+    Slip is where ``sign * feature > sign * threshold``.
 
     Shape:
-        - features: ``[N, K]``, finite; is_slip: ``[N]``, bool
-        - weights: ``[N]``, of each bin; 1 by default
+        - features: ``[N, K]``, finite; is_slip: ``[N]``, bool; weights: ``[N]``
 
     Raises:
         ValueError: if a class is absent.
     """
     if not has_both_classes(is_slip):
         raise ValueError("baselines need training bins of both classes; got only one")
-    weights = torch.ones(len(is_slip), dtype=torch.float64) if weights is None else weights
     slip, quiet = weights * is_slip, weights * ~is_slip
     step = slip / slip.sum() - quiet / quiet.sum()
     values, order = features.sort(dim=0)
@@ -346,4 +253,4 @@ def best_threshold(
     threshold = lower + (upper - lower) / 2
     if threshold in (lower, upper):  # neighbouring floats: the side that is not slip
         threshold = lower if sign > 0 else upper
-    return FeatureThreshold(index, threshold, sign)
+    return index, threshold, sign

@@ -52,6 +52,7 @@ class SampledBins:
         scene: ``[n]``, index into ``scene_names``.
         scene_names: ascending.
         weight: ``[n]``, float64, for how many bins of its stratum each stands.
+        longest_run: most equal samples in a row, of all recordings; ``None``: not known.
     """
 
     features: Tensor
@@ -61,6 +62,7 @@ class SampledBins:
     scene: Tensor
     scene_names: tuple[str, ...]
     weight: Tensor
+    longest_run: int | None = None
 
     @property
     def stratum(self) -> Tensor:
@@ -90,10 +92,12 @@ class BinSample:
         if most < 0:
             raise ValueError(f"a sample keeps 0 bins or more of a group and class, got {most}")
         self.most = most
+        self._longest_run: int | None = None
         self._strata: dict[tuple[str, str, bool], _Stratum] = {}
 
     def update(self, bins: RecordingBins) -> None:
         """Add the bins of a recording, all at once and once only (that is not checked)."""
+        self._add_run(bins.longest_run)
         keys = bin_keys(bins.name, len(bins.is_slip))
         for label in (False, True):
             rows = (bins.is_slip == label).nonzero()[:, 0]
@@ -105,6 +109,7 @@ class BinSample:
 
     def merge(self, other: BinSample) -> None:
         """Add the bins of another sample of that size; of other recordings (not checked)."""
+        self._add_run(other._longest_run)
         for name, part in other._strata.items():
             self._add(name, part)
 
@@ -133,7 +138,12 @@ class BinSample:
             scene=torch.tensor([scenes.index(name) for name in of_scene]),
             scene_names=tuple(scenes),
             weight=torch.tensor(weight, dtype=torch.float64),
+            longest_run=self._longest_run,
         )
+
+    def _add_run(self, longest_run: int | None) -> None:
+        runs = [run for run in (self._longest_run, longest_run) if run is not None]
+        self._longest_run = max(runs, default=None)
 
     def _add(self, name: tuple[str, str, bool], part: _Stratum) -> None:
         if name in self._strata:

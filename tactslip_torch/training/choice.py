@@ -222,8 +222,7 @@ class CandidateBins:
         if len(whole) < 2:
             raise ValueError(
                 "validation leaves out groups and needs two with bins of both classes, got "
-                f"{len(whole)} of {', '.join(self.group_names)}; add recordings or take another "
-                "recipe.group_by"
+                f"{len(whole)} of {', '.join(self.group_names)}; add recordings of others"
             )
         return whole
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -63,7 +62,6 @@ class RecordingFeatures(NamedTuple):
     times: Timeline
     hop_s: float
     roles: dict[str, Tensor] = {}  # noqa: RUF012  # a NamedTuple replaces, it does not change
-    seconds: dict[str, float] = {}  # noqa: RUF012
     longest_run: int = 0
 
     def in_split(self, split: Split) -> RecordingFeatures:
@@ -168,8 +166,7 @@ class FeatureMaker:
             return kept
         times = self.source.timeline(recording)
         bins = self.lay_bins(times)
-        seconds: dict[str, float] = {}
-        features, longest_run = self._features(recording, times, bins, seconds)
+        features, longest_run = self._features(recording, times, bins)
         is_slip = bins.is_slip
         if self.rule.shuffle_seed is not None:
             place = self.source.ids.index(recording)
@@ -185,7 +182,6 @@ class FeatureMaker:
             (bins.starts + bins.bin_samples).double() / self.source.sample_rate_hz,
             times,
             (self.rule.bin_ms if self.rule.hop_ms is None else self.rule.hop_ms) / 1000,
-            seconds=seconds,
             longest_run=longest_run,
         )
 
@@ -244,25 +240,17 @@ class FeatureMaker:
         recording: RecordingId,
         times: Timeline,
         bins: LabelledBins,
-        seconds: dict[str, float],
     ) -> tuple[Tensor, int]:
-        started = time.perf_counter()
         key = self._key(recording, bins)
         cached = None if self.cache is None else self.cache.load(key, self.pool.selected)
         if cached is not None and len(cached[0]) == len(bins.starts):
-            seconds["read_cache"] = time.perf_counter() - started
             return cached
         loaded = self._load(recording, times, bins)
-        seconds["simulate" if self.source.is_simulated else "read"] = _lap(started, seconds)
-        filtered = self._filter(recording, loaded, bins)
-        seconds["filter"] = _lap(started, seconds)
         with torch.no_grad():
-            features: Tensor = self.extractor(filtered).float()
+            features: Tensor = self.extractor(self._filter(recording, loaded, bins)).float()
         longest_run = int(longest_runs(loaded.samples).max())
-        seconds["features"] = _lap(started, seconds)
         if self.cache is not None:
             self.cache.store(key, self.pool.selected, features, longest_run)
-        seconds["write_cache"] = _lap(started, seconds)
         return features, longest_run
 
     def _load(self, recording: RecordingId, times: Timeline, bins: LabelledBins) -> Recording:
@@ -308,46 +296,21 @@ class FeatureMaker:
         return cache_key(content)
 
 
-def _lap(started: float, seconds: dict[str, float]) -> float:
-    """Seconds since ``started`` that no earlier stage has."""
-    return time.perf_counter() - started - sum(seconds.values())
-
-
 @dataclass(frozen=True)
-class FoldRecordings:
-    """Recordings with their roles in a fold, read one at a time."""
+class TrainingBins:
+    """Training bins of recordings, read one recording at a time and as often as asked for."""
 
     maker: FeatureMaker
     fold: Split
     recordings: Sequence[RecordingId]
 
-    def __len__(self) -> int:
-        return len(self.recordings)
-
-    def __getitem__(self, index: int) -> RecordingFeatures:
-        return self.maker(self.recordings[index]).in_split(self.fold)
-
-    def __iter__(self) -> Iterator[RecordingFeatures]:
-        return (self[index] for index in range(len(self)))
-
-    def training_bins(self, group: Callable[[RecordingId], str]) -> _TrainingBins:
-        """Their training bins, by the validation group of each recording."""
-        return _TrainingBins(self, group)
-
-
-@dataclass(frozen=True)
-class _TrainingBins:
-    """Training bins of recordings, as often as they are asked for."""
-
-    recordings: FoldRecordings
-    group: Callable[[RecordingId], str]
-
     def __iter__(self) -> Iterator[RecordingBins]:
-        for made in self.recordings:
-            some, recording = made.of(made.roles["train"]), made.recording
+        for recording in self.recordings:
+            made = self.maker(recording).in_split(self.fold)
+            some = made.of(made.roles["train"])
             yield RecordingBins(
                 str(recording),
-                self.group(recording),
+                recording.material,
                 some.features,
                 some.is_slip,
                 recording.scene,
@@ -372,7 +335,6 @@ class SlipDataModule(L.LightningDataModule):
     Attributes:
         fold: the one that loaders are of; the first one to begin with.
         seconds: time that making features took.
-        worker_seconds: what workers spent on each stage of it, summed over them.
 
     Raises:
         ValueError: if there is no such number of processes.
@@ -385,7 +347,6 @@ class SlipDataModule(L.LightningDataModule):
         self.maker, self.folds, self.fold = maker, folds, folds[0]
         self.num_workers = num_processes(num_workers)
         self.seconds = 0.0
-        self.worker_seconds = Counter[str]()
         self._shares_processors = num_workers is None
         self._is_made = False
 
@@ -394,61 +355,62 @@ class SlipDataModule(L.LightningDataModule):
         if self._is_made:
             return
         started = time.perf_counter()
-        wanted = {recording for fold in self.folds for recording in fold.having(*ROLES)}
-        recordings = self._of_process(sorted(wanted))
-        workers = self.num_workers
+        recordings, workers = self._of_process(), self.num_workers
         if self._shares_processors and self.trainer is not None:
             workers = max(1, workers // self.trainer.num_devices)
-        loader: DataLoader[RecordingFeatures] = DataLoader(
-            recordings,  # type: ignore[arg-type]  # a list is a dataset
-            batch_size=None,
-            num_workers=workers,
-            collate_fn=self.maker,  # type: ignore[arg-type]  # of one
-        )
+        loader = self._loader(recordings, self.maker, workers)
         with one_thread():  # the processors belong to the workers
             for made in bar(loader, "features", "recording", total=len(recordings)):
-                self.worker_seconds.update(made.seconds)
                 self.maker.keep(made)
         self.seconds += time.perf_counter() - started
         self._is_made = True
 
-    def train_dataloader(self) -> DataLoader[FoldRecordings]:
-        """One batch: this process's recordings with training bins."""
-        return DataLoader(
-            [self.having("train")],  # type: ignore[arg-type]  # a list is a dataset
-            batch_size=None,
-            collate_fn=_as_it_is,
-        )
+    def train_dataloader(self) -> DataLoader[TrainingBins]:
+        """One batch: the training bins of this process's recordings."""
+        return self._loader([self.training_bins()])
 
     def test_dataloader(self) -> DataLoader[RecordingFeatures]:
         """This process's recordings with a role, one a batch."""
-        return DataLoader(
-            self.having(*ROLES),  # type: ignore[arg-type]  # a sequence is a dataset
-            batch_size=None,
-            collate_fn=_as_it_is,
-        )
+        return self._loader(self._having(*ROLES), self._in_fold)
+
+    def training_bins(self) -> TrainingBins:
+        """Of this process's recordings."""
+        return TrainingBins(self.maker, self.fold, self._having("train"))
+
+    def features(self, *roles: str) -> Iterator[RecordingFeatures]:
+        """This process's recordings of the fold with any of the roles, one at a time."""
+        return map(self._in_fold, self._having(*roles))
 
     def transfer_batch_to_device(self, batch: Any, device: Any, dataloader_idx: int) -> Any:
         """Features stay where they are: moments and solve run in float64 on the processor."""
         return batch
 
-    def having(self, *roles: str) -> FoldRecordings:
-        """This process's recordings of the fold with any of the roles."""
+    def _having(self, *roles: str) -> list[RecordingId]:
         wanted = set(self.fold.having(*roles))
-        every = {recording for fold in self.folds for recording in fold.having(*ROLES)}
-        own = [recording for recording in self._of_process(sorted(every)) if recording in wanted]
-        return FoldRecordings(self.maker, self.fold, own)
+        return [recording for recording in self._of_process() if recording in wanted]
 
-    def _of_process(self, recordings: Sequence[RecordingId]) -> list[RecordingId]:
+    def _of_process(self) -> list[RecordingId]:
+        """Every so-many-th recording with a role in any fold."""
+        every = sorted({recording for fold in self.folds for recording in fold.having(*ROLES)})
         trainer = self.trainer
         part, parts = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
-        if parts > len(recordings):
-            raise ValueError(f"{parts} processes for {len(recordings)} recordings; use fewer")
-        return list(recordings[part::parts])
+        if parts > len(every):
+            raise ValueError(f"{parts} processes for {len(every)} recordings; use fewer")
+        return every[part::parts]
 
+    def _in_fold(self, recording: RecordingId) -> RecordingFeatures:
+        return self.maker(recording).in_split(self.fold)
 
-def _as_it_is(batch: Any) -> Any:
-    return batch
+    def _loader(
+        self, items: list[Any], collate: Callable[[Any], Any] = lambda item: item, workers: int = 0
+    ) -> DataLoader[Any]:
+        """A loader that makes something of one item at a time."""
+        return DataLoader(
+            items,  # type: ignore[arg-type]  # a list is a dataset
+            batch_size=None,
+            num_workers=workers,
+            collate_fn=collate,
+        )
 
 
 def training_origin(source: RecordingSource, fold: Split) -> dict[str, Any]:

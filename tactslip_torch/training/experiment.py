@@ -46,7 +46,7 @@ from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import Align, ChannelFilter, frame_lengths
 from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
-from tactslip_torch.training.baselines import BASELINES, Baselines, SimpleStatistics
+from tactslip_torch.training.baselines import SimpleStatistics
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule, training_origin
 from tactslip_torch.training.evaluation import merged_results
 from tactslip_torch.training.learner import SlipLearner
@@ -127,7 +127,6 @@ def run_experiment(experiment: Experiment, folder: Path) -> dict[str, Any]:
         metrics |= {"selected": [row["name"] for row in features], "folds": results}
     return metrics | {
         "timing_s": seconds,
-        "worker_s": dict(data.worker_seconds),
         "features": features,
     }
 
@@ -287,7 +286,8 @@ def feature_maker(
     if recipe is not None and recipe.descriptors is not None:
         wanted = {*recipe.descriptors, "range"}  # ranges tell which channels are silent
         names = {name for name in pool.names if name.descriptor in wanted}
-        names |= set(SimpleStatistics.names(pool)) if with_baselines else set()
+        if with_baselines:
+            names.update(*SimpleStatistics.names(pool).values())
         pool = pool.select([i for i, name in enumerate(pool.names) if name in names])
     return FeatureMaker(
         source,
@@ -308,11 +308,9 @@ def features_of(
     *,
     whole: bool = False,
 ) -> FeatureMaker:
-    """The features that a detector and the baseline it keeps read, computed as in its training."""
+    """The features that a detector reads, computed as in its training."""
     pool, dtype = detector.pool, DTYPES[detector.info.get("features_dtype", "float64")]
     wanted = set(range(len(pool.names)) if whole else detector.selected)
-    if BASELINES in detector.info:
-        wanted |= set(Baselines.from_dict(pool, detector.info[BASELINES]).pooled.inputs)
     pool = pool.select(sorted(wanted))
     return FeatureMaker(source, pool, detector.channel_filter, rule, cache, dtype)
 

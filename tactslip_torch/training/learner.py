@@ -14,8 +14,8 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.events import LatencyParts, RecordingEvents
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.baselines import BASELINES, Baselines
-from tactslip_torch.training.datamodule import FoldRecordings, RecordingFeatures
+from tactslip_torch.training.baselines import Baselines
+from tactslip_torch.training.datamodule import RecordingFeatures, TrainingBins
 from tactslip_torch.training.evaluation import (
     EvaluatedBins,
     bin_scores,
@@ -62,12 +62,10 @@ class SlipLearner(L.LightningModule):
         self.channel_filter = channel_filter
         self.recipe = recipe or General()
         if detector is None:
-            self.recipe.check_pool(pool)  # refused before any work
+            self.recipe.allowed(pool)  # refused before any work
         self.detector = detector
         self.with_baselines = with_baselines
         self.baselines: Baselines | None = None
-        if detector and BASELINES in detector.info:
-            self.baselines = Baselines.from_dict(pool, detector.info[BASELINES])
         self.metadata: dict[str, Any] = {}
         self.metrics: dict[str, Any] = {}
         self.events: dict[str, dict[str, list[RecordingEvents]]] = {}
@@ -81,9 +79,9 @@ class SlipLearner(L.LightningModule):
         return []
 
     @torch.no_grad()
-    def training_step(self, batch: FoldRecordings, batch_idx: int) -> None:
+    def training_step(self, batch: TrainingBins, batch_idx: int) -> None:
         """Fit to the training bins of this process and of those beside it."""
-        fit = self.recipe.fit(batch.training_bins(self.recipe.group), self.pool, show=True)
+        fit = self.recipe.fit(batch, self.pool, show=True)
         self.log("penalty", fit.penalty, batch_size=1)
         self.seconds |= fit.seconds
         self.metadata = {"recipe": self.recipe.name} | fit.metadata
@@ -91,10 +89,9 @@ class SlipLearner(L.LightningModule):
         if self.with_baselines:
             started, sample = time.perf_counter(), fit.sample
             self.baselines = from_first_process(
-                lambda: Baselines.fit(self.pool, fit.selection(sample.features), sample)
+                lambda: Baselines(self.pool, fit.selection(sample.features), sample)
             )
             self.seconds["baselines"] = time.perf_counter() - started
-            info[BASELINES] = self.baselines.to_dict()
         self.detector = fit.detector(self.pool, self.channel_filter, info)
 
     def on_test_start(self) -> None:
@@ -124,9 +121,8 @@ class SlipLearner(L.LightningModule):
         """Turn decisions into metrics."""
         assert self.detector is not None  # on_test_start
         self.metrics, self.events = {"splits": {}}, {}
-        baselines = self.baselines.metadata() if self.baselines else {}
-        for metadata in baselines.values():
-            metadata["splits"] = {}
+        known = self.baselines.metadata if self.baselines else {}
+        baselines = {name: metadata | {"splits": {}} for name, metadata in known.items()}
         pool = self.detector.pool
         latency = LatencyParts(
             self.detector.look_ahead / pool.sample_rate_hz, pool.bin_samples / pool.sample_rate_hz

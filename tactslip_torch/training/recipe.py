@@ -20,7 +20,6 @@ import torch
 import torch.distributed
 from torch import Tensor
 
-from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
 from tactslip_torch.features.groups import checked_attributes, matching
@@ -54,7 +53,6 @@ from tactslip_torch.training.choice import (
 log = logging.getLogger(__name__)
 Value = TypeVar("Value")
 
-CYCLE_GROUPS = 5
 FREE_CONSTANT = 1.0e6
 """``c`` of degree 1, where it weighs the constant alone: so large, the penalty does not reach it.
 A penalised constant moves the threshold of a machine with few bins or a strong penalty."""
@@ -75,7 +73,6 @@ class _Plan:
     num_bins: int
     validation: list[dict[str, Any]]
     nested: dict[str, Any] | None = None
-    feature_filter: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,6 @@ class Fit(_Plan):
         validation: one row per candidate, with the balanced accuracy of each held-out group; the
             one that was taken has ``chosen`` and the ``calibration`` of its held-out scores.
         nested: balanced accuracy of the whole choice on groups that it did not see, if measured.
-        feature_filter: what features were restricted to, if they were, and how many match.
         head: the machine.
         sample: of the training bins.
         seconds: time of each stage.
@@ -119,7 +115,6 @@ class Fit(_Plan):
             "nested_validation": self.nested,
             "head": self.head.cost._asdict(),
             "solve": {} if self.head.solved is None else self.head.solved.metadata(),
-            "feature_filter": self.feature_filter,
         }
 
     def detector(
@@ -159,7 +154,6 @@ class _Recipe:
 
     name: str
     penalties: float | Sequence[float]
-    group_by: str = "material"
     sample_bins: int = 400
     feature_filter: Mapping[str, str | Sequence[str]] | None = None
     descriptors: Sequence[str] | None = None
@@ -169,7 +163,6 @@ class _Recipe:
         for name, value in vars(self).items():  # lists of a configuration
             if isinstance(value, list):
                 object.__setattr__(self, name, tuple(value))
-        check_choice("recipe.group_by", self.group_by, ("material", "cycle"))
         check_number("recipe.sample_bins", self.sample_bins, least=2, whole=True)
         if self.min_alive is not None:
             check_number("recipe.min_alive", self.min_alive, whole=True)
@@ -187,12 +180,6 @@ class _Recipe:
     def penalties_ascending(self) -> tuple[float, ...]:
         """Values of C to choose from, as numbers."""
         return tuple(sorted(_numbers("recipe.penalties", self.penalties)))
-
-    def group(self, recording: RecordingId) -> str:
-        """The validation group of a recording."""
-        if self.group_by == "material":
-            return recording.material
-        return str(recording.cycle % CYCLE_GROUPS)
 
     def allowed(self, pool: FeaturePool) -> Tensor:
         """Which features of a pool may be selected, ``[F]``, bool.
@@ -224,30 +211,11 @@ class _Recipe:
             )
         return mask
 
-    def check_pool(self, pool: FeaturePool) -> None:
-        """Refuse a pool that lacks what is to be selected, before any work.
-
-        Raises:
-            ValueError: as ``allowed``, or if it has fewer features.
-        """
-        self.allowed(pool)
-
-    def _filtered(self, allowed: Tensor) -> dict[str, Any] | None:
-        """What features are restricted to, for files."""
-        if self.feature_filter is None:
-            return None
-        wanted = {
-            name: [values] if isinstance(values, str) else list(values)
-            for name, values in self.feature_filter.items()
-        }
-        return {"wanted": wanted, "matching": int(allowed.sum())}
-
     def _sensing(
         self,
         pool: FeaturePool,
         selection: FeatureSelection,
         sample: SampledBins,
-        longest_run: int | None,
         alive_fraction: float,
     ) -> Sensing:
         """Spans of channels that work, of the training bins of a selection."""
@@ -257,7 +225,7 @@ class _Recipe:
         return Sensing.fit(
             SpanFeatures(pool.hand, pool.names, pool.bin_samples)(sample.features),
             self.min_alive or least_alive(num_counted, alive_fraction),
-            most_stuck_samples(pool.sample_rate_hz, longest_run),
+            most_stuck_samples(pool.sample_rate_hz, sample.longest_run),
         )
 
 
@@ -271,8 +239,6 @@ class General(_Recipe):
         name: for tables.
         penalties: the paper's ``C``. Of several values of this, ``use``, ``num_features`` and
             ``degree`` validation chooses one; a grid that ends at its edge is extended.
-        group_by: what a validation fold leaves out: a ``"material"``, or a fifth of the
-            ``"cycle"`` numbers.
         sample_bins: bins of each group and class that choices are made by.
         feature_filter: only features that match are used, such as ``{"kind": "SG", "descriptor":
             "mean"}``: of each attribute a value, or one of several.
@@ -353,20 +319,15 @@ class General(_Recipe):
             ValueError: if a class is absent, or a solve fails.
         """
         watch = _Watch()
-        drawn, runs = BinSample(self.sample_bins), list[int]()
+        drawn = BinSample(self.sample_bins)
         for some in bins:
-            drawn.update(self._in_scene(some))
-            runs += [] if some.longest_run is None else [some.longest_run]
+            drawn.update(some)
         sample = _merged(drawn).bins()
-        longest_run = max(itertools.chain(*gathered(runs)), default=None)
         watch.lap("statistics")
-        plan, weights = from_first_process(
-            lambda: self._plan(sample, pool, longest_run, is_nested, show)
-        )
+        plan, weights = from_first_process(lambda: self._plan(sample, pool, is_nested, show))
         watch.lap("validation")
         selection, training = plan.selection, _TrainingPass(plan)
         for some in bins:
-            some = self._in_scene(some)
             z = selection(some.features)
             of_class = torch.tensor(weights.get(some.scene, (1.0, 1.0)), dtype=torch.float64)
             is_slip, weight = some.is_slip, of_class[some.is_slip.long()]
@@ -379,19 +340,10 @@ class General(_Recipe):
         watch.lap("solve")
         return Fit(**vars(plan), head=head, sample=sample, seconds=watch.seconds)
 
-    def _in_scene(self, bins: RecordingBins) -> RecordingBins:
-        """Scenes are told apart where they are weighed."""
-        if self.scene_weights:
-            return bins
-        return RecordingBins(
-            bins.name, bins.group, bins.features, bins.is_slip, longest_run=bins.longest_run
-        )
-
     def _plan(
         self,
         sample: SampledBins,
         pool: FeaturePool,
-        longest_run: int | None,
         is_nested: bool,
         show: bool,
     ) -> tuple[_Plan, dict[str, tuple[float, float]]]:
@@ -425,11 +377,10 @@ class General(_Recipe):
             kernel=choice.structure.kernel,
             penalty=choice.penalty,
             imputation=_class_mean(selection(sample.features), sample.is_slip, weight),
-            sensing=self._sensing(pool, selection, sample, longest_run, fraction),
+            sensing=self._sensing(pool, selection, sample, fraction),
             num_bins=num_bins,
             validation=choice.rows,
             nested=choice.nested,
-            feature_filter=self._filtered(allowed),
         )
         return plan, weights
 
@@ -489,7 +440,6 @@ class Paper(_Recipe):
     Args:
         name: for tables.
         penalties: the paper's ``C``; of several values validation chooses one.
-        group_by: as in ``General``.
         sample_bins: bins of each group and class that ``C`` is chosen by.
         feature_filter: as in ``General``; ``num_features`` is cut to what matches.
         descriptors: as in ``General``.
@@ -518,18 +468,16 @@ class Paper(_Recipe):
         """The kernel."""
         return Polynomial(self.degree, self.offset)
 
-    def check_pool(self, pool: FeaturePool) -> None:
-        """As ``General.check_pool``."""
-        self._size(int(self.allowed(pool).sum()))
-
-    def _size(self, num_allowed: int) -> int:
-        """How many features are selected of so many."""
-        if self.num_features > num_allowed and self.feature_filter is None:
+    def allowed(self, pool: FeaturePool) -> Tensor:
+        """As ``General.allowed``; refuses a pool with fewer features than are to be selected."""
+        mask = super().allowed(pool)
+        num = int(mask.sum())
+        if self.num_features > num and self.feature_filter is None:
             raise ValueError(
-                f"recipe.num_features={self.num_features} exceeds the pool's {num_allowed}; give "
-                f"at most {num_allowed}"
+                f"recipe.num_features={self.num_features} exceeds the pool's {num}; give at most "
+                f"{num}"
             )
-        return min(self.num_features, num_allowed)
+        return mask
 
     def fit(
         self,
@@ -540,7 +488,7 @@ class Paper(_Recipe):
         show: bool = False,
     ) -> Fit:
         """As ``General.fit``; there is nothing nested."""
-        watch, statistics = _Watch(), _Statistics(self.sample_bins)
+        watch, statistics = _Watch(), _Statistics(len(pool.names), self.sample_bins)
         for some in bins:
             statistics.update(some)
         statistics = _merged(statistics)
@@ -572,16 +520,13 @@ class Paper(_Recipe):
         show: bool,
     ) -> _Plan:
         """Features, scaling and penalty."""
-        moments = statistics.moments
-        assert moments is not None  # class_counts
-        allowed = self.allowed(pool)
-        places = allowed.nonzero()[:, 0]
-        size = self._size(len(places))
+        places = self.allowed(pool).nonzero()[:, 0]
+        size = min(self.num_features, len(places))
         if size < self.num_features:
             log.warning(
                 "recipe.num_features=%d is cut to %d: no more match", self.num_features, size
             )
-        best = places[rank_features(t_scores(moments)[places], size)].tolist()
+        best = places[rank_features(t_scores(statistics.moments)[places], size)].tolist()
         scaler = FeatureScaler(statistics.minimum[best].double(), statistics.maximum[best].double())
         selection = FeatureSelection(tuple(best), scaler)
         z = selection(sample.features)
@@ -591,10 +536,9 @@ class Paper(_Recipe):
             kernel=self.kernel,
             penalty=penalty,
             imputation=_class_mean(z, sample.is_slip, weight),
-            sensing=self._sensing(pool, selection, sample, statistics.longest_run, 0.5),
+            sensing=self._sensing(pool, selection, sample, 0.5),
             num_bins=2 * min(class_counts(sample)),
             validation=rows,
-            feature_filter=self._filtered(allowed),
         )
 
     def _penalty(
@@ -619,8 +563,8 @@ class Paper(_Recipe):
             known = [value for value in by_group.values() if value is not None]
             if not known:
                 raise ValueError(
-                    "no validation group has bins of both classes; take another recipe.group_by, "
-                    "or one value of recipe.penalties"
+                    "no validation group has bins of both classes; add recordings, or give one "
+                    "value of recipe.penalties"
                 )
             rows.append(
                 {
@@ -657,42 +601,32 @@ def class_counts(sample: SampledBins) -> list[int]:
 class _Statistics:
     """Moments, ranges and a sample of training bins."""
 
-    def __init__(self, sample_bins: int) -> None:
-        self.moments: ClassMoments | None = None
-        self.minimum, self.maximum = torch.tensor(torch.inf), torch.tensor(-torch.inf)
-        self.longest_run: int | None = None
+    def __init__(self, num_features: int, sample_bins: int) -> None:
+        self.moments = ClassMoments(num_features)
+        self.minimum = torch.full((num_features,), torch.inf)
+        self.maximum = -self.minimum
         self.sample = BinSample(sample_bins)
 
     def update(self, bins: RecordingBins) -> None:
         """Add a recording."""
-        if not len(bins.features):
-            return
-        moments = ClassMoments(bins.features.shape[1])
         try:
-            moments.update(bins.features, bins.is_slip)
+            self.moments.update(bins.features, bins.is_slip)
         except ValueError as error:
             raise ValueError(f"recording {bins.name!r}: {error}") from None
         self.sample.update(bins)
-        self._add(moments, bins.features.amin(0), bins.features.amax(0), bins.longest_run)
+        if len(bins.features):
+            self._widen(bins.features.amin(0), bins.features.amax(0))
 
     def merge(self, other: _Statistics) -> None:
         """Add the recordings of another process."""
+        self.moments.merge(other.moments)
         self.sample.merge(other.sample)
-        if other.moments is not None:
-            self._add(other.moments, other.minimum, other.maximum, other.longest_run)
+        self._widen(other.minimum, other.maximum)
 
-    def _add(
-        self, moments: ClassMoments, minimum: Tensor, maximum: Tensor, run: int | None
-    ) -> None:
-        if self.moments is None:
-            self.moments = moments
-        else:
-            self.moments.merge(moments)
+    def _widen(self, minimum: Tensor, maximum: Tensor) -> None:
         # which of 0 and -0 is taken depends on their order; adding 0 leaves 0 alone
         self.minimum = torch.minimum(self.minimum, minimum) + 0.0
         self.maximum = torch.maximum(self.maximum, maximum) + 0.0
-        runs = [run for run in (self.longest_run, run) if run is not None]
-        self.longest_run = max(runs, default=None)
 
 
 class _TrainingPass:
