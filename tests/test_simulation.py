@@ -16,7 +16,6 @@ from test_signal_checks import BY_NAME, HAND, changed, shuffled
 from benchmarks.signal_checks import filtered
 from tactslip_torch import native
 from tactslip_torch.commands.configuration import conf_dir
-from tactslip_torch.deploy.check import extreme_bins
 from tactslip_torch.simulation import (
     SEEN_MATERIALS,
     UNSEEN_MATERIALS,
@@ -255,10 +254,6 @@ def machine(**values):
     return simulate(scene_of("machine", "M1", **values))
 
 
-def extremes(kind="plain", shape=(100,)):
-    return extreme_bins(kind, shape, torch.Generator())
-
-
 REFUSED = [
     (scene, {"material": "M7"}, r"unknown material 'M7'; known are M1, .*wood"),
     (scene, {"fidelity": "lugre"}, r"unknown fidelity 'lugre'; known are kinematic, bristles$"),
@@ -305,8 +300,6 @@ REFUSED = [
     (SimulatedRecordings, {"sessions": 0}, r"data\.sessions must be a positive .*, got 0"),
     (simulate_many, {"scenes": [], "at_once": 0}, r"at_once must be a positive whole .*, got 0"),
     (simulate_many, {"scenes": [], "windows": [None]}, r"windows of each of 0 scenes, got 1"),
-    (extremes, {"kind": "quiet"}, r"kind must be one of plain, .* got 'quiet'"),
-    (extremes, {"shape": (3, 1)}, r"two samples, got shape \(3, 1\)"),
 ]
 
 
