@@ -367,19 +367,13 @@ def make_trainer(config: DictConfig, folder: Path) -> L.Trainer:
 
 
 def write_tensorboard(folder: Path, config: DictConfig, metrics: Mapping[str, Any]) -> None:
-    """Add to a run's TensorBoard its figures, validation, configuration, and final scores.
-
-    The curve of validation has the choices in the order of C as its steps.
+    """Add to a run's TensorBoard its figures, configuration, and final scores.
 
     Args:
         folder: of the run, with its figures.
         config: of the run.
         metrics: the content of ``metrics.json``.
     """
-    plain: Any = OmegaConf.to_container(config, resolve=True)
-    flat = {key: value for key, value in _flat(plain) if "._" not in key}
-    is_simple = (bool, int, float, str)
-    given = {key: v if isinstance(v, is_simple) else str(v) for key, v in flat.items()}
     final = {
         f"final/{role}/{name}": scores[name]
         for role, scores in metrics["splits"].items()
@@ -391,21 +385,8 @@ def write_tensorboard(folder: Path, config: DictConfig, metrics: Mapping[str, An
         for path in sorted(folder.glob("*.png")):
             with Image.open(path) as image:
                 board.add_image(path.stem, np.asarray(image.convert("RGB")), dataformats="HWC")
-        choices = sorted(metrics.get("validation") or (), key=lambda row: row["penalty"])
-        penalties = sorted({row["penalty"] for row in choices})
-        for row in choices:
-            kernel = "_".join(f"{k}={v}" for k, v in row["kernel"].items())
-            name = f"validation/{row.get('use', 'channel')}/K={row['num_features']}/{kernel}"
-            board.add_scalar(name, row["mean"], penalties.index(row["penalty"]))
-        board.add_hparams(given, final, run_name=".")
-
-
-def _flat(section: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in section.items():
-        if isinstance(value, dict) and value:
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+        for name, score in final.items():
+            board.add_scalar(name, score)
 
 
 def feature_rows(names: Sequence[FeatureName], hand: HandLayout) -> list[dict[str, str]]:

@@ -81,17 +81,19 @@ class SlipLearner(L.LightningModule):
     @torch.no_grad()
     def training_step(self, batch: TrainingBins, batch_idx: int) -> None:
         """Fit to the training bins of this process and of those beside it."""
+        started = time.perf_counter()
         fit = self.recipe.fit(batch, self.pool, show=True)
+        fitted = time.perf_counter()
+        self.seconds["fit"] = fitted - started
         self.log("penalty", fit.penalty, batch_size=1)
-        self.seconds |= fit.seconds
         self.metadata = {"recipe": self.recipe.name} | fit.metadata
         info = self.metadata | {"calibration": fit.calibration}
         if self.with_baselines:
-            started, sample = time.perf_counter(), fit.sample
+            sample = fit.sample
             self.baselines = from_first_process(
                 lambda: Baselines(self.pool, fit.selection(sample.features), sample)
             )
-            self.seconds["baselines"] = time.perf_counter() - started
+            self.seconds["baselines"] = time.perf_counter() - fitted
         self.detector = fit.detector(self.pool, self.channel_filter, info)
 
     def on_test_start(self) -> None:

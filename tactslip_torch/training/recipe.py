@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
@@ -71,6 +71,8 @@ class _Plan:
     imputation: Tensor
     sensing: Sensing
     num_bins: int
+    sample: SampledBins
+    weights: dict[str, tuple[float, float]]
     validation: list[dict[str, Any]]
     nested: dict[str, Any] | None = None
 
@@ -86,17 +88,15 @@ class Fit(_Plan):
         imputation: mean of the scaled columns, both classes counting alike; for lost channels.
         sensing: spans of channels that work, of the training bins.
         num_bins: how many bins are trained on; about, where classes are undersampled.
+        sample: of the training bins.
+        weights: of each bin by scene, non-slip and slip; of ``Paper`` the part that is trained on.
         validation: one row per candidate, with the balanced accuracy of each held-out group; the
             one that was taken has ``chosen`` and the ``calibration`` of its held-out scores.
         nested: balanced accuracy of the whole choice on groups that it did not see, if measured.
         head: the machine.
-        sample: of the training bins.
-        seconds: time of each stage.
     """
 
     head: Head = field(kw_only=True)
-    sample: SampledBins = field(kw_only=True)
-    seconds: dict[str, float] = field(kw_only=True)
 
     @property
     def calibration(self) -> dict[str, Any] | None:
@@ -149,7 +149,7 @@ class Fit(_Plan):
 
 
 @dataclass(frozen=True)
-class _Recipe:
+class _Recipe(ABC):
     """What both recipes have."""
 
     name: str
@@ -210,6 +210,65 @@ class _Recipe:
                 "rounding; ask for others"
             )
         return mask
+
+    def fit(
+        self,
+        bins: Iterable[RecordingBins],
+        pool: FeaturePool,
+        *,
+        is_nested: bool = True,
+        show: bool = False,
+    ) -> Fit:
+        """Choose a machine and fit it.
+
+        Args:
+            bins: training bins; they are gone through twice.
+            pool: of their features, whole or a selection.
+            is_nested: whether a nested validation also evaluates the choice itself.
+            show: progress bars.
+
+        Raises:
+            ValueError: if a class is absent, or a solve fails.
+        """
+        statistics = self._statistics(pool)
+        for some in bins:
+            statistics.update(some)
+        statistics = _merged(statistics)
+        plan: _Plan = from_first_process(lambda: self._plan(statistics, pool, is_nested, show))
+        size, degree, kept = plan.selection.size, plan.kernel.degree, {}
+        sums = SufficientStats(size, degree=degree)
+        adds_up = plan.num_bins > plan.kernel.num_monomials(size)  # else the bins are fewer
+        for some in bins:
+            part = self._weighted(plan, some)
+            if adds_up:
+                sums.update(some.name, *part)
+            else:
+                kept[some.name] = part
+        if not adds_up:
+            kept = dict(itertools.chain(*(own.items() for own in gathered(kept))))
+        elif _num_processes() > 1:
+            for total in (sums.sums, sums.count):
+                torch.distributed.all_reduce(total)
+
+        def solve() -> Head:
+            if adds_up:
+                return sums.solve(plan.penalty, plan.kernel.offset, balance="none")
+            columns = zip(*(kept[name] for name in sorted(kept)), strict=True)
+            return fit_machine(TrainingBins(*map(torch.cat, columns)), plan.penalty, plan.kernel)
+
+        return Fit(**vars(plan), head=from_first_process(solve))
+
+    @abstractmethod
+    def _statistics(self, pool: FeaturePool) -> BinSample | _Statistics:
+        """What the first look at training bins gathers."""
+
+    @abstractmethod
+    def _plan(self, statistics: Any, pool: FeaturePool, is_nested: bool, show: bool) -> _Plan:
+        """Choose by what was gathered."""
+
+    @abstractmethod
+    def _weighted(self, plan: _Plan, bins: RecordingBins) -> tuple[Tensor, Tensor, Tensor]:
+        """Scaled bins ``[N, K]``, classes and weights ``[N]`` that the machine is fitted to."""
 
     def _sensing(
         self,
@@ -299,55 +358,20 @@ class General(_Recipe):
             for degree in sorted(_several(self.degree))
         )
 
-    def fit(
-        self,
-        bins: Iterable[RecordingBins],
-        pool: FeaturePool,
-        *,
-        is_nested: bool = True,
-        show: bool = False,
-    ) -> Fit:
-        """Choose a machine and fit it.
+    def _statistics(self, pool: FeaturePool) -> BinSample:
+        return BinSample(self.sample_bins)
 
-        Args:
-            bins: training bins; they are gone through twice.
-            pool: of their features, whole or a selection.
-            is_nested: whether to evaluate the choice itself by leaving out two groups.
-            show: progress bars.
+    def _weighted(self, plan: _Plan, bins: RecordingBins) -> tuple[Tensor, Tensor, Tensor]:
+        selection, is_slip = plan.selection, bins.is_slip
+        z, of_class = selection(bins.features), torch.tensor(plan.weights[bins.scene]).double()
+        if self.drop_channels == 0 or selection.pooling is None:
+            return z, is_slip, of_class[is_slip.long()]
+        is_lost = _dropped(bins.name, len(selection.pooling.hand), self.drop_channels)
+        fewer = selection(bins.features, is_lost.expand(len(z), -1))
+        return torch.cat([z, fewer]), is_slip.repeat(2), of_class[is_slip.long()].repeat(2) / 2
 
-        Raises:
-            ValueError: if a class is absent, or a solve fails.
-        """
-        watch = _Watch()
-        drawn = BinSample(self.sample_bins)
-        for some in bins:
-            drawn.update(some)
-        sample = _merged(drawn).bins()
-        watch.lap("statistics")
-        plan, weights = from_first_process(lambda: self._plan(sample, pool, is_nested, show))
-        watch.lap("validation")
-        selection, training = plan.selection, _TrainingPass(plan)
-        for some in bins:
-            z = selection(some.features)
-            of_class = torch.tensor(weights.get(some.scene, (1.0, 1.0)), dtype=torch.float64)
-            is_slip, weight = some.is_slip, of_class[some.is_slip.long()]
-            if self.drop_channels > 0 and selection.pooling is not None:
-                is_lost = _dropped(some.name, len(selection.pooling.hand), self.drop_channels)
-                z = torch.cat([z, selection(some.features, is_lost.expand(len(z), -1))])
-                is_slip, weight = is_slip.repeat(2), weight.repeat(2) / 2
-            training.update(some.name, z, is_slip, weight)
-        head = training.solve()
-        watch.lap("solve")
-        return Fit(**vars(plan), head=head, sample=sample, seconds=watch.seconds)
-
-    def _plan(
-        self,
-        sample: SampledBins,
-        pool: FeaturePool,
-        is_nested: bool,
-        show: bool,
-    ) -> tuple[_Plan, dict[str, tuple[float, float]]]:
-        """Features, kernel and penalty; and the weights of bins by scene."""
+    def _plan(self, statistics: BinSample, pool: FeaturePool, is_nested: bool, show: bool) -> _Plan:
+        sample = statistics.bins()
         allowed = self.allowed(pool)
         weights = self.weights(sample)
         table = torch.tensor([weights[scene] for scene in sample.scene_names])
@@ -356,14 +380,8 @@ class General(_Recipe):
         num_bins = round(float(sample.weight.sum()))
         structures, penalties = self._structures(num_bins), self.penalties_ascending
         if len(sample.group_names) > 1:
-            choice = choose_model(
-                candidates,
-                structures,
-                penalties,
-                self.tolerance,
-                is_nested=is_nested,
-                show=show,
-            )
+            how = {"is_nested": is_nested, "show": show}
+            choice = choose_model(candidates, structures, penalties, self.tolerance, **how)
         else:
             choice = Choice(structures[0], penalties[len(penalties) // 2])
             log.warning(
@@ -372,17 +390,18 @@ class General(_Recipe):
         selection = candidates.select(choice.structure)
         is_pooled = selection.pooling is not None and self.drop_channels > 0
         fraction = 1 - self.drop_channels if is_pooled else 0.5
-        plan = _Plan(
+        return _Plan(
             selection=selection,
             kernel=choice.structure.kernel,
             penalty=choice.penalty,
             imputation=_class_mean(selection(sample.features), sample.is_slip, weight),
             sensing=self._sensing(pool, selection, sample, fraction),
             num_bins=num_bins,
+            sample=sample,
+            weights=weights,
             validation=choice.rows,
             nested=choice.nested,
         )
-        return plan, weights
 
     def _structures(self, num_bins: int) -> list[Structure]:
         """All structures for a machine of so many training bins, the simplest first.
@@ -479,47 +498,22 @@ class Paper(_Recipe):
             )
         return mask
 
-    def fit(
-        self,
-        bins: Iterable[RecordingBins],
-        pool: FeaturePool,
-        *,
-        is_nested: bool = True,
-        show: bool = False,
-    ) -> Fit:
-        """As ``General.fit``; there is nothing nested."""
-        watch, statistics = _Watch(), _Statistics(len(pool.names), self.sample_bins)
-        for some in bins:
-            statistics.update(some)
-        statistics = _merged(statistics)
-        watch.lap("statistics")
-        sample = statistics.sample.bins()
-        counts = class_counts(sample)
-        fractions = [min(counts) / count for count in counts]
-        weight = sample.weight * torch.tensor(fractions).double()[sample.is_slip.long()]
-        plan = from_first_process(lambda: self._plan(statistics, sample, weight, pool, show))
-        watch.lap("validation")
-        training = _TrainingPass(plan)
-        for some in bins:
-            kept = (
-                bin_keys(some.name, len(some.is_slip))
-                < torch.tensor(fractions).double()[some.is_slip.long()]
-            )
-            z = plan.selection(some.features[kept])
-            training.update(some.name, z, some.is_slip[kept], torch.ones(len(z)).double())
-        head = training.solve()
-        watch.lap("solve")
-        return Fit(**vars(plan), head=head, sample=sample, seconds=watch.seconds)
+    def _statistics(self, pool: FeaturePool) -> _Statistics:
+        return _Statistics(len(pool.names), self.sample_bins)
+
+    def _weighted(self, plan: _Plan, bins: RecordingBins) -> tuple[Tensor, Tensor, Tensor]:
+        is_slip, fractions = bins.is_slip, torch.tensor(plan.weights[PAPER_SCENE]).double()
+        kept = bin_keys(bins.name, len(is_slip)) < fractions[is_slip.long()]
+        z = plan.selection(bins.features[kept])
+        return z, is_slip[kept], torch.ones(len(z), dtype=torch.float64)
 
     def _plan(
-        self,
-        statistics: _Statistics,
-        sample: SampledBins,
-        weight: Tensor,
-        pool: FeaturePool,
-        show: bool,
+        self, statistics: _Statistics, pool: FeaturePool, is_nested: bool, show: bool
     ) -> _Plan:
-        """Features, scaling and penalty."""
+        sample = statistics.sample.bins()
+        counts = class_counts(sample)
+        fractions = min(counts) / counts[0], min(counts) / counts[1]
+        weight = sample.weight * torch.tensor(fractions).double()[sample.is_slip.long()]
         places = self.allowed(pool).nonzero()[:, 0]
         size = min(self.num_features, len(places))
         if size < self.num_features:
@@ -537,7 +531,9 @@ class Paper(_Recipe):
             penalty=penalty,
             imputation=_class_mean(z, sample.is_slip, weight),
             sensing=self._sensing(pool, selection, sample, 0.5),
-            num_bins=2 * min(class_counts(sample)),
+            num_bins=2 * min(counts),
+            sample=sample,
+            weights={PAPER_SCENE: fractions},
             validation=rows,
         )
 
@@ -627,58 +623,6 @@ class _Statistics:
         # which of 0 and -0 is taken depends on their order; adding 0 leaves 0 alone
         self.minimum = torch.minimum(self.minimum, minimum) + 0.0
         self.maximum = torch.maximum(self.maximum, maximum) + 0.0
-
-
-class _TrainingPass:
-    """The second look at training bins: sums of fixed size, or the bins where they are few."""
-
-    def __init__(self, plan: _Plan) -> None:
-        self._plan = plan
-        self._bins: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
-        self._sums: SufficientStats | None = None
-        if plan.num_bins > plan.kernel.num_monomials(plan.selection.size):
-            self._sums = SufficientStats(plan.selection.size, degree=plan.kernel.degree)
-
-    def update(self, name: str, z: Tensor, is_slip: Tensor, weight: Tensor) -> None:
-        """Add scaled bins of a recording, ``[N, K]`` and ``[N]``."""
-        if self._sums is not None:
-            self._sums.update(name, z, is_slip, weight)
-        else:
-            self._bins[name] = z, is_slip, weight
-
-    def solve(self) -> Head:
-        """The machine of the bins of all processes.
-
-        Raises:
-            ValueError: if the system cannot be told in float64.
-        """
-        if self._sums is None:
-            for bins in gathered(self._bins):
-                self._bins |= bins
-        elif _num_processes() > 1:
-            for total in (self._sums.sums, self._sums.count):
-                torch.distributed.all_reduce(total)
-        return from_first_process(self._solve)
-
-    def _solve(self) -> Head:
-        kernel, penalty = self._plan.kernel, self._plan.penalty
-        if self._sums is not None:
-            return self._sums.solve(penalty, kernel.offset, balance="none")
-        columns = zip(*(self._bins[name] for name in sorted(self._bins)), strict=True)
-        return fit_machine(TrainingBins(*map(torch.cat, columns)), penalty, kernel)
-
-
-class _Watch:
-    """Seconds of each stage."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        """End a stage."""
-        now = time.perf_counter()
-        self.seconds[stage], self._last = now - self._last, now
 
 
 def _dropped(recording: str, num: int, largest: float) -> Tensor:
