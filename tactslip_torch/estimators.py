@@ -101,9 +101,6 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         (8, 1120)
     """
 
-    _pool: FeaturePool
-    context_: tuple[int, int]
-
     def __init__(
         self,
         sample_rate_hz: float,
@@ -224,32 +221,36 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         hand, frames = self.hand, FRAMES if self.frames is None else self.frames
         if hand is None:
             alike = range(1, windows.shape[1] + 1)
-            channels = (Channel(f"C{i}", "taxel", "any", "any", "fast") for i in alike)
-            hand = HandLayout(tuple(channels))
+            hand = HandLayout(tuple(Channel(f"C{i}", "taxel", "any", "any", "fast") for i in alike))
         if self.frames and (unknown := sorted(set(frames) - set(hand.kinds))):
             raise ValueError(
                 f"frames names the kind {unknown[0]!r}, which no channel is of; take some of "
                 f"{', '.join(hand.kinds)}"
             )
         lengths = [frames.get(channel.kind) or 1 for channel in hand.channels]
-        self._take(None, ChannelFilter(lengths, align=self.align), hand)
-        before, after = self.context_
+        layer = ChannelFilter(lengths, align=self.align)
+        before, after = (0, 0) if self.filtered else (layer.context_before, layer.context_after)
         if (num := windows.shape[-1] - before - after) < 1:
             raise ValueError(
                 f"windows of {windows.shape[-1]} samples leave nothing, as the filter takes "
                 f"{before} before and {after} behind; give longer ones, filtered ones with "
                 "filtered=True, or frames={} for no filter"
             )
-        options: dict[str, Any] = {"bin_samples": num, "wavelet": self.wavelet, "level": None}
-        self._pool = FeaturePool(hand, float(self.sample_rate_hz), **options)
+        pool = FeaturePool(
+            hand,
+            float(self.sample_rate_hz),
+            bin_samples=num,
+            wavelet=self.wavelet,
+            level=None,
+        )
+        self._set(pool, layer)
         return windows
 
-    def _take(self, pool: Any, channel_filter: ChannelFilter, hand: HandLayout) -> None:
-        self._pool = pool
-        self._filter, self.hand_ = channel_filter, hand
-        self.context_ = (channel_filter.context_before, channel_filter.context_after)
-        if self.filtered:
-            self.context_ = (0, 0)
+    def _set(self, pool: FeaturePool, layer: ChannelFilter) -> None:
+        """What windows of a fit, or of a detector, are described by."""
+        self._pool, self._filter, self.hand_ = pool, layer, pool.hand
+        context = (layer.context_before, layer.context_after)
+        self.context_ = (0, 0) if self.filtered else context
 
     def _bins(self, windows: Tensor) -> Tensor:
         """Filtered bins of windows."""
@@ -310,8 +311,6 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         >>> classifier.predict(X[:1]), classifier.predict_proba(X).shape
         (array(['grip'], dtype='<U4'), (60, 2))
     """
-
-    _slope: Calibration
 
     def __init__(
         self,
@@ -381,7 +380,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         with torch.no_grad():
             x = pool(features._bins(windows), torch.float64)
             fit = _fitted(recipe, pool, x, is_slip, *_groups(y, groups))
-        self._slope = _UNCALIBRATED
+        self._slope: Calibration = _UNCALIBRATED
         if fit.calibration is not None:
             self._slope = Platt(fit.calibration["slope"], 0.0)  # a score of 0 says nothing
         info = fit.metadata | {
@@ -444,7 +443,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         features = TactileFeatures(
             pool.sample_rate_hz, pool.hand, filtered=filtered, align=layer.align
         )
-        features._take(pool, layer, pool.hand)
+        features._set(pool, layer)
         made = cls(features, slip_label=labels[1])
         made.classes_, made.slip_label_ = np.unique(np.array(labels)), np.array(labels)[1]
         found = calibration_of(detector)

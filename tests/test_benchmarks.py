@@ -1,4 +1,4 @@
-"""Each benchmark runs in its smallest form, and writes where it is told."""
+"""Each benchmark runs in its smallest form, and writes where it is asked to."""
 
 import json
 from functools import partial

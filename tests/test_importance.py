@@ -8,7 +8,6 @@ import torch
 from omegaconf import OmegaConf
 from sklearn.metrics import balanced_accuracy_score
 from small_detector import HAND, raw_bins, small_detector
-from tactslip_torch.features.bin_sample import BinSample
 from test_commands import BAD_INPUT, TINY, composed
 
 from tactslip_torch.analysis.importance import (
@@ -22,6 +21,7 @@ from tactslip_torch.analysis.importance import (
     score_gradients,
     without,
 )
+from tactslip_torch.analysis.old.bin_sample import BinSample
 from tactslip_torch.commands.importance import sensors
 from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.features.selection import ClassMoments, t_scores

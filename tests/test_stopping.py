@@ -42,7 +42,6 @@ def test_a_signal_is_a_line_and_a_status(number, capsys):
 STOPPED = [
     (signal.SIGTERM, TRAIN, "config.yaml", "in the cache; start it again"),
     (signal.SIGINT, "generate materials=M1 cycles=20", "M1_paper_00.npz", "are whole"),
-    (signal.SIGTERM, "crossval data.cycles=2", "crossval.log", "start it again"),
 ]
 
 

@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from difflib import get_close_matches
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
@@ -138,11 +139,11 @@ class Contact(_Parameters):
         recoil_s: time constant of the shear's fall from static to kinetic (prior, ours). On the
             kinematic fidelity alone: bristles integrate that fall.
         friction_noise_mv: *calibrated.* Broadband friction noise of every sliding element, rms
-            at a PVDF film for mu = 1, 1 N and 40 mm/s.
+            in a fast channel for mu = 1, 1 N and 40 mm/s.
         friction_noise_exponent: power of speed it grows with.
         friction_noise_low_share: share of its power below 25 Hz.
         texture_scale: factor on every material's texture (prior, ours).
-        onset_pulse_v: first swing of the PVDF burst when an element lets go, per newton of
+        onset_pulse_v: first swing of a fast channel's burst when an element lets go, per newton of
             friction. On kinematic fidelity alone: see ``Dynamics.release_v_per_n``.
         runout: relative change of normal load along the travel.
         skin_resonance_hz: range of the skin's resonance, drawn per session.
@@ -204,18 +205,19 @@ class Sensors(_Parameters):
         white_noise_mv: rms of each channel's white noise.
         white_noise_session_spread: its spread between sessions.
         gain_spread: spread of the channels' gains between sessions (a third between recordings).
-        sg_preload_v_per_n: SG volts per newton of normal force (prior, ours).
-        sg_shear_v_per_n: SG volts per newton of friction (prior, ours).
-        sg_session_offset_v: spread of SG offsets between sessions (prior, ours).
-        sg_offset_v: spread of SG offsets between recordings, from grasping again.
-        sg_drift_mv: size of the SG's slow drift (prior, ours).
-        pvdf_shear_v_per_n: PVDF volts per newton of friction, before the high-pass (prior, ours).
+        sg_preload_v_per_n: volts of a slow channel per newton of normal force (prior, ours).
+        sg_shear_v_per_n: volts of a slow channel per newton of friction (prior, ours).
+        sg_session_offset_v: spread of slow channels' offsets between sessions (prior, ours).
+        sg_offset_v: spread of slow channels' offsets between recordings, from grasping again.
+        sg_drift_mv: size of a slow channel's drift (prior, ours).
+        pvdf_shear_v_per_n: volts of a fast channel per newton of friction, before the high-pass
+            (prior, ours).
         pvdf_highpass_hz: corner of the film and its amplifier (6.6 Hz at 10 MOhm, MSI
             manual), at least 2 Hz.
         pvdf_offset_mv: largest offset behind the high-pass; keep it at or below 2 mV.
-        pvdf_drift_mv: size of the film's slow (pyroelectric) drift.
-        warming_mv: how far an SG channel's zero moves over the recording as the hand warms up,
-            with a sign and size of its own in every channel; a PVDF channel moves a fiftieth of it.
+        pvdf_drift_mv: size of a fast channel's (pyroelectric) drift.
+        warming_mv: how far a slow channel's zero moves over the recording as the hand warms up,
+            with a sign and size of its own in every channel; a fast one moves a fiftieth of it.
         num_bits: of the converter.
         rail_v: the converter's range is plus and minus this.
 
@@ -243,7 +245,7 @@ class Sensors(_Parameters):
         super().__post_init__()
         self._require("num_bits", 2 <= self.num_bits <= 32, "2 to 32")
         self._require("rail_v", self.rail_v > 0, "positive")
-        wanted = "at least 2, for slower films outlast a block of a quarter second"
+        wanted = "at least 2, for slower ones outlast a block of a quarter second"
         self._require("pvdf_highpass_hz", self.pvdf_highpass_hz >= 2, wanted)
 
 
@@ -379,8 +381,8 @@ class Dynamics(_Parameters):
             and the other sticks and slips, but for the softest skins of all and most patches.
         bristle_damping: damping ratio of the bristles with the skin's mass (prior, ours).
         viscous_n_s_m: viscous friction, which the closed forms do not have.
-        release_v_per_n: PVDF volts per newton of the skin's inertia: what a film at the
-            surface hears when the skin lets go (prior, ours: so that the bursts of M2 to M5
+        release_v_per_n: volts of a fast channel per newton of the skin's inertia, when the skin
+            lets go (prior, ours: so that the bursts of M2 to M5
             stand out of their slides with a single bristle, as the paper shows).
 
     Raises:
@@ -412,12 +414,12 @@ class Imperfections(_Parameters):
     """What makes channels differ without slip, and what makes slip differ between channels.
 
     On the paper's simulated hand, slip alone makes channels differ: everything else (mains, arm,
-    motor) moves them together. On real electrodes at rest neighbours are nearly independent
-    (``python -m benchmarks.realism``). None of these moves an onset.
+    motor) moves them together. On real electrodes at rest neighbours are nearly independent.
+    None of these moves an onset.
 
     Args:
         local_noise_mv: noise of every element that touches, sliding or not, independent between
-            elements, rms at a PVDF film at 1 N. It stands for creep and settling of asperities
+            elements, rms in a fast channel at 1 N. It stands for creep and settling of asperities
             behind the skin's resonance, so it has the spectrum of friction noise; its level wanders
             within the recording and differs between elements (prior, ours: below the 1.5 to 4 mV
             rms of rest; independent, as a real fingertip's electrodes in touch).
@@ -425,7 +427,7 @@ class Imperfections(_Parameters):
             half a second to ten (prior: in the real set a channel's level wanders about the mean
             over channels by .2 to .3 within seconds).
         gain_drift: the same of each channel's gain: temperature, glue (prior, ours).
-        pickup_mv: broadband pick-up, one signal in all channels, rms at a film of coupling 1. Each
+        pickup_mv: broadband pick-up, one signal in all channels, rms at a coupling of 1. Each
             channel has a coupling and sign of its own, so it too makes channels differ; its level
             wanders (a film is a source of high impedance, near motor drives and cables: MSI/TE
             Piezo Film Sensors Technical Manual asks for shielding; level prior, ours).
@@ -461,7 +463,8 @@ class Material:
         mu_s: static friction coefficient, the centre of its lognormal prior; dimensionless.
         ra_um: lowest and highest roughness Ra; with ``texture_mv`` it sets how strongly the
             material vibrates (a session rougher than the middle of its range vibrates more).
-        texture_mv: rms of the texture's vibration at 40 mm/s and 1 N at a PVDF film (prior, ours).
+        texture_mv: rms of the texture's vibration at 40 mm/s and 1 N in a fast channel (prior,
+            ours).
         character: see ``Character``.
         wavelength_mm: shortest and longest dominant wavelength, or ``None`` without one. For a
             tacky material: travel per stick-slip cycle.
@@ -764,10 +767,10 @@ def paper_scenes(
     values = _grouped(overrides)
     known = {f.name for f in fields(Scene)} - {"material", "hand", "seed", "cycle"}
     if unknown := sorted(set(values) - known):
-        raise ValueError(
-            f"unknown override {', '.join(unknown)}; a scene has {', '.join(sorted(known))} "
-            f"and the fields of {', '.join(group.__name__ for group in _GROUPS.values())}"
-        )
+        names = known.union(*((f.name for f in fields(group)) for group in _GROUPS.values()))
+        near = get_close_matches(unknown[0], names, 1)
+        hint = f"did you mean {near[0]}?" if near else "see tactslip_torch.Scene"
+        raise ValueError(f"a scene has no parameter {', '.join(unknown)}; {hint}")
     return [
         Scene(material, hand or HandLayout.paper24(), seed=seed, cycle=cycle, **values)
         for material in materials

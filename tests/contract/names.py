@@ -43,7 +43,6 @@ KEYS = {
     "held_out": "split.unseen",
     "materials": "data.materials",
     "num_features": "recipe.num_features",
-    "num_held_out": "num_unseen",
     "penalties": "recipe.penalties",
     "root": "data.root",
     "root_of_data": "root",

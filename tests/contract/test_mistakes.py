@@ -45,11 +45,6 @@ MISTAKES = {  # beside those of tests/test_command_line.py, which a page lists
         "precision float32 float64 'int8'",
     ),
     "export of no alarm": ("export", settings(model="{bare}", graph="stream"), "alarm onset"),
-    "crossval of too many": (
-        "crossval",
-        [*of_set("{root}"), *settings(num_held_out=4, workers=0)],
-        "num_unseen 4",
-    ),
 }
 
 
