@@ -79,8 +79,8 @@ def read_materials(
                 fitted[material].update(bins)
     training = {}
     for name, sample in fitted.items():
-        bins = sample.bins()
-        training[name] = RecordingBins(name, name, bins.features, bins.is_slip)
+        own = sample.bins()
+        training[name] = RecordingBins(name, name, own.features, own.is_slip)
     return Materials(maker.pool, training, {key: of.bins() for key, of in drawn.items()})
 
 
@@ -96,15 +96,14 @@ def evaluate_split(materials: Materials, recipe: Recipe, unseen: Sequence[str]) 
     fit = recipe.fit(bins, materials.pool, is_nested=False)
 
     def score(names: Sequence[str], roles: Sequence[str]) -> tuple[float | None, dict[str, Any]]:
-        weights, says, truth, by_material = [], [], [], {}
+        decided: list[tuple[torch.Tensor, ...]] = []
         for name in names:
             some = [materials.scored[name, role] for role in roles]
-            own = [torch.cat([fit.head(fit.selection(of.features)) >= 0 for of in some])]
-            own += [torch.cat([of.is_slip for of in some]), torch.cat([of.weight for of in some])]
-            by_material[name] = balanced_accuracy(*own)
-            for kept, of in zip((says, truth, weights), own, strict=True):
-                kept.append(of)
-        return balanced_accuracy(*map(torch.cat, (says, truth, weights))), by_material
+            says_slip = torch.cat([fit.head(fit.selection(of.features)) >= 0 for of in some])
+            truth, weights = ([getattr(of, n) for of in some] for n in ("is_slip", "weight"))
+            decided.append((says_slip, torch.cat(truth), torch.cat(weights)))
+        by_material = {n: balanced_accuracy(*own) for n, own in zip(names, decided, strict=True)}
+        return balanced_accuracy(*map(torch.cat, zip(*decided, strict=True))), by_material
 
     of_unseen, by_material = score(unseen, ("train", "test"))
     return {

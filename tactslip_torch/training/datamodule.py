@@ -321,7 +321,7 @@ class TrainingBins:
 class SlipDataModule(L.LightningDataModule):
     """The recordings of one or more folds.
 
-    ``setup`` makes their features once for all folds. The only batch of training is all recordings
+    ``setup`` makes the features of each recording once for all folds. The only batch of training is all recordings
     with training bins, as a fit needs them together; a batch of a test is one recording. Of
     several processes each gets every so-many-th recording: none is padded with recordings of
     another, as Lightning's own sampler would.
@@ -348,22 +348,21 @@ class SlipDataModule(L.LightningDataModule):
         self.num_workers = num_processes(num_workers)
         self.seconds = 0.0
         self._shares_processors = num_workers is None
-        self._is_made = False
+        self._made: set[RecordingId] = set()
 
-    def setup(self, stage: str = "") -> None:
-        """Make the features of this process's recordings, once."""
-        if self._is_made:
-            return
-        started = time.perf_counter()
-        recordings, workers = self._of_process(), self.num_workers
+    def setup(self, stage: str = "test") -> None:
+        """Make the features of this process's recordings, each once, for a fit those that train."""
+        started, workers = time.perf_counter(), self.num_workers
         if self._shares_processors and self.trainer is not None:
             workers = max(1, workers // self.trainer.num_devices)
+        wanted = self._having(*(["train"] if stage == "fit" else ROLES))
+        recordings = [recording for recording in wanted if recording not in self._made]
         loader = self._loader(recordings, self.maker, workers)
         with one_thread():  # the processors belong to the workers
-            for made in bar(loader, "features", "recording", total=len(recordings)):
+            for made in bar(loader, "features", "recording", show=bool(recordings)):
                 self.maker.keep(made)
+        self._made.update(recordings)
         self.seconds += time.perf_counter() - started
-        self._is_made = True
 
     def train_dataloader(self) -> DataLoader[TrainingBins]:
         """One batch: the training bins of this process's recordings."""
