@@ -321,10 +321,10 @@ class TrainingBins:
 class SlipDataModule(L.LightningDataModule):
     """The recordings of one or more folds.
 
-    ``setup`` makes the features of each recording once for all folds. The only batch of training is all recordings
-    with training bins, as a fit needs them together; a batch of a test is one recording. Of
-    several processes each gets every so-many-th recording: none is padded with recordings of
-    another, as Lightning's own sampler would.
+    ``setup`` makes the features of each recording once for all folds. The only batch of training is
+    all training bins, as a fit needs them together; a batch of a test is one recording. Of several
+    processes each gets every so-many-th recording: none is padded with recordings of another, as
+    Lightning's own sampler would.
 
     Args:
         maker: makes features of a recording.
