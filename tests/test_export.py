@@ -10,6 +10,7 @@ from small_detector import HAND, alarming_detector, small_detector
 from test_commands import composed
 
 from tactslip_torch.commands.export import export as export_command
+from tactslip_torch.commands.train import export_fold
 from tactslip_torch.deploy import export
 from tactslip_torch.deploy.export import (
     export_detector,
@@ -20,7 +21,6 @@ from tactslip_torch.deploy.export import (
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import KEY, AlarmSettings
 from tactslip_torch.onset.rules import Cusum
-from tactslip_torch.training.experiment import export_fold
 
 pytestmark = pytest.mark.onnx
 

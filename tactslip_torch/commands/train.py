@@ -7,6 +7,7 @@ configuration in ``outputs/<name>/<time>``.
 
 from __future__ import annotations
 
+import logging
 import time
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,10 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from tactslip_torch.commands.entry import entry_point, save_config
+from tactslip_torch.deploy.check import GraphKind
+from tactslip_torch.deploy.export import export_detector, read_sidecar
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.decisions import KEY
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.experiment import (
@@ -26,6 +31,8 @@ from tactslip_torch.training.experiment import (
     run_experiment,
     write_tensorboard,
 )
+
+log = logging.getLogger(__name__)
 
 
 def train(config: DictConfig, folder: Path) -> dict[str, float]:
@@ -97,8 +104,24 @@ def _experiment(config: DictConfig) -> Experiment:
         },
         num_workers=config.num_workers,
         with_baselines=config.baselines,
-        with_export=config.export,
+        export=export_fold if config.export else None,
     )
+
+
+def export_fold(detector: SlipDetector, folder: Path) -> dict[str, dict[str, float] | str]:
+    """Write the ONNX files; by graph their error, or why there is none: nothing learned is lost."""
+    kinds: list[GraphKind] = ["bin", "stream"] if KEY in detector.info else ["bin"]
+    found: dict[str, dict[str, float] | str] = {}
+    for kind in kinds:
+        try:
+            paths = export_detector(detector, folder, [kind], source=folder / "detector.pt")
+            written = read_sidecar(paths[0])
+            error, size = written["check"]["worst_sd"], written["onnx_bytes"]
+            found[kind] = {"error": error, "bytes": size}
+        except Exception as error:  # of onnxruntime they have no base in common
+            log.exception("the %s graph was not written", kind)
+            found[kind] = (str(error) or type(error).__name__).splitlines()[0]
+    return found
 
 
 def _saved(config: DictConfig, folder: Path, again: str) -> str:

@@ -27,8 +27,6 @@ from torch.utils.tensorboard import SummaryWriter
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split, have_same_bins
-from tactslip_torch.deploy.check import GraphKind
-from tactslip_torch.deploy.export import export_detector, read_sidecar
 from tactslip_torch.features.cache import (
     FeatureCache,
     default_cache_folder,
@@ -41,7 +39,7 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.native import BackendName, backend_of
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
-from tactslip_torch.onset.decisions import KEY, Scorer, calibration_of
+from tactslip_torch.onset.decisions import Scorer, calibration_of
 from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import Align, ChannelFilter, frame_lengths
 from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
@@ -69,7 +67,7 @@ class Experiment:
         metadata: of the experiment, to be kept with detectors.
         num_workers: processes that make features; ``None``: one a processor.
         with_baselines: whether baselines are fitted and evaluated.
-        with_export: whether ONNX files are written.
+        export: writes the ONNX files of a detector into a folder; ``None``: nothing does.
 
     Raises:
         ValueError: if the alarm is for one detector, and there are several folds.
@@ -84,7 +82,7 @@ class Experiment:
     metadata: Mapping[str, Any] = field(default_factory=dict)
     num_workers: int | None = None
     with_baselines: bool = True
-    with_export: bool = True
+    export: Callable[[SlipDetector, Path], dict[str, Any]] | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.alarm, CalibratedAlarm) and len(self.folds) > 1:
@@ -148,14 +146,14 @@ def _run_fold(experiment: Experiment, data: SlipDataModule, folder: Path) -> dic
     tested = time.perf_counter()
     detector.info |= training_origin(maker.source, data.fold) | dict(experiment.metadata)
     alarm: dict[str, Any] = {}
-    onnx: dict[str, dict[str, float] | str] = {}
+    onnx: dict[str, Any] = {}
     if trainer.is_global_zero:
         detector.save(folder / "detector.pt")  # stays, whatever comes
         alarm = _set_alarm(experiment, detector)
         detector.save(folder / "detector.pt")
     alarmed = time.perf_counter()
-    if trainer.is_global_zero and experiment.with_export:
-        onnx = export_fold(detector, folder)
+    if trainer.is_global_zero and experiment.export:
+        onnx = experiment.export(detector, folder)
     seconds = {"test": tested - started, "alarm": alarmed - tested}
     return {
         **learner.metrics,
@@ -193,22 +191,6 @@ def _set_alarm(experiment: Experiment, detector: SlipDetector) -> dict[str, Any]
     elif alarm is not None:
         alarm(detector)
     return {}
-
-
-def export_fold(detector: SlipDetector, folder: Path) -> dict[str, dict[str, float] | str]:
-    """Write the ONNX files; by graph their error, or why there is none: nothing learned is lost."""
-    kinds: list[GraphKind] = ["bin", "stream"] if KEY in detector.info else ["bin"]
-    found: dict[str, dict[str, float] | str] = {}
-    for kind in kinds:
-        try:
-            paths = export_detector(detector, folder, [kind], source=folder / "detector.pt")
-            written = read_sidecar(paths[0])
-            error, size = written["check"]["worst_sd"], written["onnx_bytes"]
-            found[kind] = {"error": error, "bytes": size}
-        except Exception as error:  # of onnxruntime they have no base in common
-            log.exception("the %s graph was not written", kind)
-            found[kind] = (str(error) or type(error).__name__).splitlines()[0]
-    return found
 
 
 def _added(several: Sequence[Mapping[str, float]]) -> dict[str, float]:
