@@ -283,17 +283,11 @@ def feature_maker(
 
 
 def features_of(
-    detector: SlipDetector,
-    source: RecordingSource,
-    rule: LabelRule,
-    cache: FeatureCache,
-    *,
-    whole: bool = False,
+    detector: SlipDetector, source: RecordingSource, rule: LabelRule, cache: FeatureCache | None
 ) -> FeatureMaker:
     """The features that a detector reads, computed as in its training."""
     pool, dtype = detector.pool, DTYPES[detector.info.get("features_dtype", "float64")]
-    wanted = set(range(len(pool.names)) if whole else detector.selected)
-    pool = pool.select(sorted(wanted))
+    pool = pool.select(sorted(set(detector.selected)))
     return FeatureMaker(source, pool, detector.channel_filter, rule, cache, dtype)
 
 

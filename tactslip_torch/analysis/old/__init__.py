@@ -1,1 +1,0 @@
-"""Machinery of pareto, importance and crossval until they use ``training.recipe``."""
