@@ -11,6 +11,7 @@ import logging
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any, get_args
 
 import lightning as L
 from hydra.utils import instantiate
@@ -20,9 +21,11 @@ from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.deploy.check import GraphKind
 from tactslip_torch.deploy.export import export_detector, read_sidecar
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decisions import KEY
+from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
+from tactslip_torch.onset.decisions import KEY, Scorer, calibration_of
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process
+from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
 from tactslip_torch.training.experiment import (
     Experiment,
     common_metadata,
@@ -90,11 +93,20 @@ def _experiment(config: DictConfig) -> Experiment:
         **config.features,
     )
     recipe.allowed(maker.pool)  # refused before any work
+    alarm: CalibratedAlarm | DebouncedAlarm | None
+    alarm = instantiate(config.onset, _convert_="all") or None
+    if isinstance(alarm, CalibratedAlarm) and len(folds) > 1:
+        raise ValueError(
+            f"onset=alarms sets the alarm of one detector, this split makes {len(folds)}; take "
+            "split=unseen4 or split=seen6, or onset=debounced"
+        )
+    if isinstance(alarm, DebouncedAlarm):  # refused before the fit
+        alarm.hop_samples(maker.pool.sample_rate_hz, maker.pool.bin_samples)
     return Experiment(
         maker=maker,
         folds=folds,
         recipe=recipe,
-        alarm=instantiate(config.onset, _convert_="all") or None,
+        alarm=alarm and partial(_set_alarm, alarm, config.num_workers),
         trainer=partial(make_trainer, config.trainer),
         cache=config.cache,
         metadata={
@@ -106,6 +118,27 @@ def _experiment(config: DictConfig) -> Experiment:
         with_baselines=config.baselines,
         export=export_fold if config.export else None,
     )
+
+
+def _set_alarm(
+    alarm: CalibratedAlarm | DebouncedAlarm, num_workers: int | None, detector: SlipDetector
+) -> dict[str, Any]:
+    """Set the alarm of a detector; what its calibration measured."""
+    if isinstance(alarm, CalibratedAlarm):
+        names = get_args(BaselineName) if detector.pool.hand.fast else ()
+        baselines: dict[str, Scorer] = {
+            name.replace("_", " "): BaselineDetector(name, detector.pool, detector.channel_filter)
+            for name in names
+        }
+        return alarm(detector, baselines, num_workers)
+    if calibration_of(detector) is None:
+        log.warning(
+            "no alarm is set, so that detect and stream.onnx do not work on this detector: "
+            "onset=debounced needs scores of validation; give several recipe.penalties"
+        )
+    else:
+        alarm(detector)
+    return {}
 
 
 def export_fold(detector: SlipDetector, folder: Path) -> dict[str, dict[str, float] | str]:

@@ -30,7 +30,7 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import longest_runs
 from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import bar, check_number, num_processes, one_thread
-from tactslip_torch.signals.filtering import ChannelFilter, bins_at, extended
+from tactslip_torch.signals.filtering import ChannelFilter, bins_at
 from tactslip_torch.training.bins import RecordingBins
 
 
@@ -190,29 +190,6 @@ class FeatureMaker:
         times = self.source.timeline(recording)
         bins = self.lay_bins(times)
         return self._filter(recording, self._load(recording, times, bins), bins), bins
-
-    def raw_bins(self, recording: RecordingId, index: Tensor) -> Tensor:
-        """Some bins of a recording before filtering, with the context that it takes.
-
-        At the ends of a recording the context is what ``extended`` makes of it. Samples are as they
-        are: a NaN or Inf stays.
-
-        Args:
-            recording: of the source.
-            index: numbers of bins, ``[m]``, among those that ``__call__`` hands on.
-
-        Shape:
-            - output: ``[m, C, context_before + n + context_after]``, in the maker's dtype
-
-        Raises:
-            ValueError: if a bin leaves the recording.
-        """
-        times = self.source.timeline(recording)
-        bins = self.lay_bins(times)
-        loaded = self._load(recording, times, bins)
-        whole = extended(loaded.samples.to(self.dtype), self.channel_filter)
-        context = self.channel_filter.context_before + self.channel_filter.context_after
-        return bins_at(whole, bins.starts[index], bins.bin_samples + context)
 
     def lay_bins(self, times: Timeline) -> LabelledBins:
         """Where the bins of a recording lie, and what they are; no sample is needed for that.

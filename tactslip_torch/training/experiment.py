@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import lightning as L
 import numpy as np
@@ -38,12 +38,9 @@ from tactslip_torch.features.pooling import statistics_of
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.native import BackendName, backend_of
-from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
-from tactslip_torch.onset.decisions import Scorer, calibration_of
 from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import Align, ChannelFilter, frame_lengths
 from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
-from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
 from tactslip_torch.training.baselines import SimpleStatistics
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule, training_origin
 from tactslip_torch.training.evaluation import merged_results
@@ -61,37 +58,25 @@ class Experiment:
         maker: of features.
         folds: of recordings, each with a detector of its own.
         recipe: how detectors are made.
-        alarm: how the alarm of a detector is set; ``None``: there is none.
+        alarm: sets the alarm of a detector and returns what that measured; ``None``: nothing does.
         trainer: Lightning's, for a folder of results.
         cache: as ``feature_cache`` takes it.
         metadata: of the experiment, to be kept with detectors.
         num_workers: processes that make features; ``None``: one a processor.
         with_baselines: whether baselines are fitted and evaluated.
         export: writes the ONNX files of a detector into a folder; ``None``: nothing does.
-
-    Raises:
-        ValueError: if the alarm is for one detector, and there are several folds.
     """
 
     maker: FeatureMaker
     folds: Sequence[Split]
     recipe: Recipe
-    alarm: CalibratedAlarm | DebouncedAlarm | None
+    alarm: Callable[[SlipDetector], dict[str, Any]] | None
     trainer: Callable[[Path], L.Trainer]
     cache: str | bool | None = "auto"
     metadata: Mapping[str, Any] = field(default_factory=dict)
     num_workers: int | None = None
     with_baselines: bool = True
     export: Callable[[SlipDetector, Path], dict[str, Any]] | None = None
-
-    def __post_init__(self) -> None:
-        if isinstance(self.alarm, CalibratedAlarm) and len(self.folds) > 1:
-            raise ValueError(
-                f"onset=alarms sets the alarm of one detector, this split makes {len(self.folds)}; "
-                "take split=unseen4 or split=seen6, or onset=debounced"
-            )
-        if isinstance(self.alarm, DebouncedAlarm):  # refused before the fit
-            self.alarm.hop_samples(self.maker.pool.sample_rate_hz, self.maker.pool.bin_samples)
 
 
 def run_experiment(experiment: Experiment, folder: Path) -> dict[str, Any]:
@@ -149,7 +134,7 @@ def _run_fold(experiment: Experiment, data: SlipDataModule, folder: Path) -> dic
     onnx: dict[str, Any] = {}
     if trainer.is_global_zero:
         detector.save(folder / "detector.pt")  # stays, whatever comes
-        alarm = _set_alarm(experiment, detector)
+        alarm = experiment.alarm(detector) if experiment.alarm else {}
         detector.save(folder / "detector.pt")
     alarmed = time.perf_counter()
     if trainer.is_global_zero and experiment.export:
@@ -171,26 +156,6 @@ def _run_fold(experiment: Experiment, data: SlipDataModule, folder: Path) -> dic
         "onnx": onnx,
         "timing_s": learner.seconds | seconds | {"save_export": time.perf_counter() - alarmed},
     }
-
-
-def _set_alarm(experiment: Experiment, detector: SlipDetector) -> dict[str, Any]:
-    """Set the alarm of a detector; what its calibration measured."""
-    alarm = experiment.alarm
-    if isinstance(alarm, CalibratedAlarm):
-        names = get_args(BaselineName) if detector.pool.hand.fast else ()
-        baselines: dict[str, Scorer] = {
-            name.replace("_", " "): BaselineDetector(name, detector.pool, detector.channel_filter)
-            for name in names
-        }
-        return alarm(detector, baselines, experiment.num_workers)
-    if alarm is not None and calibration_of(detector) is None:
-        log.warning(
-            "no alarm is set, so that detect and stream.onnx do not work on this detector: "
-            "onset=debounced needs scores of validation; give several recipe.penalties"
-        )
-    elif alarm is not None:
-        alarm(detector)
-    return {}
 
 
 def _added(several: Sequence[Mapping[str, float]]) -> dict[str, float]:
