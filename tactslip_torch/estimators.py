@@ -379,23 +379,12 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         pool, is_slip = features._pool, torch.from_numpy(np.asarray(y == self.slip_label_))
         with torch.no_grad():
             x = pool(features._bins(windows), torch.float64)
-<<<<<<< HEAD
             fit = _fitted(recipe, pool, x, is_slip, *_groups(y, groups))
-        self._slope: Calibration = _UNCALIBRATED
+        self._slope: Platt = _UNCALIBRATED
         if fit.calibration is not None:
             self._slope = Platt(fit.calibration["slope"], 0.0)  # a score of 0 says nothing
         info = fit.metadata | {
             "recipe": recipe.name,
-=======
-            plan, head = _solved(recipe, pool, x, is_slip, *_groups(y, groups))
-        self._slope: Platt = _UNCALIBRATED
-        if plan.calibration is not None:
-            self._slope = Platt(plan.calibration["slope"], 0.0)  # a score of 0 says nothing
-        info = plan.metadata | {
-            "validation": plan.validation,
-            "head": head.cost._asdict(),
-            "solve": solve_metadata(head),
->>>>>>> main
             "calibration": self._slope.to_dict(),
             "classes": self._ordered(self.classes_.tolist()),
         }
