@@ -23,7 +23,7 @@ from torch import Tensor
 
 from tactslip_torch.deploy.export import export_detector, wanted_graphs
 from tactslip_torch.features.bin_sample import SampledBins
-from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pool import MOST_BIN_SAMPLES, FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, most_stuck_samples
 from tactslip_torch.hand import Channel, HandLayout
@@ -33,7 +33,7 @@ from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import calibration_of
-from tactslip_torch.package_files import DAMAGE_ERRORS, MOST_BIN_SAMPLES, load_table, save_table
+from tactslip_torch.package_files import DAMAGE_ERRORS, load_table, save_table
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.wavelet import SpectrumMethod
 from tactslip_torch.training.plan import Plan, TrainingPass, plan_detector, solve_metadata

@@ -41,7 +41,6 @@ from tactslip_torch.features.ops import (
 )
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.native import BackendName
-from tactslip_torch.package_files import MOST_BIN_SAMPLES
 from tactslip_torch.runtime import check_choice, for_each
 from tactslip_torch.signals.filtering import check_samples
 from tactslip_torch.signals.wavelet import (
@@ -60,6 +59,8 @@ NATIVE_SPAN = 2.0**-10
 LEAST_SPAN = {torch.float32: 2.0**-17, torch.float64: 2.0**-22}
 """Part of the largest raw sample within reach that a filtered span must exceed, by the dtype of the
 raw samples: 64 roundings of float32; of float64, what leaves seven digits to a filtered sample."""
+MOST_BIN_SAMPLES = 1024
+"""Beyond it the constant matrices take gigabytes or minutes."""
 MOST_LEVELS = 4
 """Wavelet levels of the paper."""
 _FEW_BINS = 4  # so few are done here: another thread would take longer to start
