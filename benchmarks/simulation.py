@@ -14,11 +14,11 @@ from typing import Any, ClassVar
 
 import torch
 
+from benchmarks.crossval import read_materials
 from benchmarks.harness import Benchmark, Job, say
-from benchmarks.subjects import FittedMachine, small_crossval
+from benchmarks.subjects import FittedMachine, small_training
 from benchmarks.tables import Table, percent, times
 from benchmarks.timing import interleaved, on_threads
-from tactslip_torch.commands.crossval import read_materials
 from tactslip_torch.simulation import SEEN_MATERIALS, Dynamics, Scene, simulate, timeline
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.recipe import balanced_accuracy
@@ -133,14 +133,14 @@ def _difference(scenes: list[Scene], finest: list[Scene]) -> tuple[float, float]
 def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> list[dict[str, str]]:
     """Balanced accuracy on held-out cycles by the level trained on and the one evaluated on."""
     off = ["cache=off", *overrides]
-    config, recipe = small_crossval(off, sizes.train_bins, sizes.num_features)
+    config, recipe = small_training(off, sizes.train_bins, sizes.num_features)
     kept = {}
     for level, (fidelity, given) in LEVELS.items():
         say(f"simulation: features of {level}")
         source = SimulatedRecordings(
             cycles=sizes.cycles, materials=list(sizes.materials), fidelity=fidelity, scene=given
         )
-        kept[level] = read_materials(config, source, sizes.materials, [recipe])
+        kept[level] = read_materials(config, source, sizes.materials, sizes.train_bins, 2000)
     bins = {
         level: materials.bins_of(sizes.materials, ("test",)) for level, materials in kept.items()
     }

@@ -175,9 +175,9 @@ def composed(command: str, overrides: Sequence[str]) -> DictConfig:
     Raises:
         ValueError: if an override names what does not exist.
     """
-    found = checked(command, overrides).composed
-    assert found is not None  # no --help
-    return found.config
+    config = checked(command, overrides).config
+    del config.hydra
+    return config
 
 
 def features_of_some(
@@ -229,11 +229,10 @@ class FittedMachine:
         return scores
 
 
-def small_crossval(
+def small_training(
     overrides: Sequence[str], train_bins: int, num_features: int
 ) -> tuple[DictConfig, Recipe]:
-    """The configuration of ``crossval``, and its default recipe on a sample of bins."""
-    sized = [f"train_bins={train_bins}", f"recipes.robust.num_features={num_features}"]
-    config = composed("crossval", [*sized, *overrides])
-    recipe: Recipe = instantiate(config.recipes.robust, _convert_="all")
+    """The configuration of a training, and the recipe of the paper on a sample of bins."""
+    config = composed("train", ["recipe=paper", f"recipe.num_features={num_features}", *overrides])
+    recipe: Recipe = instantiate(config.recipe, _convert_="all")
     return config, replace(recipe, sample_bins=train_bins)

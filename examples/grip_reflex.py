@@ -3,7 +3,7 @@
     python -m tactslip_torch.train +exp=onset hydra.run.dir=RUN
     python examples/grip_reflex.py RUN --out grip_reflex.png
 
-An object is pulled until it slides (``conf/scene/pulled.yaml``), on materials and with mountings
+An object is pulled until it slides (``scene=pulled``), on materials and with mountings
 that the training did not have, over friction and load. Three alarms of one training watch the same
 samples, each at the threshold that training gave it (``metrics.json``). What is sensed is a hand
 that does not react; the motion of the object in one that does is computed behind the onset, when
@@ -23,10 +23,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
-from omegaconf import OmegaConf
 
 from tactslip_torch import AlarmSettings, HandLayout, SlipDetector
-from tactslip_torch.commands.configuration import conf_dir
+from tactslip_torch.commands.configuration import presets
 from tactslip_torch.onset.baselines import BaselineDetector
 from tactslip_torch.onset.events import first_releases
 from tactslip_torch.report import style
@@ -141,7 +140,7 @@ def main(
     held_out = [name for name in MATERIALS if name not in trained] or list(MATERIALS)
     loads_n = (1.0,) if quick else (0.5, 1.0, 2.0)
     frictions = (0.4, 1.2) if quick else (0.4, 0.6, 0.8, 1.0, 1.2)
-    pulled: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "scene" / "pulled.yaml"))
+    pulled = presets()["scene"]["pulled"]
     figure = style.new_figure(
         11, 5, "A grip that tightens when the alarm comes: sliding until held", simulated=True
     )

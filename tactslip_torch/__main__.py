@@ -20,7 +20,6 @@ COMMANDS = {
     "data": "check, describe and convert recordings in files",
     "export": "write a detector as ONNX",
     "importance": "which sensors matter",
-    "crossval": "every choice of held-out materials",
     "pareto": "the most accurate detector within a deadline",
     "hosts": "copy a program that runs an exported detector: python, c, node or web",
 }
@@ -65,7 +64,7 @@ def run(command: str, arguments: list[str]) -> None:
         SystemExit: with another status than 0 if it failed.
     """
     with _importing():
-        from tactslip_torch.commands.configuration import Composed, checked, help_text
+        from tactslip_torch.commands.configuration import checked, help_text
         from tactslip_torch.commands.stopping import errors_in_one_line, stopping
 
     with stopping():
@@ -77,14 +76,13 @@ def run(command: str, arguments: list[str]) -> None:
             return
         asked = [each for each in arguments if each not in ("-h", "--help")]
         with errors_in_one_line():
-            found = checked(command, asked)
+            line = checked(command, asked)
         if len(asked) < len(arguments):
-            composed = found.composed or Composed(command)
-            print(help_text(command, COMMANDS[command], composed))
+            print(help_text(COMMANDS[command], line))
             return
         with _importing():
             module = import_module(f"{__package__}.commands.{command.replace('-', '_')}")
-        module.main(found)
+        module.main(line)
 
 
 @contextmanager

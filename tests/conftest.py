@@ -3,12 +3,16 @@
 import os
 import sys
 import zlib
+from pathlib import Path
 from typing import Any
 
 import generated
 import numpy as np
 import pytest
 import torch
+from contract.names import settings as overrides
+from contract.recordings import of_set, split_of_set, write_set
+from contract.running import Runner, Trained, train
 from hypothesis import HealthCheck, is_hypothesis_test, seed, settings
 from matplotlib.figure import Figure
 
@@ -69,6 +73,81 @@ def seed_hypothesis(config: pytest.Config, items: list[pytest.Item]) -> None:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     said = f"property tests: seed {generated.SEED} (TACTSLIP_SEED={generated.SEED} repeats them)"
     terminalreporter.write_line(said)
+
+
+# A folder of recordings, and a detector of each recipe that was trained on it: ask for these
+# before you make a detector another way. They are made once, when first asked for.
+
+
+@pytest.fixture(scope="session")
+def command() -> Runner:
+    """Runs a command in a process of its own."""
+    return Runner()
+
+
+@pytest.fixture(scope="session")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve text files of a hand of two slow and two fast channels, with their manifest."""
+    return write_set(tmp_path_factory.mktemp("recordings"))
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Features of the recordings."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="session")
+def general(
+    command: Runner, recordings: Path, cache: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Trained:
+    """A detector of the default recipe: pooled features and single ones, with an alarm."""
+    return _trained(command, recordings, cache, tmp_path_factory.mktemp("general"))
+
+
+@pytest.fixture(scope="session")
+def paper(
+    command: Runner, recordings: Path, cache: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Trained:
+    """A detector of the paper's recipe: twelve features, nothing pooled, with an alarm."""
+    recipe = {"recipe": "paper", "num_features": 12, "penalties": [0.001, 0.1]}
+    return _trained(command, recordings, cache, tmp_path_factory.mktemp("paper"), **recipe)
+
+
+def _trained(command: Runner, root: Path, cache: Path, folder: Path, **recipe: object) -> Trained:
+    quick = {"onset": "debounced", "workers": 0, "export": False, "baselines": False}
+    given = [*of_set(root), *split_of_set()]
+    return train(command, folder, given, cache=cache, **quick, **recipe)
+
+
+@pytest.fixture(scope="session", params=["general", "paper"])
+def trained(request: pytest.FixtureRequest) -> Trained:
+    """Each of the two detectors."""
+    found: Trained = request.getfixturevalue(request.param)
+    return found
+
+
+@pytest.fixture(scope="session", params=["paper", pytest.param("general", marks=pytest.mark.slow)])
+def trained_or_slow(request: pytest.FixtureRequest) -> Trained:
+    """The same, the default among the slow tests: for what trains once more."""
+    found: Trained = request.getfixturevalue(request.param)
+    return found
+
+
+@pytest.fixture(scope="session")
+def graphs_of(request: pytest.FixtureRequest, command: Runner, tmp_path_factory: Any) -> Any:
+    """By recipe and precision a folder with both graphs, exported when first asked for."""
+    made: dict[tuple[str, str], Path] = {}
+
+    def graphs(recipe: str, precision: str = "float32") -> Path:
+        if (recipe, precision) not in made:
+            folder = made[recipe, precision] = tmp_path_factory.mktemp("graphs")
+            model = request.getfixturevalue(recipe).file
+            words = {"model": model, "precision": precision, "output": folder, "graph": "both"}
+            command.well(folder, "export", *overrides(**words))
+        return made[recipe, precision]
+
+    return graphs
 
 
 @pytest.fixture

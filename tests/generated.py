@@ -10,10 +10,9 @@ import os
 from dataclasses import dataclass
 
 import torch
+from extremes import EXTREMES, extreme_bins
 from hypothesis import strategies as st
 from torch import Tensor
-
-from tactslip_torch.deploy.check import EXTREMES, extreme_bins
 
 SEED = int(os.environ.get("TACTSLIP_SEED", "1"))
 ORDINARY = ("plain", "integers", "ramp")  # drawn as often as all the others together

@@ -2,8 +2,8 @@
 
 import numpy as np
 import torch
+from extremes import slip_samples
 
-from tactslip_torch.deploy.check import simulated_stream
 from tactslip_torch.features.groups import JUMPING
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import Sensing
@@ -72,7 +72,7 @@ def with_floors(detector: SlipDetector, min_alive: int, stuck_samples: int = 150
 def alarming_detector(seed: int = 0) -> SlipDetector:
     """The small detector, with settings by which the simulated slip raises alarms."""
     made = small_detector(seed, backend="auto")
-    scores = score_stream(made, simulated_stream(HAND, 2000.0, torch.float64), 20).score
+    scores = score_stream(made, slip_samples(HAND), 20).score
     rise = 2.0 / float(scores.std())
     settings = AlarmSettings(
         20,

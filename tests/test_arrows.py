@@ -23,10 +23,7 @@ ARROWS = {
     "report": (),
 }
 """Importer: what it may import beside itself, ``runtime`` and ``package_files``; others may all."""
-KNOWN = (
-    ("data.file_recordings", "signals.resampling"),
-    ("deploy.check", "simulation."),
-)
+KNOWN = (("data.file_recordings", "signals.resampling"),)
 """Importer and imported, by how they begin: arrows that are still to be turned."""
 
 

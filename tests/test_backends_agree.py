@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from engine_bins import KINDS, bins_of
+from extremes import EXTREMES, extreme_bins
 from small_detector import HAND, alarming_detector, raw_bins, with_floors
 from test_onnx import run_on
 
-from tactslip_torch.deploy.check import EXTREMES, extreme_bins
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.streaming import StreamingDetector

@@ -9,12 +9,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 from biotac_layout import write_biotac
-from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from small_set import NoiseRecordings
 
 from tactslip_torch import HandLayout, SlipDetector
-from tactslip_torch.commands.configuration import conf_dir
+from tactslip_torch.commands.configuration import compose_config, options_of
 from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.commands.train import train
@@ -90,8 +89,7 @@ TINY_BY_FOLD = (
 
 
 def composed(*overrides, name="train"):
-    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-        return compose(name, list(overrides))
+    return compose_config(name, overrides)
 
 
 def run_train(folder, *overrides):
@@ -249,7 +247,7 @@ REFUSED = [
     (["+features.misspelt=1"], "misspelt"),
     (["recipe.num_features=0"], "recipe.num_features must be whole numbers of at least 1"),
     (["onset=debounced", "onset.hop_ms=0.3"], "onset.hop_ms=0.3 is 0.6 samples at 2000 Hz"),
-    (["+scene.misspelt=1"], "unknown override misspelt"),
+    (["+scene.misspelt=1"], "a scene has no parameter misspelt"),
     (["data.channels=[{name: film, kind: FSR, finger: index, segment: distal}]"], "FSR"),
     ([*TINY, "+scene.slide_s=0.03"], "no slip"),  # slides hold no bin of 50 ms
 ]
@@ -271,7 +269,7 @@ def test_bad_input_is_refused_before_anything_is_simulated(overrides, line, tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(path.stem for path in (conf_dir() / "exp").glob("*.yaml")))
+@pytest.mark.parametrize("name", options_of("exp"))
 def test_every_experiment_runs_fast(name, tmp_path, tmp_path_factory):
     """One recording of each pass, or two; the whole set is named, not simulated."""
     cache = tmp_path_factory.getbasetemp() / "features"  # made by the first experiment of a kind

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from extremes import slip_samples
 from small_detector import HAND, alarming_detector
 
-from tactslip_torch.deploy.check import simulated_stream
 from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 
-SAMPLES = simulated_stream(HAND, 2000.0, torch.float64)
+SAMPLES = slip_samples(HAND)
 
 
 @pytest.fixture(scope="module")

@@ -22,12 +22,12 @@ from operator import xor
 import numpy as np
 import pytest
 import torch
+from extremes import slip_samples
 from small_detector import HAND, alarming_detector
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from tactslip_torch.data.formats import Reading
-from tactslip_torch.deploy.check import simulated_stream
 from tactslip_torch.live import (
     Block,
     Callback,
@@ -63,7 +63,7 @@ def detector():
 
 @pytest.fixture(scope="module")
 def samples():
-    return simulated_stream(HAND, RATE, torch.float64).T.numpy().copy()
+    return slip_samples(HAND).T.numpy().copy()
 
 
 class Kept:

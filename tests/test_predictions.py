@@ -6,10 +6,10 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from extremes import EXTREMES, extreme_bins
 from small_detector import HAND, raw_bins, small_detector
 from test_detector import noise, random_detector
 
-from tactslip_torch.deploy.check import EXTREMES, extreme_bins
 from tactslip_torch.model.detector import SlipDetector
 
 BAD = [float("nan"), float("inf"), -float("inf"), 1e308]

@@ -9,14 +9,12 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
-import yaml
 from scipy.signal import butter, sosfiltfilt
 from test_signal_checks import BY_NAME, HAND, changed, shuffled
 
 from benchmarks.signal_checks import filtered
 from tactslip_torch import native
-from tactslip_torch.commands.configuration import conf_dir
-from tactslip_torch.deploy.check import extreme_bins
+from tactslip_torch.commands.configuration import presets
 from tactslip_torch.simulation import (
     SEEN_MATERIALS,
     UNSEEN_MATERIALS,
@@ -46,8 +44,8 @@ from tactslip_torch.simulation._contact import (
 from tactslip_torch.simulation.scene import Motion
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 
-SCENES = conf_dir() / "scene"
-NAMES = sorted(path.stem for path in SCENES.glob("*.yaml"))
+SCENES = presets()["scene"]
+NAMES = sorted(SCENES)
 RATE_HZ = 2000.0
 
 CONTACTS = {
@@ -65,8 +63,8 @@ CALM = {"mains_mv": 0.0, "sg_drift_mv": 0.0, "pvdf_drift_mv": 0.0, "burst_rate_h
 
 
 def scene_of(name, material, cycle=0, **changes):
-    own = yaml.safe_load((SCENES / f"{name}.yaml").read_text())
-    return paper_scenes(cycles=cycle + 1, materials=(material,), **{**own, **changes})[cycle]
+    overrides = {**SCENES[name], **changes}
+    return paper_scenes(cycles=cycle + 1, materials=(material,), **overrides)[cycle]
 
 
 def scene_on(model, material, cycle=0, **changes):
@@ -255,10 +253,6 @@ def machine(**values):
     return simulate(scene_of("machine", "M1", **values))
 
 
-def extremes(kind="plain", shape=(100,)):
-    return extreme_bins(kind, shape, torch.Generator())
-
-
 REFUSED = [
     (scene, {"material": "M7"}, r"unknown material 'M7'; known are M1, .*wood"),
     (scene, {"fidelity": "lugre"}, r"unknown fidelity 'lugre'; known are kinematic, bristles$"),
@@ -300,13 +294,11 @@ REFUSED = [
     (recording, {"windows": [(0.0, float("nan"))]}, r"a window must be finite, got \(0\.0, nan\)"),
     (recording, {"channels": ["SG1", "SG15"]}, r"channels SG15; this hand has SG1, .*PVDF10"),
     (recording, {"dtype": torch.int64}, r"dtype must be floating, got torch\.int64"),
-    (paper_scenes, {"burst_rate": 1}, r"unknown override burst_rate; a scene has .*strokes"),
+    (paper_scenes, {"burst_rate": 1}, "burst_rate; did you mean burst_rate_hz"),
     (paper_scenes, {"cycles": 0}, r"cycles must be a whole number of at least 1, got 0"),
     (SimulatedRecordings, {"sessions": 0}, r"data\.sessions must be a positive .*, got 0"),
     (simulate_many, {"scenes": [], "at_once": 0}, r"at_once must be a positive whole .*, got 0"),
     (simulate_many, {"scenes": [], "windows": [None]}, r"windows of each of 0 scenes, got 1"),
-    (extremes, {"kind": "quiet"}, r"kind must be one of plain, .* got 'quiet'"),
-    (extremes, {"shape": (3, 1)}, r"two samples, got shape \(3, 1\)"),
 ]
 
 

@@ -44,7 +44,6 @@ STOPPED = [
     (signal.SIGINT, TRAIN, "last.ckpt", "last.ckpt"),
     (signal.SIGTERM, TRAIN, "config.yaml", "no pass is finished"),
     (signal.SIGINT, "generate materials=M1 cycles=20", "M1_paper_00.npz", "are whole"),
-    (signal.SIGTERM, "crossval data.cycles=2", "crossval.log", "start it again"),
 ]
 
 

@@ -91,11 +91,11 @@ def tags(unpacked):
 
 def test_the_wheel_comes_before_the_checkout(unpacked, tmp_path):
     """The editable install is on the path as well: without this the next tests prove nothing."""
-    code = "import tactslip_torch.commands.entry as c; print(c.__file__); print(c.conf_dir())"
+    code = "from tactslip_torch.commands import configuration as c; print(c.__file__, c.conf_dir())"
     done = run(unpacked, tmp_path, "-c", code)
     assert done.returncode == 0, done.stderr
     module, conf = done.stdout.split()
-    assert Path(module) == unpacked / "tactslip_torch" / "commands" / "entry.py"
+    assert Path(module) == unpacked / "tactslip_torch" / "commands" / "configuration.py"
     assert Path(conf) == unpacked / "tactslip_torch" / "conf"
 
 

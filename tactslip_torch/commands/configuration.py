@@ -1,882 +1,417 @@
-"""What each command can be told: its keys with their descriptions, from the commented YAML alone.
+"""The configuration of a command: Hydra composes it, its commented YAML files describe it.
 
-Nothing here imports torch, so that ``--help`` is there at once. The comments of ``conf/`` are the
-only source: the one behind a key describes it (in group files, that of the base file), those at
-the top of a file describe the command or the option, and lines ``# tactslip ...`` there are
-examples.
-
-What is wrong with a command line, in one line: what was typed, what is wanted, what to do.
-
-Hydra composes a configuration from ``key=value``; what it says of one that it cannot compose is
-several lines about its grammar. So a command line is composed here first, and each error is told
-in the words of this package. Keys that are added (``+key=value``, or in an experiment's file) must
-be ones that something takes.
+Nothing here imports torch, so that help and mistakes come at once.
 """
 
 from __future__ import annotations
 
-import inspect
 import os
 import re
-import shutil
 import tempfile
 import textwrap
-import typing
-from argparse import ArgumentError, Namespace
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from functools import cache, cached_property, reduce
-from operator import getitem
+from functools import cache
 from pathlib import Path
-from types import UnionType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
-from hydra import initialize_config_dir
-from hydra._internal.callbacks import Callbacks
-from hydra._internal.utils import get_args_parser
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.utils import run_job
-from hydra.errors import HydraException
-from hydra.types import HydraContext, RunMode
-from hydra.utils import get_object
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-_PACKAGE = Path(__file__).resolve().parents[1]
-_OURS = re.compile(r"(.+\.)?_\w+_$")  # _target_ and the like: Hydra's, nothing to be set
-_WIDTH = 100
-_INDENT = 34
-
-
-def packaged_folder(name: str, hint: str) -> Path:
-    """A folder inside the package (wheel) or beside it (checkout, editable install).
-
-    Args:
-        name: of the folder.
-        hint: a file that is in it.
-
-    Raises:
-        FileNotFoundError: if there is none.
-    """
-    for folder in (_PACKAGE / name, _PACKAGE.parent / name):
-        if (folder / hint).is_file():
-            return folder
-    raise FileNotFoundError(f"no {name} folder with {hint} in or beside {_PACKAGE}; reinstall")
-
-
-def conf_dir() -> Path:
-    """The ``conf`` folder."""
-    return packaged_folder("conf", "train.yaml")
-
-
-_NEEDED = {"web": ("web", "node")}
-"""Hosts of several folders: the page shares the reader and the stream of ``node``."""
-_LEFT = shutil.ignore_patterns("node_modules", "__pycache__", "*.o")
-
-
-def hosts_dir() -> Path:
-    """The ``export`` folder."""
-    return packaged_folder("export", "README.md")
-
-
-def host_names() -> list[str]:
-    """The hosts there are."""
-    return sorted(path.name for path in hosts_dir().iterdir() if (path / "README.md").is_file())
-
-
-def copy_host(name: str, folder: Path) -> Path:
-    """Copy a host program, with what it shares with others, into a folder.
-
-    Returns:
-        Its own folder, ``folder / name``.
-
-    Raises:
-        ValueError: if there is no such host.
-        FileExistsError: if there is something in its place.
-    """
-    if name not in host_names():
-        raise ValueError(f"no host {name!r}; there are {', '.join(host_names())}")
-    parts = _NEEDED.get(name, (name,))
-    for part in parts:
-        if (folder / part).exists():
-            raise FileExistsError(f"{folder / part} is there already; give another folder")
-    for part in parts:
-        shutil.copytree(hosts_dir() / part, folder / part, ignore=_LEFT)
-    return folder / name
-
-
-class _File(NamedTuple):
-    """What is in a YAML file, and what it says of itself.
-
-    Attributes:
-        content: without Hydra's section.
-        defaults: its defaults list.
-        head: the lines at its top, without examples.
-        examples: command lines.
-        keys: what stands behind or above each key, by its dotted path.
-        groups: the same of its defaults list, by ``group`` or ``group@package``.
-    """
-
-    content: Mapping[str, Any]
-    defaults: Sequence[Any]
-    head: str
-    examples: tuple[str, ...]
-    keys: Mapping[str, str]
-    groups: Mapping[str, str]
-
-
-@cache
-def _read(path: Path) -> _File:
-    text = path.read_text(encoding="utf-8")
-    lines = text.splitlines()
-    top: list[str] = []
-    for line in lines:
-        if not line.startswith("#"):
-            break
-        top.append(line.lstrip("# "))
-    keys: dict[str, str] = {}
-    groups: dict[str, str] = {}
-
-    def behind(line: int, column: int, key_line: int) -> str:
-        if found := re.match(r"\s*#\s*(.*)", lines[line][column:]):
-            return found[1]
-        above: list[str] = []
-        while key_line > len(top) and lines[key_line - 1].lstrip().startswith("#"):
-            key_line -= 1
-            above.insert(0, lines[key_line].lstrip(" #"))
-        return " ".join(above)
-
-    def walk(node: yaml.MappingNode, prefix: str) -> None:
-        for key, value in node.value:
-            name, line = prefix + str(key.value), key.start_mark.line
-            if name == "defaults":
-                for entry in value.value:
-                    if isinstance(entry, yaml.MappingNode):
-                        (group, option), *_ = entry.value
-                        place = option.end_mark.line, option.end_mark.column
-                        groups[str(group.value)] = behind(*place, option.end_mark.line)
-                continue
-            is_block = isinstance(value, yaml.CollectionNode) and not value.flow_style
-            end = (line, key.end_mark.column + 1) if is_block else None
-            found = behind(*(end or (value.end_mark.line, value.end_mark.column)), line)
-            if found:
-                keys[name] = found
-            if is_block and isinstance(value, yaml.MappingNode) and name != "hydra":
-                walk(value, f"{name}.")
-
-    loader = yaml.SafeLoader(text)
-    if root := loader.get_single_node():
-        walk(root, "")
-    head = [line for line in top if not line.startswith(("tactslip ", "@package"))]
-    examples = tuple(line for line in top if line.startswith("tactslip "))
-    content: dict[str, Any] = loader.construct_document(root) if root else {}
-    content.pop("hydra", None)
-    defaults = content.pop("defaults", [])
-    return _File(content, defaults, " ".join(head), examples, keys, groups)
-
-
-class Group(NamedTuple):
-    """A group of the configuration: files to choose one of.
-
-    Attributes:
-        name: on the command line, ``+exp`` for experiments.
-        chosen: the option that is used now.
-        options: all there are.
-        description: what the group is about.
-    """
-
-    name: str
-    chosen: str | None
-    options: tuple[str, ...]
-    description: str
-
-
-class Key(NamedTuple):
-    """A key of the configuration: ``name=value`` sets it."""
-
-    name: str
-    value: Any
-    description: str
-
-
-class Composed:
-    """A configuration as Hydra composes it, and what its files say of it.
-
-    Args:
-        command: as it is typed; its file in ``conf`` has ``_`` in place of ``-``.
-        overrides: of the command line.
-        folder: of configuration of the user's own, ``--config-dir``.
-
-    Attributes:
-        whole: all of it, Hydra's own section as well, which ``run`` uses up.
-        config: without Hydra's own section, unresolved.
-        head: what the command does.
-        examples: command lines.
-
-    Raises:
-        HydraException: or another of Hydra's, if it cannot be composed.
-    """
-
-    def __init__(
-        self, command: str, overrides: Sequence[str] = (), folder: str | None = None
-    ) -> None:
-        name, given = command.replace("-", "_"), list(overrides)
-        if folder is not None:
-            given.append(f"hydra.searchpath=[{Path(folder).absolute().as_uri()}]")
-        with _loader(name) as loader:
-            self.whole: DictConfig = loader.load_configuration(name, given, RunMode.RUN)
-            files = loader.compute_defaults_list(name, given, RunMode.RUN).defaults
-        self._loader = loader
-        own_keys = [key for key in self.whole if key != "hydra"]
-        self.config: DictConfig = OmegaConf.masked_copy(self.whole, own_keys)
-        OmegaConf.set_struct(self.config, False)
-        own = _read(conf_dir() / f"{name}.yaml")
-        self.head, self.examples = own.head, own.examples
-        self._own = own
-        self._files: list[tuple[Path, str]] = []
-        places = [conf_dir(), *([Path(folder)] if folder is not None else [])]
-        for file in files:
-            found = [p for at in places if (p := at / f"{file.config_path}.yaml").is_file()]
-            if found and not (file.package or "").startswith("hydra"):
-                self._files.append((found[0], f"{file.package}." if file.package else ""))
-        self._said: dict[str, str] = {}
-        for path, prefix in self._files:
-            for key, text in _read(path).keys.items():
-                self._said.setdefault(prefix + key, text)  # the base describes
-
-    @cached_property
-    def keys(self) -> tuple[Key, ...]:
-        """Those that may be set, in the order of their sections."""
-        plain: Any = OmegaConf.to_container(self.config, resolve=False)
-        return tuple(_keys(plain, "", self._said))
-
-    @cached_property
-    def groups(self) -> tuple[Group, ...]:
-        """Those that apply."""
-        entries = [entry for entry in self._own.defaults if isinstance(entry, dict)]
-        used = {k: v for each in entries for k, v in each.items() if not k.startswith("override")}
-        groups = [Group(k, v, options_of(k), self._own.groups.get(k, "")) for k, v in used.items()]
-        fitting = tuple(each for each in options_of("exp") if self._fits(each, set(used)))
-        about = "an experiment: other defaults for several keys"
-        return (*groups, *([Group("+exp", None, fitting, about)] if fitting else []))
-
-    def _fits(self, experiment: str, used: set[str]) -> bool:
-        """Whether an experiment changes nothing that this command does not have."""
-        file = _read(conf_dir() / f"exp/{experiment}.yaml")
-        groups = {k.removeprefix("override /") for each in file.defaults for k in each}
-        return groups <= used and set(file.content) <= set(self.config)
-
-    def run(self, task: Callable[[DictConfig], None]) -> None:
-        """Carry out a task as ``hydra.main`` does, which would compose everything twice more.
-
-        Args:
-            task: given the configuration, with ``HydraConfig`` set, in a folder for results that
-                holds the configuration and, as it says, the log.
-
-        Raises:
-            Exception: what the task raises.
-        """
-        self.whole.hydra.mode = RunMode.RUN
-        callbacks, name = Callbacks(self.whole), self.whole.hydra.job.config_name
-        callbacks.on_run_start(self.whole, config_name=name)
-        context = HydraContext(self._loader, callbacks)
-        done = run_job(task, self.whole, "hydra.run.dir", None, context)
-        callbacks.on_run_end(self.whole, config_name=name, job_return=done)
-        _ = done.return_value  # raises what the task did
-
-    @cached_property
-    def known(self) -> dict[str, Any]:
-        """Every key that a file but an experiment's has, sections included, with its value."""
-        found: dict[str, Any] = {}
-
-        def walk(section: Mapping[str, Any], prefix: str) -> None:
-            for key, value in section.items():
-                name = f"{prefix}{key}"
-                found[name] = value
-                if isinstance(value, dict) and (name not in self._said or _has(self._said, name)):
-                    walk(value, f"{name}.")
-
-        for path, prefix in self._files:
-            if path.parent.name == "exp":
-                continue
-            parts = prefix.split(".")[:-1]
-            for depth in range(1, len(parts) + 1):
-                found.setdefault(".".join(parts[:depth]), {})
-            walk(_read(path).content, prefix)
-        return found
-
-
-@contextmanager
-def _loader(name: str) -> Iterator[Any]:
-    """Hydra's loader for a job of this name, which leaves no mark on the process."""
-    before = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(conf_dir()), name, "1.3"):
-            yield GlobalHydra.instance().config_loader()
-    finally:
-        GlobalHydra.instance().hydra = before
-
-
-def options_of(group: str) -> tuple[str, ...]:
-    """The options of a group, which may be given as ``group@package``."""
-    folder = conf_dir() / group.partition("@")[0]
-    return tuple(sorted(path.stem for path in folder.glob("*.yaml")))
-
-
-def _keys(section: Mapping[str, Any], prefix: str, said: Mapping[str, str]) -> Iterator[Key]:
-    """The keys of a section; of a mapping that is described as a whole, itself alone."""
-    for key, value in section.items():
-        name = f"{prefix}{key}"
-        if _OURS.match(name):
-            continue
-        if isinstance(value, dict) and value and (not said.get(name) or _has(said, name)):
-            is_described = "_target_" in value or _has(said, name)
-            yield from _keys(value, f"{name}.", said) if is_described or prefix else ()
-        elif value != {} or name in said:
-            yield Key(name, value, said.get(name, ""))
-
-
-def _has(said: Mapping[str, str], name: str) -> bool:
-    return any(key.startswith(f"{name}.") for key in said)
-
-
-def help_text(command: str, summary: str, composed: Composed) -> str:
-    """What ``tactslip COMMAND --help`` prints.
-
-    Args:
-        command: as it is typed.
-        summary: what it does, in a line.
-        composed: its configuration: keys of the options that are chosen are told.
-    """
-    required = [f"{key.name}=VALUE" for key in composed.keys if key.value == "???"]
-    experiment = ["[+exp=NAME]"] if any(g.name == "+exp" for g in composed.groups) else []
-    words = ["usage: tactslip", command, *required, *experiment, "[KEY=VALUE ...]"]
-    lines = [" ".join(words), "", f"{command}: {summary}.", *_wrapped(composed.head, 0), ""]
-    lines += ["examples:", *(f"  {example}" for example in composed.examples)]
-    if composed.groups:
-        lines += ["", "groups of settings (GROUP=OPTION; the default is marked *):"]
-        for group in composed.groups:
-            options = [f"*{o}" if o == group.chosen else o for o in group.options]
-            if group.name == "+exp":
-                lines += _row("+exp=NAME", group.description)
-                for option in options:
-                    lines += _row(f"  {option}", _read(conf_dir() / f"exp/{option}.yaml").head)
-            else:
-                lines += _row(group.name, f"{group.description}: {' '.join(options)}")
-        lines += _row("", "GROUP=OPTION beside --help lists the keys of that option")
-    lines += ["", "keys (KEY=DEFAULT):"]
-    section = ""
-    for key in sorted(composed.keys, key=lambda key: "." in key.name):  # those without come first
-        if (own := key.name.rpartition(".")[0].partition(".")[0]) != section:
-            section = own
-            lines += [""]
-        value = "" if key.value == "???" else _flow(key.value)
-        lines += _row(f"{key.name}={value}", key.description + " (required)" * (key.value == "???"))
-    lines += ["", "every command also takes:"]
-    for what, text in _EVERYWHERE.items():
-        lines += _row(what, text)
-    return "\n".join(lines)
-
-
-_EVERYWHERE = {
-    "hydra.run.dir=FOLDER": "folder of the results",
-    "-m, --multirun": "a run for each of several values, such as seed=0,1,2; ends in a table",
-    "--cfg job": "print the configuration and stop",
-    "--config-dir FOLDER": "a folder with configuration of your own",
-    "--hydra-help": "Hydra's own options",
-    "TACTSLIP_TRACEBACK=1": "environment variable: errors show where they were raised",
-}
-
-
-def _flow(value: Any) -> str:
-    """A value as it is typed."""
-    text: str = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False)
-    return text.removesuffix("\n").removesuffix("\n...").replace(", ", ",")
-
-
-def _wrapped(text: str, indent: int) -> list[str]:
-    margin = " " * indent
-    return textwrap.wrap(
-        text, _WIDTH, initial_indent=margin, subsequent_indent=margin, break_on_hyphens=False
-    )
-
-
-def _row(name: str, text: str) -> list[str]:
-    """A name, and what it is: behind it where there is place, else below."""
-    rows = _wrapped(text, _INDENT)
-    if len(name) + 4 <= _INDENT and rows:
-        return [f"  {name:{_INDENT - 2}}{rows[0].lstrip()}", *rows[1:]]
-    return [f"  {name}", *rows]
-
-
-_ELSEWHERE = (
-    "config_name", "config_path", "hydra_help", "info", "shell_completion", "experimental_rerun"
-)  # fmt: skip
-_PAIRS = {"[": "]", "{": "}", "(": ")"}
-_MIRROR = str.maketrans("[]{}()", "][}{)(")
+from tactslip_torch.commands.packaged import packaged_folder
+
+_COMMENTED = re.compile(r"( *)(?:- )?([\w@/]+):(?: +([^#\s].*?))?(?: +# (.*))?$")
+_WIDTH, _INDENT = 100, 34
+_HELP = """
+every command also takes:
+  hydra.run.dir=FOLDER            folder of the results
+  -m, --multirun                  a run for each of several values, such as seed=0,1,2, and a table
+  --cfg job                       print the configuration and stop
+  --config-dir FOLDER             a folder with configuration of your own
+  TACTSLIP_TRACEBACK=1            environment variable: errors show where they were raised"""
 
 
 class Mistake(ValueError):
     """A command line that cannot be carried out; its text is one line for the user."""
 
 
-class Checked(NamedTuple):
+class CommandLine(NamedTuple):
     """A command line that can be carried out.
 
     Attributes:
-        arguments: in the order that Hydra wants, options last.
-        options: as Hydra reads them.
-        composed: the configuration; ``None`` where another one or help of Hydra's is asked for.
+        command: the first word.
+        arguments: for ``hydra.main``: overrides, then options.
+        options: of the command line, such as ``multirun``.
+        config: composed, with Hydra's own section; of several values each key has the first.
     """
 
+    command: str
     arguments: list[str]
     options: Namespace
-    composed: Composed | None
+    config: DictConfig
 
 
-def checked(command: str, arguments: Sequence[str]) -> Checked:
-    """A command line, read and composed.
+class Key(NamedTuple):
+    """A key that ``name=value`` sets, with the comment that describes it."""
+
+    name: str
+    value: Any
+    description: str
+
+
+def conf_dir() -> Path:
+    """The folder ``conf``."""
+    return packaged_folder("conf", "train.yaml")
+
+
+@cache
+def presets() -> Mapping[str, Mapping[str, Any]]:
+    """Options of groups that are no files of their own, ``conf/scenes.yaml``; registered once."""
+    groups: dict[str, dict[str, Any]] = yaml.safe_load((conf_dir() / "scenes.yaml").read_text())
+    for group, options in groups.items():
+        for name, node in options.items():
+            ConfigStore.instance().store(name, node, group)
+    return groups
+
+
+def compose_config(
+    command: str,
+    overrides: Sequence[str] = (),
+    folder: str | None = None,
+    *,
+    with_hydra: bool = False,
+) -> DictConfig:
+    """The configuration of a command.
 
     Args:
-        command: as it is typed.
-        arguments: of the command line.
+        command: name of its file in ``conf``.
+        overrides: such as ``"seed=1"``.
+        folder: with configuration of the user's own.
+        with_hydra: with Hydra's own section as well.
 
     Raises:
-        Mistake: if it cannot be composed, or has a key that nothing takes.
+        HydraException: or another of Hydra's, if it cannot be composed.
+    """
+    given = list(overrides)
+    if folder is not None:
+        given.append(f"hydra.searchpath=[{Path(folder).absolute().as_uri()}]")
+    presets()
+    with initialize_config_dir(str(conf_dir()), command, "1.3"):
+        config = compose(command, given, return_hydra_config=with_hydra)
+    OmegaConf.set_struct(config, False)
+    return config
+
+
+def options_of(group: str) -> list[str]:
+    """The options of a group."""
+    files = (conf_dir() / group).glob("*.yaml")
+    return sorted([*(path.stem for path in files), *presets().get(group, ())])
+
+
+def _groups(hydra: Any) -> dict[str, str]:
+    """The groups with the options that are chosen, from Hydra's own section."""
+    chosen = hydra.runtime.choices.items()
+    return {group: str(option) for group, option in chosen if re.fullmatch(r"\w+", group)}
+
+
+# Keys and help ------------------------------------------------------------------------------------
+
+
+@cache
+def _comments(path: Path) -> dict[str, str]:
+    """The comment behind each key of a YAML file, by the key's dotted path."""
+    found: dict[str, str] = {}
+    sections: list[tuple[int, str]] = []
+    key = ""
+    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
+        if match := _COMMENTED.match(line):
+            indent, name, comment = len(match[1]), match[2], match[4]
+            sections = [section for section in sections if section[0] < indent]
+            key = ".".join([*(own for _, own in sections), name])
+            sections.append((indent, name))
+        else:  # a value goes on
+            comment = (re.search(r"\S +# (.*)", line) or [None, None])[1]
+        if comment:
+            found.setdefault(key, comment)
+    return found
+
+
+@cache
+def _described(group: str, option: str) -> dict[str, str]:
+    """Comments of the file of an option, and of its bases, which come first."""
+    path = conf_dir() / group / f"{option}.yaml"
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    bases = re.findall(r"(?m)^  - (\w+)$", text.partition("defaults:\n")[2])
+    own = _comments(path)
+    for base in bases:
+        own = own | (_described(group, base) if base != "_self_" else {})
+    return own
+
+
+def keys_of(command: str, config: DictConfig, hydra: Any = None) -> list[Key]:
+    """The keys that may be set, in the order of the configuration.
+
+    A mapping that is described as a whole is one key.
+
+    Args:
+        command: name of its file in ``conf``.
+        config: its configuration.
+        hydra: Hydra's own section, if it is not in ``config``.
+    """
+    said = {
+        f"{group}.{key}": text
+        for group, option in _groups(hydra or config.hydra).items()
+        for key, text in _described(group, option).items()
+    }
+    for key, text in _comments(conf_dir() / f"{command}.yaml").items():
+        said.setdefault(key, text)
+    sections = {key.rpartition(".")[0] for key in said}
+
+    def walk(section: Mapping[str, Any], prefix: str) -> Iterator[Key]:
+        for key, value in section.items():
+            name = f"{prefix}{key}"
+            if re.fullmatch(r"_\w+_", str(key)) or name in (*presets(), "hydra"):
+                continue
+            if isinstance(value, dict) and value and (name in sections or name not in said):
+                yield from walk(value, f"{name}.")
+            elif value != {} or name in said:
+                yield Key(name, value, said.get(name, ""))
+
+    plain: Any = OmegaConf.to_container(config, resolve=False)
+    return list(walk(plain, ""))
+
+
+def help_text(summary: str, line: CommandLine) -> str:
+    """What ``tactslip COMMAND --help`` prints, with the keys of the options that are chosen."""
+    command, config = line.command, line.config
+    path = conf_dir() / f"{command}.yaml"
+    head = [row[2:] for row in path.read_text().partition("defaults:")[0].splitlines()]
+    keys, about = keys_of(command, config), _comments(path)
+    groups = {
+        name: at
+        for name, at in reversed(_groups(config.hydra).items())
+        if f"defaults.{name}" in about
+    }
+    required = [f"{key.name}=VALUE" for key in keys if key.value == "???"]
+    lines = [" ".join(["usage: tactslip", command, *required, "[KEY=VALUE ...]"]), ""]
+    lines += [f"{command}: {summary}.", *(row for row in head if not row.startswith("tactslip "))]
+    lines += ["", "examples:", *(f"  {row}" for row in head if row.startswith("tactslip "))]
+    if groups:
+        lines += ["", "groups of settings (GROUP=OPTION; the default is marked *):"]
+        for group, chosen in groups.items():
+            options = " ".join(f"*{o}" if o == chosen else o for o in options_of(group))
+            lines += _row(group, f"{about[f'defaults.{group}']}: {options}")
+        lines += _row("", "GROUP=OPTION beside --help lists the keys of that option")
+        lines += _row("+exp=NAME", "an experiment: other defaults for several keys")
+        for option in options_of("exp"):
+            text = (conf_dir() / f"exp/{option}.yaml").read_text(encoding="utf-8")
+            if set(re.findall(r"override /(\w+):", text)) <= set(groups):
+                comments = re.findall(r"(?m)^# (.*)$", text.partition("\ndefaults:")[0])
+                lines += _row(f"  {option}", " ".join(comments[1:]))
+    lines += ["", "keys (KEY=DEFAULT):"]
+    before = ""
+    for key in sorted(keys, key=lambda key: "." in key.name):  # those without a section come first
+        if before != (before := key.name.partition(".")[0] if "." in key.name else ""):
+            lines.append("")
+        flow = yaml.safe_dump(key.value, default_flow_style=True, width=10_000, sort_keys=False)
+        value = "" if key.value == "???" else flow.removesuffix("\n").removesuffix("\n...")
+        text = key.description + " (required)" * (key.value == "???")
+        lines += _row(f"{key.name}={value.replace(', ', ',')}", text)
+    return "\n".join(lines) + "\n" + _HELP
+
+
+def _row(name: str, text: str) -> list[str]:
+    """A name, and what it is: behind it where there is place, else below."""
+    margin = " " * _INDENT
+    rows = textwrap.wrap(text, _WIDTH, initial_indent=margin, subsequent_indent=margin)
+    if len(name) + 4 <= _INDENT and rows:
+        return [f"  {name:{_INDENT - 2}}{rows[0].lstrip()}", *rows[1:]]
+    return [f"  {name}", *rows]
+
+
+# Mistakes -----------------------------------------------------------------------------------------
+
+
+class _Parser(ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise Mistake(message)
+
+
+def checked(command: str, arguments: Sequence[str]) -> CommandLine:
+    """A command line, read and composed.
+
+    Raises:
+        Mistake: if it cannot be composed.
     """
     if "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("RANK", "0") != "0":
         nowhere = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
         arguments = [*nowhere, *arguments]
-    options, rest = _apart(command, arguments)
-    overrides, folder, composed = options.overrides, options.config_dir, None
-    if not any(getattr(options, name) for name in _ELSEWHERE):
-        if folder is not None and not Path(folder).is_dir():
-            raise Mistake(f"--config-dir {folder}: there is no such folder")
-        _check_words(command, overrides)
-        if problem := unknown_choice(arguments):
-            raise Mistake(problem)
-        overrides = [_readable(override) for override in overrides]
-        first = [_first_of(each) for each in overrides] if options.multirun else overrides
-        try:
-            composed = Composed(command, first, folder)
-        except (HydraException, OmegaConfBaseException, ValueError) as error:
-            raise Mistake(_translated(command, first, error, folder)) from error
-        for key in unknown_keys(composed):
-            raise Mistake(_no_key(command, first, key, composed))
-    return Checked([*overrides, *rest], options, composed)
-
-
-@cache
-def _plain(command: str) -> Composed:
-    """The configuration as the files have it."""
-    return Composed(command)
-
-
-def _composed_or_plain(
-    command: str, overrides: Sequence[str], folder: str | None = None
-) -> Composed:
-    """The configuration with these overrides or, if it cannot be composed, as the files have it."""
-    try:
-        return Composed(command, overrides, folder)
-    except (HydraException, OmegaConfBaseException):
-        return _plain(command)
-
-
-# Words ------------------------------------------------------------------------------------------
-
-
-def _apart(command: str, arguments: Sequence[str]) -> tuple[Namespace, list[str]]:
-    """What Hydra's parser makes of arguments in any order, and those that are no overrides."""
-    parser = get_args_parser()
-    parser.exit_on_error, parser.allow_abbrev = False, False
-    try:
-        options, unknown = parser.parse_known_intermixed_args(arguments)
-    except ArgumentError as error:
-        raise Mistake(f"{error}; {_LIST_KEYS.format(command)}") from None
-    if "--" in arguments:
-        raise Mistake(f"{command} has no option --; write KEY=VALUE, without dashes")
+    parser = _Parser(allow_abbrev=False, add_help=False)
+    parser.add_argument("overrides", nargs="*")
+    parser.add_argument("-m", "--multirun", action="store_true")
+    parser.add_argument("-c", "--cfg", choices=("job", "hydra", "all"))
+    parser.add_argument("--resolve", action="store_true")
+    parser.add_argument("-cd", "--config-dir")
+    options, unknown = parser.parse_known_intermixed_args(arguments)
     if unknown:
-        option, found, value = unknown[0].partition("=")
-        key = option.lstrip("-").replace("-", "_")
-        near = _nearest(key, _names(_plain(command))) or "KEY"
-        if not found:
-            behind = arguments[arguments.index(unknown[0]) + 1 :][:1]
-            value = next((each for each in behind if each[:1] != "-"), "")
+        key, _, value = unknown[0].lstrip("-").partition("=")
+        near = _nearest(command, key.replace("-", "_")) or "KEY"
         hint = f"write {near}={value or 'VALUE'}, without dashes"
-        raise Mistake(f"{command} has no option {option}; {hint}")
+        raise Mistake(f"{command} has no option {unknown[0]}; {hint}")
+    if options.config_dir is not None and not Path(options.config_dir).is_dir():
+        raise Mistake(f"--config-dir {options.config_dir}: there is no such folder")
     rest = list(arguments)
     for override in options.overrides:
         rest.remove(override)
-    return options, rest
+    overrides, config = _composed(command, options)
+    known = {key.name.partition(".")[0] for key in keys_of(command, config) if key.description}
+    for name in config:
+        if str(name) not in known.union(_groups(config.hydra), presets(), ("hydra",)):
+            raise Mistake(_no_key(command, str(name), config))
+    return CommandLine(command, [*overrides, *rest], options, config)
 
 
-def _check_words(command: str, overrides: Sequence[str]) -> None:
-    """Refuse words that are no ``key=value``, and brackets and quotes that do not close.
+def _composed(command: str, options: Namespace) -> tuple[list[str], DictConfig]:
+    """The overrides as Hydra reads them, and the configuration.
 
-    Raises:
-        Mistake: that says how to write the first of them.
+    A value that is nothing in Hydra's grammar (``a=b``, ``{material}_{trial}``) is a text. With
+    ``--multirun`` the first of several values is composed.
     """
-    for place, word in enumerate(overrides):
-        key, found, value = word.partition("=")
-        if word.startswith("~") and key != "~":
-            continue
-        if what := _unclosed(word):
-            whole = " ".join(overrides[place:])
-            ends = range(len(word) + 1, len(whole) + 1)
-            better = next((whole[:end] for end in ends if not _unclosed(whole[:end])), word + what)
-            outer = '"' if "'" in better else "'"
-            raise Mistake(
-                f"{word} is not closed: {what} is missing; "
-                f"write {outer}{better}{outer}, with the quotes"
-            )
-        if extra := _unclosed(word[::-1].translate(_MIRROR)):
-            raise Mistake(f"{word} has a {extra} too many; write '{word.removesuffix(extra)}'")
-        if not found:
-            raise Mistake(_no_value(command, word, overrides[place + 1 :]))
-        if not key.strip("+~ "):
-            raise Mistake(f"{word} has no key; write KEY=VALUE, {_LIST_KEYS.format(command)}")
-        if value.startswith("="):
-            raise Mistake(f"{word} has two =; write {key}={value.lstrip('=')}")
+    overrides, tried = list(options.overrides), list(options.overrides)
+    while True:
+        try:
+            config = compose_config(command, tried, options.config_dir, with_hydra=True)
+            return overrides, config
+        except (HydraException, OmegaConfBaseException, ValueError) as error:
+            swept = re.search(r"(?:argument|parameters) '(.+)'", str(error))
+            if options.multirun and swept and (word := swept[1]) in tried:
+                key, _, values = word.partition("=")
+                first, *others = re.sub(r"\w+\(|\)", "", values).split(",")
+                tried[tried.index(word)] = f"{key}={first}"
+                known = options_of(key.lstrip("+"))
+                for option in others if known and not options.config_dir else ():
+                    if option not in known:
+                        raise Mistake(_unknown(key.lstrip("+"), option, known)) from error
+                continue
+            word = error.override if isinstance(error, OverrideParseException) else ""
+            key, found, value = word.partition("=")
+            is_closed = value.count("{") == value.count("}")
+            if found and word in overrides and is_closed and value[:1] not in "'\"[=":
+                escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+                quoted = f'{key}="{escaped}"'
+                for words in (overrides, tried):
+                    words[words.index(word)] = quoted
+                continue
+            raise Mistake(_translated(command, tried, error)) from error
 
 
-_LIST_KEYS = "tactslip {} --help lists the keys"
-
-
-def _unclosed(word: str) -> str:
-    """The bracket or quote that is missing at the end, or ``""``."""
-    open_: list[str] = []
-    quote = ""
-    for character in word:
-        if quote:
-            quote = "" if character == quote else quote
-        elif character in "'\"":
-            quote = character
-        elif character in _PAIRS:
-            open_.append(_PAIRS[character])
-        elif open_ and character == open_[-1]:
-            open_.pop()
-    return quote or "".join(reversed(open_))
-
-
-def _no_value(command: str, word: str, rest: Sequence[str]) -> str:
-    """What to write in place of a word without ``=``."""
-    composed = _plain(command)
-    if word in {option for group in composed.groups for option in group.options}:
-        group = next(g.name for g in composed.groups if word in g.options)
-        return f"{word} has no key; write {group}={word}"
-    key, colon, value = word.rstrip(",").partition(":")
-    if near := _nearest(key.lstrip("+"), _names(composed)):
-        values = [value, *(each for each in rest if each != "=")] if colon else rest
-        given = next(
-            (each for each in values if each not in ("", "=") and "=" not in each), "VALUE"
-        )
-        return f"{word} has no value; write {near}={given}, without blanks"
-    required = [key.name for key in composed.keys if key.value == "???"]
-    if required and ("." in word or "/" in word or Path(word).exists()):
-        return f"{word} has no key; write {required[0]}={word}"
-    return f"{word} is no KEY=VALUE; {_LIST_KEYS.format(command)}"
-
-
-def _readable(override: str) -> str:
-    """An override as Hydra reads it.
-
-    A value that is nothing in its grammar (``a=b``, ``{material}_{trial}``) is a text. A mapping
-    may have new keys; whether something takes them is seen when all is composed.
-    """
-    key, found, value = override.partition("=")
-    if not found or _is_read(override):
-        return f"++{override}" if re.match(r"[\w.]+=\s*\{", override) else override
-    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-    quoted = f'{key}="{escaped}"'
-    return quoted if _is_read(quoted) else override
-
-
-def _is_read(override: str) -> bool:
-    try:
-        OverridesParser.create().parse_overrides([override])
-    except HydraException:
-        return False
-    return True
-
-
-def _first_of(override: str) -> str:
-    """An override with the first of its values, as the first run of a sweep has it."""
-    try:
-        (parsed,) = OverridesParser.create().parse_overrides([override])
-        if parsed.is_sweep_override():
-            key = override.partition("=")[0]
-            return f"{key}={next(iter(parsed.sweep_string_iterator()))}"
-    except (HydraException, NotImplementedError, StopIteration):
-        pass  # said when it is composed
-    return override
-
-
-# What Hydra says ---------------------------------------------------------------------------------
-
-
-def unknown_choice(arguments: Sequence[str]) -> str | None:
-    """One line about the first argument that names an option its config group does not have.
-
-    Example:
-        >>> unknown_choice(["+exp=unseen4", "seed=3"]) is None
-        True
-        >>> unknown_choice(["labels=quarter_second"])
-        'unknown labels quarter_second; known: half_second, whole_slide'
-        >>> unknown_choice(["+exp=quik"])[:31]
-        'unknown exp quik; known: quick,'
-    """
-    own = get_args_parser().parse_known_args(arguments)[0].config_dir
-    for argument in arguments:
-        key, found, value = argument.lstrip("+").partition("=")
-        group = key.partition("@")[0]
-        if argument.startswith("-") or not found or not group or not (conf_dir() / group).is_dir():
-            continue
-        known = list(options_of(group))
-        known += [path.stem for path in Path(own, group).glob("*.yaml")] if own else []
-        for choice in value.strip("'\"[]").split(","):
-            if choice and choice.strip() not in known and not value.startswith("{"):
-                near = get_close_matches(choice, known, 5)
-                order = [*near, *sorted(set(known) - set(near))]
-                return f"unknown {group} {choice}; known: {', '.join(order)}"
-        if group == "exp" and not argument.startswith("+"):
-            return f"write +exp={value}: experiments are added to the configuration"
-    return None
-
-
-def _translated(
-    command: str, overrides: Sequence[str], error: Exception, folder: str | None
-) -> str:
+def _translated(command: str, overrides: Sequence[str], error: Exception) -> str:
     """What Hydra raised, in one line."""
-    said = str(error)
-    if found := re.search(r"Could not override '([^']+)'", said):
-        added = [f"+{o}" if o.startswith(f"{found[1]}=") else o for o in overrides]
-        composed = _composed_or_plain(command, added, folder)
-        section = composed.known.get(found[1].rpartition(".")[0])
-        if isinstance(section, dict) and not unknown_keys(composed):
-            return f"{found[1]} has no default; write +{found[1]}=VALUE"
-    if found := re.search(r"Multiple values for ([\w/@.]+)\. .*: ([\w/.-]+)'", said):
-        group, option = found[1], found[2]
-        if group == "exp":
-            given = [o.partition("=")[2] for o in overrides if o.startswith("+exp=")]
-            return f"+exp is given twice; write '+exp=[{','.join(given)}]'"
-        return f"+{group}={option} adds a group that is there already; write {group}={option}"
-    if found := re.search(r"Could not (?:override|delete from config\.) '([^']+)'", said):
-        return _no_key(command, overrides, found[1])
-    if found := re.search(r"An item is already at '([^']+)'", said):
-        (word,) = [o for o in overrides if o.startswith(f"+{found[1]}=")][:1] or [f"+{found[1]}"]
-        return f"{word} adds a key that is there already; write {word.lstrip('+')}"
-    if found := re.search(r"Ambiguous value for argument '(.+)'", said):
+    text, listed = str(error), f"tactslip {command} --help lists the keys"
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        group, _, option = error.missing_cfg_file.rpartition("/")
+        return _unknown(group, option, sorted({*options_of(group), *(error.options or ())}))
+    if found := re.search(r"(?:argument|parameters) '(.+)'", text):
         key, _, value = found[1].partition("=")
-        if _is_choice(key) and not key.startswith("+"):
-            return f"{found[1]} has several values; choose one, or add -m for a run of each"
-        return (
-            f"{found[1]} has several values; write '{key}=[{value}]' for a list, "
-            "or add -m for a run of each"
-        )
-    if found := re.search(r"Sweep parameters '(.+)' requires", said):
-        return f"{found[1]} has several values; add -m for a run of each"
-    if found := re.search(r"Could not find '([^']+)'", said):
-        return f"there is no configuration {found[1]}; {_LIST_KEYS.format(command)}"
-    for word in overrides:
-        if not _is_read(word):
-            return f"{word} cannot be read; write KEY=VALUE, {_LIST_KEYS.format(command)}"
-    lines = [line for line in said.splitlines() if line.strip()] or [type(error).__name__]
-    return f"{lines[0]}; {_LIST_KEYS.format(command)}"
+        hint = "" if "(" in value else f", or write '{key}=[{value}]' for a list"
+        return f"{found[1]} has several values; add -m for a run of each{hint}"
+    if isinstance(error, OverrideParseException):
+        key = re.match(r"[+~]*([\w.@/]*)", error.override)[1]  # type: ignore[index]
+        near_key = "+exp" if key == "exp" else _nearest(command, key) or "KEY"
+        hint = f"write {near_key}=VALUE without blanks, in quotes if it has any"
+        return f"{error.override} cannot be read; {hint}; brackets and quotes must close"
+    if found := re.search(r"Multiple values for ([\w/]+)", text):
+        values = [
+            word.partition("=")[2] for word in overrides if found[1] in word.partition("=")[0]
+        ]
+        hint = f"'+exp=[{','.join(values)}]'" if found[1] == "exp" else f"{found[1]}={values[-1]}"
+        return f"{found[1]} is given twice; write {hint}"
+    if found := re.search(r"An item is already at '([^']+)'", text):
+        return f"{found[1]} is there already; write {found[1]}=VALUE, without +"
+    if found := re.search(r"Could not (?:override|delete)[^']*'([^'=]+)", text):
+        return _no_key(command, found[1], *_tried(command, overrides))
+    return f"{(text.splitlines() or [type(error).__name__])[0]}; {listed}"
 
 
-def _no_key(
-    command: str, overrides: Sequence[str], key: str, composed: Composed | None = None
-) -> str:
-    """That a key is unknown: what is near it, or which option has it."""
-    groups = {group.name: group for group in _plain(command).groups}
-    head, _, rest = key.partition(".")
-    if rest and head in groups:
-        having = [o for o in groups[head].options if rest in _keys_of(f"{head}/{o}")]
-        chosen = next(
-            (o.partition("=")[2] for o in overrides if o.startswith(f"{head}=")),
-            groups[head].chosen,
-        )
-        if having and chosen not in having:
-            others = " or ".join(f"{head}={option}" for option in having)
-            return f"{head}={chosen} has no key {key}; it is one of {others}"
-    if composed is None:
-        kept = [o for o in overrides if "." not in o.partition("=")[0] and _is_choice(o)]
-        composed = _composed_or_plain(command, kept)
-    names = _names(composed)
-    if section := _scene_of(key):
-        names = [f"{section}.{parameter}" for parameter in sorted(_scene_parameters())]
-    near = _nearest(key, names)
-    hint = f"did you mean {near}?" if near else _LIST_KEYS.format(command)
+def _unknown(group: str, option: str, known: Sequence[str]) -> str:
+    near = get_close_matches(option, known, 3)
+    order = [*near, *(each for each in known if each not in near)]
+    return f"unknown {group} {option}; known: {', '.join(order)}"
+
+
+def _tried(command: str, overrides: Sequence[str]) -> list[DictConfig]:
+    """The configuration with the options of groups alone."""
+    groups = [word for word in overrides if options_of(word.partition("=")[0].lstrip("+"))]
+    try:
+        return [compose_config(command, groups, with_hydra=True)]
+    except (HydraException, OmegaConfBaseException):
+        return []
+
+
+def _no_key(command: str, key: str, config: DictConfig | None = None) -> str:
+    """That a key is unknown: which option has it, or what is near it."""
+    config = config or compose_config(command, with_hydra=True)
+    if key == "exp":
+        return "experiments are added: write +exp=NAME"
+    group, _, rest = key.partition(".")
+    chosen = _groups(config.hydra).get(group)
+    having = [
+        f"{group}={option}"
+        for option in options_of(group)
+        if any(f"{rest}.".startswith(f"{own}.") for own in _described(group, option))
+    ]
+    if chosen and rest and having and f"{group}={chosen}" not in having:
+        return f"{group}={chosen} has no key {key}; {' or '.join(having)} has it"
+    near = _nearest(command, key, config)
+    hint = f"did you mean {near}?" if near else f"tactslip {command} --help lists the keys"
+    if "." in key and not near:
+        hint += f", +{key}=VALUE sets what has no default"
     return f"{command} has no key {key}; {hint}"
 
 
-@cache
-def _keys_of(file: str) -> frozenset[str]:
-    """The keys of a file of a group and of its bases."""
-    content, defaults, *_ = _read(conf_dir() / f"{file}.yaml")
-    bases = [entry for entry in defaults if isinstance(entry, str)]
-    own = {key for key, _ in _leaves(content)}
-    folder = file.partition("/")[0]
-    return frozenset(own.union(*(_keys_of(f"{folder}/{b}") for b in bases if b != "_self_")))
-
-
-def _is_choice(override: str) -> bool:
-    key = override.lstrip("+").partition("=")[0].partition("@")[0]
-    return (conf_dir() / key).is_dir()
-
-
-def _names(composed: Composed) -> list[str]:
-    """Groups and keys; a section of the configuration may hold keys that were added."""
-    keys = [key.name for key in composed.keys if key.name in composed.known]
-    return [*(group.name for group in composed.groups), *keys, "hydra.run.dir", "hydra.sweep.dir"]
-
-
-def _nearest(key: str, names: Sequence[str]) -> str | None:
-    """The name that was meant, as far as can be told: one without dots before others."""
+def _nearest(command: str, key: str, config: DictConfig | None = None) -> str | None:
+    """The name that was meant: one without dots before others."""
+    config = config or compose_config(command, with_hydra=True)
+    keys = [each.name for each in keys_of(command, config) if each.description]
+    names = ["hydra.run.dir", *_groups(config.hydra), *keys]
     names = sorted(names, key=lambda name: name.count("."))
     by_last = {name.rpartition(".")[2]: name for name in reversed(names)}
     last = key.rpartition(".")[2].lower()
     if last in by_last:
         return by_last[last]
-    if near := get_close_matches(key, names, 1, 0.8):
-        return near[0]
-    near = get_close_matches(last, by_last, 1, 0.75)
-    return by_last[near[0]] if near else None
+    near = get_close_matches(key, names, 1, 0.8) or get_close_matches(last, by_last, 1, 0.75)
+    return by_last.get(near[0], near[0]) if near else None
 
 
-# Keys that something takes -----------------------------------------------------------------------
+def with_lists(command: str, config: DictConfig, hydra: Any) -> None:
+    """Put a text or number where the description of a key says "list" into a list, in place."""
+    for key in keys_of(command, config, hydra):
+        is_simple = isinstance(key.value, str | int | float) and not isinstance(key.value, bool)
+        is_set = key.value != "???" and not str(key.value).startswith("${")
+        if is_simple and is_set and key.description.startswith("list"):
+            OmegaConf.update(config, key.name, [key.value], merge=False)
 
 
-def unknown_keys(composed: Composed) -> list[str]:
-    """Keys of a configuration that are in no file but an experiment's, and that nothing takes."""
-    config: Any = OmegaConf.to_container(composed.config, resolve=False)
-    known = composed.known
-    inner = {name.rpartition(".")[0] for name in known}
-    found: dict[str, None] = {}
-    for path, _ in _leaves(config):
-        parts, section = path.split("."), _scene_of(path)
-        depth = next(n for n in range(len(parts), -1, -1) if not n or ".".join(parts[:n]) in known)
-        above = ".".join(parts[:depth])
-        is_free = above != "" and above not in inner and not section
-        if depth == len(parts) or is_free:
-            continue
-        if section:
-            is_taken = parts[section.count(".") + 1] in _scene_parameters()
-        else:
-            target = reduce(getitem, parts[:depth], config).get("_target_", "")
-            is_taken = parts[depth] in {"_target_", "_convert_", "_partial_", *_arguments(target)}
-        if not is_taken:
-            found[".".join(parts[: depth + 1])] = None
-    return list(found)
-
-
-def _leaves(section: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in section.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{name}.")
-        else:
-            yield name, value
-
-
-def _scene_of(key: str) -> str | None:
-    """The section of a scene that a key is in, such as ``scene`` or ``extra_scenes.taps``."""
-    found = re.match(r"(scene|(?:.+\.)?extra_scenes\.[^.]+)\.", key)
-    return found[1] if found else None
-
-
-@cache
-def _scene_parameters() -> frozenset[str]:
-    """What can be set of a scene: fields of ``Scene`` and of its groups of parameters."""
-    from tactslip_torch.simulation.scene import Scene
-
-    names = {"name", "cycles"}
-    for field in fields(Scene):
-        names.add(field.name)
-        if is_dataclass(field.default_factory):
-            names |= {inner.name for inner in fields(field.default_factory)}
-    return frozenset(names)
-
-
-@cache
-def _arguments(target: str) -> Mapping[str, Any]:
-    """The arguments of a target with their types, as far as they are stated."""
-    if not target:
-        return {}
-    try:
-        made = get_object(target)
-        names = inspect.signature(made).parameters
-    except (ImportError, AttributeError, ValueError, TypeError):
-        return {}  # said when it is made
-    try:
-        types = typing.get_type_hints(made.__init__ if inspect.isclass(made) else made)
-    except (NameError, TypeError):
-        types = {}
-    return {name: types.get(name) for name in names}
-
-
-def with_lists(config: DictConfig, composed: Composed) -> None:
-    """Put a text or number where a list is wanted into a list of one, in place.
-
-    A list is wanted where what is made of a section takes nothing simpler; of a section that
-    nothing is made of, where the description of the key begins with "list".
-    """
-    said = {key.name: key.description for key in composed.keys}
-    plain: Any = OmegaConf.to_container(config, resolve=False)
-    for path, value in list(_leaves(plain)):
-        is_simple = isinstance(value, str | int | float) and not isinstance(value, bool)
-        if not is_simple or value == "???" or str(value).startswith("${"):
-            continue
-        *parts, last = path.split(".")
-        wanted = _arguments(reduce(getitem, parts, plain).get("_target_", "")).get(last)
-        if _wants_list(wanted, type(value)) if wanted else said.get(path, "").startswith("list"):
-            OmegaConf.update(config, path, [value], merge=False)
-
-
-def _wants_list(wanted: Any, kind: type) -> bool:
-    """Whether a type takes lists, and no value of a simple kind."""
-    is_union = typing.get_origin(wanted) in (typing.Union, UnionType)
-    members = typing.get_args(wanted) if is_union else (wanted,)
-    is_simple = any(each in (kind, Any) or (kind is int and each is float) for each in members)
-    is_simple |= any(typing.get_origin(each) is typing.Literal for each in members)
-    lists = (list, tuple, Sequence)
-    return not is_simple and any(typing.get_origin(e) in lists or e in lists for e in members)
-
-
-# Folders ------------------------------------------------------------------------------------------
-
-
-def check_folder(composed: Composed, *, is_sweep: bool = False) -> None:
+def check_folder(line: CommandLine) -> None:
     """Refuse a results folder that cannot be made; Hydra alone would show a trace.
-
-    Args:
-        composed: says where results go; ``"."`` is not looked at.
-        is_sweep: whether there are several runs.
 
     Raises:
         Mistake: that says why.
-
-    Example:
-        >>> composed = Composed("evaluate", ["hydra.run.dir=/dev/null/a"])
-        >>> check_folder(composed)  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        tactslip_torch.commands.configuration.Mistake: cannot write to hydra.run.dir=/dev/null...
     """
-    of = "sweep" if is_sweep else "run"
-    where: Any = OmegaConf.to_container(composed.whole.hydra[of])
+    of = "sweep" if line.options.multirun else "run"
+    where: Any = OmegaConf.to_container(line.config.hydra[of])
     wanted = str(where["dir"]).partition("${")[0]  # what it holds of the configuration is new
-    if wanted == ".":
-        return
     folder = Path(wanted).absolute()
     nearest = next(place for place in (folder, *folder.parents) if place.exists())
     try:
-        with tempfile.TemporaryDirectory(dir=nearest):
-            pass
+        if wanted != ".":
+            with tempfile.TemporaryDirectory(dir=nearest):
+                pass
     except OSError as error:
-        said = f"cannot write to hydra.{of}.dir={folder}: {error.strerror} at {nearest}"
-        raise Mistake(said) from error
+        why = f"cannot write to hydra.{of}.dir={folder}: {error.strerror} at {nearest}"
+        raise Mistake(why) from error

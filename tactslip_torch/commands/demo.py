@@ -19,8 +19,9 @@ def demo(folder: Path) -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} is there and not empty; give another one, --out DIR")
-    from tactslip_torch.commands.configuration import Composed, copy_host  # not for --help
+    from tactslip_torch.commands.configuration import compose_config  # not for --help
     from tactslip_torch.commands.detect import detect
+    from tactslip_torch.commands.packaged import copy_host
     from tactslip_torch.deploy.export import export_detector
     from tactslip_torch.model.detector import SlipDetector
     from tactslip_torch.pretrained import NAME, RECORDING, sample_recording
@@ -30,7 +31,7 @@ def demo(folder: Path) -> None:
     model, place = folder / "detector.pt", folder / "recording.npz"
     detector.save(model)
     shutil.copyfile(RECORDING, place)
-    config = Composed("detect").config
+    config = compose_config("detect")
     config.model, config.input = str(model), str(place)
     (found,) = detect(config, folder)["recordings"]
     export_detector(detector, folder, source=model)

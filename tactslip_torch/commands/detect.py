@@ -14,7 +14,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -275,10 +275,7 @@ def settings_of(config: DictConfig, detector: SlipDetector) -> AlarmSettings:
         return settings
     if type(config.threshold) not in (int, float) or not math.isfinite(config.threshold):
         raise ValueError(f"threshold must be a finite number, got {config.threshold!r}")
-    value = float(config.threshold)
-    if settings.onset is not None:  # bins keep theirs
-        return replace(settings, onset=replace(settings.onset, threshold=value))
-    return replace(settings, threshold=value)
+    return settings.at_threshold(float(config.threshold))
 
 
 def _num_pieces(path: Path, context: _DetectionContext) -> int:

@@ -1,14 +1,14 @@
-"""What every command does: find its configuration, run, write results, report bad input."""
+"""A command with a configuration: run by Hydra, with a folder for results, errors in one line."""
 
 from __future__ import annotations
 
 import logging
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import Any, TextIO
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -16,7 +16,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.configuration import (
-    Checked,
+    CommandLine,
     check_folder,
     checked,
     conf_dir,
@@ -31,85 +31,70 @@ NOTHING_SAVED = "no result is written (features made so far stay in the cache); 
 
 
 def entry_point(
-    name: str,
+    command: str,
     run: Callable[[DictConfig, Path], Any],
     saved: Callable[[DictConfig, Path, str], str] = lambda config, folder, again: NOTHING_SAVED,
-) -> Callable[[Checked | None], None]:
-    """The command ``name`` as a function of the command line, by default that of the process.
+) -> Callable[[CommandLine | None], None]:
+    """A command as a function of the command line, by default that of the process.
 
-    It refuses what is no configuration (``mistakes``) or no folder, composes the configuration,
-    and calls ``run`` with it and the folder for results. What bad input raises is printed in one
-    line, and the exit status is 2; where a signal stops it, what is saved and how to go on, and the
-    exit status is 130 (SIGINT) or 143 (SIGTERM).
+    What bad input raises is printed in one line, with exit status 2; where a signal stops it, what
+    is saved and how to go on, with exit status 130 (SIGINT) or 143 (SIGTERM).
 
     Args:
-        name: of the file in ``conf``, and of the module in ``commands``.
-        run: does the work.
-        saved: what is there of a run that is stopped, and how to go on; given the configuration,
-            the folder and the command line.
+        command: name of the file in ``conf``, and of the module in ``commands``.
+        run: does the work, given the configuration and the folder for results.
+        saved: what a stopped run leaves, and how to go on; given the configuration, the folder and
+            the command line.
     """
-    command = name.replace("_", "-")
 
-    def main(given: Checked | None = None) -> None:
+    def main(given: CommandLine | None = None) -> None:
         with errors_in_one_line():
-            arguments, options, composed = given or checked(command, sys.argv[1:])
-            is_sweep, words_typed = options.multirun, list(sys.argv)
-            if composed:
-                is_sweep |= composed.whole.hydra.mode == RunMode.MULTIRUN
-                check_folder(composed, is_sweep=is_sweep)
-            runs: list[_Run] = []
+            line = given or checked(command, sys.argv[1:])
+            check_folder(line)
+            typed, runs = list(sys.argv), list[dict[str, Any]]()
 
             def in_folder(config: DictConfig) -> None:
-                sys.argv[:] = words_typed  # by which Lightning starts further processes
+                sys.argv[:] = typed  # by which Lightning starts further processes
+                folder = Path(HydraConfig.get().runtime.output_dir)
                 with _kept_in_log(), errors_in_one_line():
-                    if composed is not None:
-                        with_lists(config, composed)
-                    folder = Path(HydraConfig.get().runtime.output_dir)
-                    if (folder / "config.yaml").exists() and name != "generate":
+                    with_lists(command, config, HydraConfig.get())
+                    if (folder / "config.yaml").exists() and command != "generate":
                         log.warning(
                             "%s holds an earlier run; files of the same names are replaced", folder
                         )
                     try:
-                        returned = run(config, folder)
+                        found = run(config, folder)
                     except Stopped as stop:
-                        again = shlex.join(["tactslip", command, *arguments])
+                        again = shlex.join(["tactslip", command, *line.arguments])
                         raise stop.saying(saved(config, folder, again)) from None
-                    if HydraConfig.get().mode == RunMode.MULTIRUN and _are_scores(returned):
-                        source = str(OmegaConf.select(config, "data._target_"))
-                        words = list(HydraConfig.get().overrides.task)
-                        runs.append(_Run(words, returned, folder.parent, "simulation" in source))
+                if HydraConfig.get().mode == RunMode.MULTIRUN and _are_scores(found):
+                    of_simulation = "simulation" in str(OmegaConf.select(config, "data._target_"))
+                    words = list(HydraConfig.get().overrides.task)
+                    runs.append(
+                        {"words": words, "scores": found, "simulated": of_simulation}
+                        | {"place": folder.parent}
+                    )
 
-            in_folder.__module__ = f"{__package__}.{name}"  # Hydra names job and log file by it
-            if composed and not (is_sweep or options.cfg or options.resolve):
-                composed.run(in_folder)
-            else:
-                sys.argv[1:] = arguments
-                of_hydra = hydra.main(str(conf_dir()), name, version_base="1.3")
-                of_hydra(in_folder)()
+            sys.argv[1:] = [f"hydra.job.name={command}", *line.arguments]
+            hydra.main(str(conf_dir()), command, version_base="1.3")(in_folder)()
             if runs and is_first_process():
                 _compare(runs)
 
     return main
 
 
-class _Run(NamedTuple):
-    """A run of a sweep: what was set, its scores, where they are, and whether simulated."""
-
-    given: list[str]
-    scores: Mapping[str, float]
-    place: Path
-    simulated: bool
-
-
-def _compare(runs: Sequence[_Run]) -> None:
+def _compare(runs: list[dict[str, Any]]) -> None:
     """A table and a figure of the runs of a sweep, by what differs between them."""
     from tactslip_torch.report.sweep import sweep_table, write_sweep  # draws, which few commands do
 
-    common = set(runs[0].given).intersection(*(run.given for run in runs))
-    told = [(" ".join(o for o in r.given if o not in common) or "all", r.scores) for r in runs]
-    place, simulated = runs[0].place, any(run.simulated for run in runs)
-    write_sweep(told, place, simulated=simulated)
-    print(f"\n{sweep_table(told, simulated=simulated)}\n\nruns.csv and runs.png in {place}")
+    common = set.intersection(*(set(run["words"]) for run in runs))
+    named = [
+        (" ".join(word for word in run["words"] if word not in common) or "all", run["scores"])
+        for run in runs
+    ]
+    place, simulated = runs[0]["place"], any(run["simulated"] for run in runs)
+    write_sweep(named, place, simulated=simulated)
+    print(f"\n{sweep_table(named, simulated=simulated)}\n\nruns.csv and runs.png in {place}")
 
 
 def _are_scores(returned: Any) -> bool:

@@ -6,7 +6,7 @@ import argparse
 import shutil
 from pathlib import Path
 
-from tactslip_torch.commands.configuration import copy_host, host_names
+from tactslip_torch.commands.packaged import copy_host, host_names
 
 
 def add_sample(page: Path) -> None:

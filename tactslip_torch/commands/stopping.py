@@ -11,10 +11,13 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
+from inspect import signature
 from types import FrameType
 from typing import Any
 
 from hydra.errors import InstantiationException
+from hydra.utils import get_object
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -131,6 +134,11 @@ def one_line(error: BaseException) -> str:
     while isinstance(error, InstantiationException) and error.__cause__ is not None:
         place = re.search(r"full_key: (\S+)", str(error))
         section = f"{place[1]}: " if place else ""
+        target = re.search(r"call to target '(\S+)'", str(error))
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error.__cause__))
+        if target and unknown:
+            near = get_close_matches(unknown[1], signature(get_object(target[1])).parameters, 1)
+            return f"{section}no key {unknown[1]}" + (f"; did you mean {near[0]}?" if near else "")
         error = error.__cause__
     if isinstance(error, MissingMandatoryValue):
         return f"no value for {error.full_key}; give {error.full_key}=..."

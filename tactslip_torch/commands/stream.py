@@ -18,9 +18,9 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from tactslip_torch.commands.configuration import hosts_dir
 from tactslip_torch.commands.detect import plain_section, settings_of
 from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.commands.packaged import hosts_dir
 from tactslip_torch.data.formats import Reading
 from tactslip_torch.live.frames import Frames
 from tactslip_torch.live.mcap_log import McapLog

@@ -327,7 +327,7 @@ def host_metadata(detector: SlipDetector, kind: str, precision: Precision) -> di
             "tail_samples": timing.tail,
             "state_size": timing.state_size,
             "rule": settings.rule.to_dict(),
-            "threshold": (settings.onset or settings).threshold,
+            "threshold": settings.alarm_threshold,
             "target_false_alarms_per_hour": settings.target_per_hour,
             "threshold_curve": settings.metadata.get("threshold_curve", []),
         }

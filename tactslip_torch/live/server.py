@@ -76,7 +76,7 @@ def page_metadata(detector: SlipDetector, settings: AlarmSettings) -> dict[str, 
 
     names = detector.pool.hand.names
     facts = host_metadata(detector, "stream", "float32") | {
-        "threshold": (settings.onset or settings).threshold,
+        "threshold": settings.alarm_threshold,
         "units": str(detector.info.get("units", "V")),
         "used_channels": [names[i] for i in detector.needed_index.tolist()],
     }

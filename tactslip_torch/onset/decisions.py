@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -112,6 +112,17 @@ class AlarmSettings:
     def decision_samples(self) -> int:
         """Distance of two decisions: that of the onset classifier, if there is one."""
         return self.hop_samples if self.onset is None else self.onset.evidence.hop_samples
+
+    @property
+    def alarm_threshold(self) -> float:
+        """The one that a user sets: of the onset classifier, if there is one; bins keep theirs."""
+        return (self.onset or self).threshold
+
+    def at_threshold(self, value: float) -> AlarmSettings:
+        """The same with another ``alarm_threshold``."""
+        if self.onset is None:
+            return replace(self, threshold=value)
+        return replace(self, onset=replace(self.onset, threshold=value))
 
     @property
     def thresholds(self) -> dict[str, float]:

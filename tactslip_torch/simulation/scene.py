@@ -17,6 +17,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from difflib import get_close_matches
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
@@ -769,10 +770,10 @@ def paper_scenes(
     values = _grouped(overrides)
     known = {f.name for f in fields(Scene)} - {"material", "hand", "seed", "cycle"}
     if unknown := sorted(set(values) - known):
-        raise ValueError(
-            f"unknown override {', '.join(unknown)}; a scene has {', '.join(sorted(known))} "
-            f"and the fields of {', '.join(group.__name__ for group in _GROUPS.values())}"
-        )
+        names = known.union(*((f.name for f in fields(group)) for group in _GROUPS.values()))
+        near = get_close_matches(unknown[0], names, 1)
+        hint = f"did you mean {near[0]}?" if near else "see tactslip_torch.Scene"
+        raise ValueError(f"a scene has no parameter {', '.join(unknown)}; {hint}")
     return [
         Scene(material, hand or HandLayout.paper24(), seed=seed, cycle=cycle, **values)
         for material in materials

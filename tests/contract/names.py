@@ -20,8 +20,6 @@ from tactslip_torch import (
 )
 
 PACKAGE = "tactslip_torch"
-REPLACED_NEXT = ("features/", "deploy/")
-"""Of the package, what the issue behind this one replaces; not counted in ``modules.py``."""
 BACKENDS = ("torch", "auto")
 """Of ``FeaturePool``: the definitions, and the fastest there is."""
 
@@ -45,7 +43,6 @@ KEYS = {
     "held_out": "split.unseen",
     "materials": "data.materials",
     "num_features": "recipe.num_features",
-    "num_held_out": "num_unseen",
     "penalties": "recipe.penalties",
     "resume": "ckpt_path",
     "root": "data.root",

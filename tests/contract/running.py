@@ -1,11 +1,8 @@
-"""Commands run to their end, each in a process of its own that need not import everything anew.
-
-A server of ``multiprocessing`` imports the libraries once; a command is a fork of it that becomes
-what ``python`` would be: arguments, folder, output and exit status.
-"""
+"""Runs commands to their end, each in a process forked from one that has imported the libraries."""
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import runpy
@@ -15,9 +12,9 @@ import traceback
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from .names import PACKAGE
+from .names import DETECTOR, METRICS, PACKAGE, SlipDetector, settings
 
 ROOT = Path(__file__).parents[2]
 SERVER = multiprocessing.get_context("forkserver")
@@ -28,7 +25,7 @@ SERVER.set_forkserver_preload(
 
 
 class Ran(NamedTuple):
-    """What a command left: exit status, and what it said."""
+    """What a command left: exit status, and its output."""
 
     status: int
     out: str
@@ -63,8 +60,7 @@ class Runner:
         self._process.join()
         status = self._process.exitcode
         assert status is not None
-        said = [(self._folder / name).read_text() for name in (".stdout", ".stderr")]
-        return Ran(status, *said)
+        return Ran(status, *((self._folder / name).read_text() for name in (".stdout", ".stderr")))
 
     def __call__(self, folder: Path, command: str, *overrides: str) -> Ran:
         """Run a command in a folder, whatever comes of it."""
@@ -76,6 +72,28 @@ class Runner:
         ran = self(folder, command, *overrides)
         assert ran.status == 0, ran.err
         return ran.out
+
+
+class Trained(NamedTuple):
+    """A detector, the folder of its run, its metrics and how the command was called."""
+
+    detector: SlipDetector
+    folder: Path
+    metrics: dict[str, Any]
+    overrides: list[str]
+
+    @property
+    def file(self) -> Path:
+        return self.folder / DETECTOR
+
+
+def train(command: Runner, folder: Path, overrides: Sequence[str], **words: object) -> Trained:
+    """Run the training in a folder, and read what it left."""
+    given = [*overrides, *settings(**words)]
+    command.well(folder, "train", *given, *settings(folder="run"))
+    run = folder / "run"
+    metrics = json.loads((run / METRICS).read_text())
+    return Trained(SlipDetector.load(run / DETECTOR), run, metrics, given)
 
 
 def _become(folder: Path, arguments: Sequence[str]) -> None:

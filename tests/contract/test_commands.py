@@ -131,8 +131,8 @@ def test_stream_decides_as_detect_and_ends_whole_by_a_signal(
     assert "all decisions are written" in ran.err.splitlines()[-1]
 
 
-def test_detect_does_without_masked_channels(command, selected, recordings, tmp_path):
-    told = settings(model=selected.file, input=recordings / "D_1.csv")
+def test_detect_does_without_masked_channels(command, paper, recordings, tmp_path):
+    told = settings(model=paper.file, input=recordings / "D_1.csv")
     masked = settings(masked_channels=["SG1", "PVDF2"], folder="run")
     command.well(tmp_path, "detect", *told, *masked)
     (one,) = read(tmp_path / "run" / names.ONSETS[0])["recordings"]
@@ -145,23 +145,32 @@ def test_detect_does_without_masked_channels(command, selected, recordings, tmp_
 
 
 @pytest.mark.slow
-def test_converted_recordings_are_the_same_set(command, selected, recordings, tmp_path):
+def test_converted_recordings_are_the_same_set(command, paper, recordings, tmp_path):
     told = settings(root_of_data=recordings, channels=CHANNELS, workers=0)
     command.well(tmp_path, "data", *settings(action=names.CONVERT, format="h5", output="to"), *told)
     data = [*settings(data="files", root="to"), *split_of_set()]
-    words = settings(model=selected.file, workers=0, cache="off", folder="run")
+    words = settings(model=paper.file, workers=0, cache="off", folder="run")
     command.well(tmp_path, "evaluate", *data, *words)
     splits = read(tmp_path / "run" / names.METRICS)[names.SPLITS]
-    for name, scores in selected.metrics[names.SPLITS].items():
+    for name, scores in paper.metrics[names.SPLITS].items():
         assert splits[name][names.CONFUSION] == scores[names.CONFUSION], name
 
 
 # A simulated set, and statistics in shards -------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def quick(command, tmp_path_factory):
+    """The folder of the quick experiment on the simulated hand."""
+    folder = tmp_path_factory.mktemp("quick")
+    words = settings(experiment="quick", workers=0, cache=folder / "cache", folder="run")
+    command.well(folder, "train", *words)
+    return folder
+
+
 @pytest.mark.slow
 def test_the_quick_experiment_trains_exports_and_says_it_is_simulated(quick):
-    metrics = read(quick.folder / "run" / names.METRICS)
+    metrics = read(quick / "run" / names.METRICS)
     assert metrics["simulated"] is True
     assert metrics["num_features_pool"] == 2582
     non_slip = {name: sum(s[names.CONFUSION][0]) for name, s in metrics[names.SPLITS].items()}
@@ -174,20 +183,20 @@ def test_the_quick_experiment_trains_exports_and_says_it_is_simulated(quick):
 def test_workers_change_nothing(command, quick, tmp_path):
     told = settings(experiment="quick", export=False, baselines=False, folder="run")
     command.well(tmp_path, "train", *told, *settings(workers=2, cache="off"))
-    metrics, again = (read(folder / "run" / names.METRICS) for folder in (quick.folder, tmp_path))
+    metrics, again = (read(folder / "run" / names.METRICS) for folder in (quick, tmp_path))
     assert again["selected"] == metrics["selected"]
     for name, scores in metrics[names.SPLITS].items():
         assert again[names.SPLITS][name][names.CONFUSION] == scores[names.CONFUSION]
 
 
 @pytest.mark.slow
-def test_sums_in_shards_give_the_detector_of_one_process(selected, tmp_path):
+def test_sums_in_shards_give_the_detector_of_one_process(paper, tmp_path):
     """By the example script, which took the place of 0.1.0's command."""
-    example, run = runpy.run_path(str(ROOT / names.BATCH_FIT)), selected.file.parent
+    example, run = runpy.run_path(str(ROOT / names.BATCH_FIT)), paper.file.parent
     for shard in ("1/2", "2/2"):
         example["collect"](run, shard, tmp_path / f"sums-{shard[0]}.stats", [])
     shards = sorted(tmp_path.glob("sums-*.stats"), reverse=True)
     example["solve"](run, tmp_path / "detector.pt", shards)
     found = SlipDetector.load(tmp_path / "detector.pt")
-    assert found.selected_names == selected.detector.selected_names
-    torch.testing.assert_close(probe(found), probe(selected.detector), rtol=1e-9, atol=1e-9)
+    assert found.selected_names == paper.detector.selected_names
+    torch.testing.assert_close(probe(found), probe(paper.detector), rtol=1e-9, atol=1e-9)

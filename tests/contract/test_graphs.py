@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from . import names
-from .conftest import RECIPES
 from .names import BIN_GRAPH, BIN_INPUT, BIN_OUTPUTS, STREAM_GRAPH
 from .recordings import NAMES, bins_of, samples_of
 
@@ -16,19 +15,19 @@ pytestmark = pytest.mark.onnx
 
 CASES = [
     ("general", "float32"),
-    ("selected", "float32"),
-    pytest.param(("selected", "float64"), marks=pytest.mark.slow),
+    ("paper", "float32"),
+    pytest.param(("paper", "float64"), marks=pytest.mark.slow),
 ]
 CLOSE = {"float32": 1e-4, "float64": 1e-9}
 """Of scores in standard deviations of ordinary scores, and of probabilities."""
 
 
 @pytest.fixture(scope="module", params=CASES, ids="-".join)
-def exported(request, graphs_of, trained_by):
+def exported(request, graphs_of):
     """Folder of graphs, detector and precision."""
     recipe, precision = request.param
-    assert recipe in RECIPES
-    return graphs_of(recipe, precision), trained_by(recipe).detector, precision
+    detector = request.getfixturevalue(recipe).detector
+    return graphs_of(recipe, precision), detector, precision
 
 
 def session_of(path):

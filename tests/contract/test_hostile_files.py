@@ -392,16 +392,16 @@ def own_file(folder, name, content):
 
 
 @pytest.fixture(scope="module")
-def own_files(selected, tmp_path_factory):
+def own_files(paper, tmp_path_factory):
     """A whole file of each kind."""
     folder = tmp_path_factory.mktemp("own")
     for name in (names.DETECTOR, names.CHECKPOINT):
-        shutil.copy(selected.folder / name, folder)
+        shutil.copy(paper.folder / name, folder)
     z = torch.linspace(-1, 1, 480, dtype=torch.float64).view(40, 12)
     sums = SufficientStats(12)
     sums.update("M1/0", z, torch.arange(40) % 2 == 0)
     sums.save(folder / "sums.pt")
-    export_detector(selected.detector, folder, ["bin"])
+    export_detector(paper.detector, folder, ["bin"])
     for name, text in MANIFESTS.items():
         (folder / name).write_text(text)
     for name, (_, use) in OWN.items():

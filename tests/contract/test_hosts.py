@@ -63,7 +63,7 @@ def host(request, places):
 
 @pytest.fixture(scope="module")
 def stream(graphs_of):
-    return graphs_of("selected") / names.STREAM_GRAPH
+    return graphs_of("paper") / names.STREAM_GRAPH
 
 
 @pytest.fixture(scope="module")
@@ -100,10 +100,10 @@ THRESHOLDS = [
     ids=str,
 )
 def test_a_host_decides_what_the_package_decides(
-    host, stream, selected, recording, options, threshold
+    host, stream, paper, recording, options, threshold
 ):
     """However it is told, and the options before the files or behind."""
-    expected = truth(SAMPLES, threshold, detector=selected.detector)
+    expected = truth(SAMPLES, threshold, detector=paper.detector)
     ran = run_host(host, *options, stream, EVERY, recording)
     hosts.assert_same(ran, expected)
     assert ran.summary["seconds"] == len(SAMPLES) / 2000
@@ -111,17 +111,17 @@ def test_a_host_decides_what_the_package_decides(
     if threshold is None:
         assert ran.summary["alarms"] > 0
     else:
-        assert expected != truth(SAMPLES, detector=selected.detector)
+        assert expected != truth(SAMPLES, detector=paper.detector)
 
 
 @pytest.mark.parametrize("lost", hosts.LOST)
 def test_lost_channels_are_named_and_raise_no_alarm(
-    host, stream, selected, fast_stream, tmp_path, lost
+    host, stream, paper, fast_stream, tmp_path, lost
 ):
     broken = hosts.without(SAMPLES, lost)
     ran = run_host(host, stream, saved(tmp_path / "recording.npy", broken), EVERY)
-    hosts.assert_same(ran, truth(broken, detector=selected.detector))
-    whole = sum(row["alarm"] for row in truth(SAMPLES, detector=selected.detector))
+    hosts.assert_same(ran, truth(broken, detector=paper.detector))
+    whole = sum(row["alarm"] for row in truth(SAMPLES, detector=paper.detector))
     assert ran.summary["alarms"] <= whole
     assert any(line["channels_lost"] for line in ran.lines)
     if not_valid_s := [line["time_s"] for line in ran.lines if not line["valid"]]:
@@ -135,12 +135,12 @@ def test_lost_channels_are_named_and_raise_no_alarm(
     hosts.assert_same(ran, truth(broken, with_onset=True))
 
 
-def test_names_of_channels_are_written_as_json(host, stream, selected, tmp_path):
+def test_names_of_channels_are_written_as_json(host, stream, paper, tmp_path):
     names_of_hand = ['a "b"', "c\\d", "\u00e9\t\x01", "\U0001f600"]
     model = copied(stream, tmp_path)
     told(channels=names_of_hand)(sidecar_of(model))
     missing = saved(tmp_path / "recording.npy", SAMPLES * np.nan)
-    in_use = [names_of_hand[i] for i in selected.detector.needed_index.tolist()]
+    in_use = [names_of_hand[i] for i in paper.detector.needed_index.tolist()]
     lines = run_host(host, model, missing, EVERY).lines
     assert lines
     assert all(line["channels_lost"] == in_use for line in lines)
@@ -165,11 +165,11 @@ def test_an_onset_classifier_raises_alarms_and_is_named(
 
 
 @pytest.mark.slow
-def test_a_graph_in_double_precision_is_fed_in_it(host, graphs_of, selected, tmp_path):
-    precise = graphs_of("selected", "float64") / names.STREAM_GRAPH
+def test_a_graph_in_double_precision_is_fed_in_it(host, graphs_of, paper, tmp_path):
+    precise = graphs_of("paper", "float64") / names.STREAM_GRAPH
     samples = SAMPLES * (1 + 2.0**-40)  # no float32
     ran = run_host(host, precise, saved(tmp_path / "recording.npy", samples), EVERY)
-    hosts.assert_same(ran, truth(samples, detector=selected.detector), exact=True)
+    hosts.assert_same(ran, truth(samples, detector=paper.detector), exact=True)
 
 
 # What is wrong ---------------------------------------------------------------------------------
@@ -344,8 +344,8 @@ def test_it_needs_no_torch(stream, recording):
 SCORE = [sys.executable, EXPORT / "python" / "score.py"]
 
 
-def test_bins_are_scored_as_the_package_scores_them(stream, selected, tmp_path):
-    detector = selected.detector
+def test_bins_are_scored_as_the_package_scores_them(stream, paper, tmp_path):
+    detector = paper.detector
     before, after = detector.context_before, detector.context_after
     broken = hosts.without(SAMPLES, "200 samples")
     broken[2500:2510, 1:3] = np.nan

@@ -45,22 +45,17 @@ MISTAKES = {  # beside those of tests/test_command_line.py, which a page lists
         "precision float32 float64 'int8'",
     ),
     "export of no alarm": ("export", settings(model="{bare}", graph="stream"), "alarm onset"),
-    "crossval of too many": (
-        "crossval",
-        [*of_set("{root}"), *settings(num_held_out=4, workers=0)],
-        "num_unseen 4",
-    ),
 }
 
 
 @pytest.fixture(scope="module")
-def places(trained_by, recordings, tmp_path_factory):
+def places(general, paper, recordings, tmp_path_factory):
     """What stands for the words in braces: a detector with an alarm, one without, recordings."""
     folder = tmp_path_factory.mktemp("bare")
-    bare = SlipDetector.load(trained_by("general").file)
+    bare = SlipDetector.load(general.file)
     del bare.info[ALARM_INFO]
     bare.save(folder / DETECTOR)
-    model = trained_by("selected").file
+    model = paper.file
     return {"{model}": model, "{root}": recordings, "{bare}": folder / DETECTOR}
 
 

@@ -1,19 +1,12 @@
-"""How many modules a reader must follow: of a short training, and of one push of a stream."""
+"""How long a chain of imports a reader follows."""
 
 import ast
 from functools import cache
 
-import pytest
-
-from .modules import FOLDER, counted, of_push
 from .names import PACKAGE
-from .recordings import samples_of
+from .running import ROOT
 
-MOST_OF_TRAINING = 40
-MOST_OF_A_PUSH = 8
-"""Without features and deployment, as issue 20 asks."""
-
-
+FOLDER = ROOT / PACKAGE
 DEEPEST = 10
 """Modules in the longest chain of imports."""
 
@@ -21,7 +14,7 @@ DEEPEST = 10
 @cache
 def depth(module):
     """Modules in the longest chain of imports from one, named from the package on."""
-    path = FOLDER.parent.joinpath(*module.split(".")).with_suffix(".py")
+    path = ROOT.joinpath(*module.split(".")).with_suffix(".py")
     if not path.is_file():
         return 0
     imported = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.ImportFrom)]
@@ -32,17 +25,6 @@ def depth(module):
 
 def test_no_chain_of_imports_is_longer():
     paths = [path for path in FOLDER.rglob("*.py") if path.stem != "__init__"]
-    of = {p: depth(".".join(p.relative_to(FOLDER.parent).with_suffix("").parts)) for p in paths}
+    of = {p: depth(".".join(p.relative_to(ROOT).with_suffix("").parts)) for p in paths}
     deepest = max(of, key=of.get)
     assert 5 < of[deepest] <= DEEPEST, deepest
-
-
-@pytest.mark.slow
-def test_a_short_training_executes_so_many_modules(quick):
-    modules = counted(quick.modules)
-    assert 10 < len(modules) <= MOST_OF_TRAINING, modules
-
-
-def test_one_push_executes_so_many_modules(trained):
-    modules = counted(of_push(trained.detector, samples_of("D", 1)))
-    assert 1 < len(modules) <= MOST_OF_A_PUSH, modules

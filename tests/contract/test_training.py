@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from . import names
-from .conftest import train
 from .names import settings
 from .recordings import HELD_OUT as HELD_OUT_MATERIALS
 from .recordings import SEEN, TRIALS, bins_of, samples_of, write_set
-from .running import wait_for
+from .running import train, wait_for
 
 
 def scores_of(detector):
@@ -58,18 +57,18 @@ def test_held_out_recordings_change_no_number_of_the_fit(trained_or_slow, with_o
 
 
 @pytest.mark.slow
-def test_a_training_recording_does_change_the_fit(selected, with_other_recordings):
+def test_a_training_recording_does_change_the_fit(paper, with_other_recordings):
     """So that the test above would notice a leak."""
-    other = with_other_recordings(selected, {min(trained_on(selected.detector))})
-    assert (scores_of(other.detector) - scores_of(selected.detector)).abs().max() > 1e-6
+    other = with_other_recordings(paper, {min(trained_on(paper.detector))})
+    assert (scores_of(other.detector) - scores_of(paper.detector)).abs().max() > 1e-6
 
 
 # Going on after a kill ---------------------------------------------------------------------------
 
 
-def test_a_killed_run_goes_on_behind_its_last_pass(command, selected, tmp_path):
+def test_a_killed_run_goes_on_behind_its_last_pass(command, paper, tmp_path):
     """Killed once the first pass is written; what is made then is the detector of a whole run."""
-    overrides = selected.again()
+    overrides = paper.overrides
     for attempt in ("1", "2", "3"):  # on a busy machine a run may end first
         run = tmp_path / attempt / "run"
         pid = command.start(tmp_path / attempt, "train", *overrides, *settings(folder="run"))
@@ -81,7 +80,7 @@ def test_a_killed_run_goes_on_behind_its_last_pass(command, selected, tmp_path):
     assert not (run / names.DETECTOR).exists()
     resumed = train(command, tmp_path / "again", overrides, resume=run)
     torch.testing.assert_close(
-        scores_of(resumed.detector), scores_of(selected.detector), rtol=1e-12, atol=1e-12
+        scores_of(resumed.detector), scores_of(paper.detector), rtol=1e-12, atol=1e-12
     )
-    for name, scores in selected.metrics[names.SPLITS].items():
+    for name, scores in paper.metrics[names.SPLITS].items():
         assert resumed.metrics[names.SPLITS][name][names.CONFUSION] == scores[names.CONFUSION], name
