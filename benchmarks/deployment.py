@@ -1,8 +1,8 @@
 """Exported files in onnxruntime beside the package: ``python -m benchmarks.deployment``.
 
-The main job's detector exported to ONNX as single bins and as a stream, in float32 and float64:
-error and latency beside the package itself, throughput in bulk, pushes of a stream, sizes of files,
-and a first score in a fresh process.
+The detector that comes with the package, exported to ONNX as single bins and as a stream, in
+float32 and float64: error and latency beside the package itself, throughput in bulk, pushes of a
+stream, sizes of files, and a first score in a fresh process.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from benchmarks.subjects import (
     RATE_HZ,
     WINDOW_LENGTHS,
     Array,
-    MainJobDetector,
     pushing,
     raw_bins,
+    shipped,
     stream_samples,
 )
 from benchmarks.tables import Table, times
@@ -54,14 +54,14 @@ def host(module: str) -> Any:
 
 def bin_scores(path: Path) -> Callable[[torch.Tensor], Array]:
     """What scores raw bins with all context ``[N, C, n + 2 * context]`` by a bin graph."""
-    session, facts = host("files").load_model(path, "bin")
+    session, metadata = host("files").load_model(path, "bin")
     context = ChannelFilter(WINDOW_LENGTHS).context
-    first = context - facts["context_before_samples"]  # the file takes no more than it needs
-    unused = context - facts["context_after_samples"]
+    first = context - metadata["context_before_samples"]  # the file takes no more than it needs
+    unused = context - metadata["context_after_samples"]
 
     def scores(samples: torch.Tensor) -> Array:
         cut = samples[..., first : samples.shape[-1] - unused].numpy()
-        x = np.ascontiguousarray(cut, facts["precision"])
+        x = np.ascontiguousarray(cut, metadata["precision"])
         found: Array = session.run(["score", "valid"], {"samples": x})[0]
         return found
 
@@ -73,7 +73,7 @@ class Deployment(Benchmark):
     """Files of the export beside the package.
 
     Args:
-        recordings: simulated, to whose bins the machine is fitted.
+        recordings: simulated, whose bins are scored.
         evaluated: bins whose scores are held against the reference.
         rounds: of every way.
         bulk: bins at once.
@@ -84,8 +84,8 @@ class Deployment(Benchmark):
 
     title = "Deployed: files in onnxruntime"
     about = (
-        "the main job's detector exported to ONNX and run by onnxruntime, beside the package, on "
-        "1 thread"
+        "the detector that comes with the package, exported to ONNX and run by onnxruntime, beside "
+        "the package, on 1 thread"
     )
     charts: ClassVar = {"": (("Bins", "us a bin"), ("A stream", "us a push"))}
     quick = "recordings=1 evaluated=16 rounds=2 bulk=[4] push=100 streamed_s=2.0 starts=1"
@@ -101,15 +101,14 @@ class Deployment(Benchmark):
     @torch.inference_mode()
     def measure(self, job: Job) -> dict[str, Any]:
         """Files, bins, streams and fresh processes."""
-        main = MainJobDetector.fitted(self.recordings)
         with TemporaryDirectory(prefix="tactslip-bench-") as folder, on_threads(1):
             files = []
-            main.detector().save(Path(folder) / "detector.pt")
+            shipped().save(Path(folder) / "detector.pt")
             for precision in DTYPES:
                 say(f"deployment: export, {precision}")
                 place = Path(folder) / precision
                 place.mkdir()
-                export = partial(export_detector, main.detector(), place, precision=precision)
+                export = partial(export_detector, shipped(), place, precision=precision)
                 seconds, _ = timed(export)
                 for name in ("model.onnx", "stream.onnx"):
                     row = {"file": f"{name}, {precision}"}
@@ -120,20 +119,20 @@ class Deployment(Benchmark):
                 "decided otherwise."
             )
             tables = {
-                "Bins": Table(_bins(main, Path(folder), self), note),
-                "A stream": Table(_streams(main, Path(folder), self)),
+                "Bins": Table(_bins(Path(folder), self), note),
+                "A stream": Table(_streams(Path(folder), self)),
                 "Files": Table(files),
                 "A first score in a fresh process": Table(_starts(Path(folder), self.starts)),
             }
             return {"tables": tables}
 
 
-def _bins(main: MainJobDetector, folder: Path, sizes: Deployment) -> list[dict[str, Any]]:
+def _bins(folder: Path, sizes: Deployment) -> list[dict[str, Any]]:
     ways: dict[str, Callable[[torch.Tensor], Any]] = {}
     for precision, dtype in DTYPES.items():
         ways[f"onnxruntime, {precision}"] = bin_scores(folder / precision / "model.onnx")
-        ways[f"tactslip_torch, {precision}"] = partial(_score, main.detector(dtype), dtype)
-    ways[REFERENCE] = partial(_score, main.detector(torch.float64, "torch"), torch.float64)
+        ways[f"tactslip_torch, {precision}"] = partial(_score, shipped(dtype), dtype)
+    ways[REFERENCE] = partial(_score, shipped(torch.float64, "torch"), torch.float64)
     rows: dict[str, dict[str, Any]] = {name: {"way": name} for name in ways}
     for size in (1, *sizes.bulk):
         say(f"deployment: {size} bins at once")
@@ -154,13 +153,13 @@ def _score(detector: SlipDetector, dtype: torch.dtype, samples: torch.Tensor) ->
     return detector.predict_raw(samples.to(dtype)).score
 
 
-def _streams(main: MainJobDetector, folder: Path, sizes: Deployment) -> list[dict[str, Any]]:
+def _streams(folder: Path, sizes: Deployment) -> list[dict[str, Any]]:
     samples = stream_samples(1)
     part = samples[: round(sizes.streamed_s * RATE_HZ)]
     pushes: dict[str, Callable[[Array], Any]] = {}
     scores = {}
     for precision, dtype in DTYPES.items():
-        file, detector = folder / precision / "stream.onnx", main.detector(dtype)
+        file, detector = folder / precision / "stream.onnx", shipped(dtype)
         ways: dict[str, Callable[[], Any]] = {
             f"onnxruntime, {precision}": partial(host("stream").Stream, file),
             f"tactslip_torch, {precision}": partial(StreamingDetector, detector, dtype=dtype),

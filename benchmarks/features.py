@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.harness import Benchmark, Job
-from benchmarks.peers import arrays, loop, others
+from benchmarks.peers import arrays, others
 from benchmarks.subjects import labelled_bins
 from benchmarks.tables import Table, times
 from benchmarks.timing import interleaved, on_threads
@@ -54,14 +54,12 @@ class Features(Benchmark):
         bins = some[torch.arange(self.bins) % len(some)].clone()
         few = bins[: self.slow_bins]
         rocket = others.mini_rocket(bins[:64].numpy(), self.threads, self.num_kernels)
-        names = [(n.channel, n.component, n.domain, n.descriptor) for n in FeaturePool(HAND).names]
         windows = bins.float().numpy()
         ways: dict[str, tuple[int, Callable[[], Any]]] = {
             "tactslip_torch, float64": (len(bins), partial(_pool(torch.float64), bins)),
             "tactslip_torch, float32": (len(bins), partial(_pool(torch.float32), bins.float())),
             "reference, float64": (len(few), partial(FeaturePool(HAND, backend="torch"), few)),
             "NumPy and PyWavelets, batched": (len(few), partial(arrays.features, few.numpy(), 14)),
-            "SciPy and PyWavelets, a loop": (1, partial(_looped, few[0].numpy(), names)),
             "aeon MiniRocket, transform": (len(windows), partial(rocket.transform, windows)),
             "TSFEL, all features": (1, partial(others.tsfel_features(), few[0].numpy())),
         }
@@ -79,8 +77,7 @@ class Features(Benchmark):
         note = (
             f"{self.threads} threads where a way takes threads. Error: the largest, over "
             "the larger of the reference's magnitude and its column's standard deviation; of "
-            "entropy and mode, which step, the 99th percentile. NaN of the loop, which has no "
-            "rule for constants, is left out."
+            "entropy and mode, which step, the 99th percentile."
         )
         return {"tables": {"Time and error": Table(rows, note)}}
 
@@ -98,11 +95,6 @@ def _error(found: Tensor, reference: Tensor) -> float:
 
 def _pool(dtype: torch.dtype) -> FeaturePool:
     return FeaturePool(HAND, arithmetic="native" if dtype == torch.float32 else "double")
-
-
-def _looped(bin_: Any, names: Any) -> Any:
-    with others.quiet():
-        return loop.features(bin_, names, HAND.names)
 
 
 if __name__ == "__main__":

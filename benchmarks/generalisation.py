@@ -83,8 +83,7 @@ class Generalisation(Benchmark):
         "a row says otherwise; all data are **simulated**. Everything was chosen by validation on "
         "training materials. *Worst* is the worst seed; *wanted* was set before. Baselines were "
         "fitted on the same training bins. `+exp=hard` is the protocol on a simulated hand whose "
-        "channels differ without slip, as real ones do ([how it was held against a real one]"
-        "(../benchmarks/results/realism.json): `python -m benchmarks.realism data.root=FOLDER`)"
+        "channels differ without slip, as those of a real BioTac SP do"
     )
     page, is_page = "docs/generalisation.md", True
     quick = (
@@ -139,18 +138,18 @@ class Generalisation(Benchmark):
             return
         numbers = report["numbers"]
         own = numbers["experiments"]["unseen4"]
-        told = []
+        found = []
         for measure in ("test", "held-out materials", "another session"):
             values = [of[measure] for of in own.values()]
             by_seed = ", ".join(f"{value:.2f}" for value in values)
-            told.append({"": measure, "mean ± sd": mean_sd(values), "by seed": by_seed})
+            found.append({"": measure, "mean ± sd": mean_sd(values), "by seed": by_seed})
         text = [
             "It prints among others (seed 0, `python -m benchmarks.generalisation`, code "
             f"{numbers['code']['unseen4']}):\n",
             f"```\n{numbers['main job']}\n```\n",
             f"Balanced accuracy, %, {len(own)} seeds, **simulated**. *Unseen*",
             "are held-out materials, *another session* another mounting of the six seen ones:\n",
-            Table(told).markdown(),
+            Table(found).markdown(),
         ]
         put_between(ROOT / "README.md", "first result", "\n".join(text))
 
@@ -168,9 +167,9 @@ class Generalisation(Benchmark):
             axes.set_xticks(levels, [f"{mv:g}" for mv in levels])
 
 
-# What a detector says ----------------------------------------------------------------------------
+# Scores of a detector -----------------------------------------------------------------------------
 class _Scored(NamedTuple):
-    """What a detector says of one recording: bins ``[N]``."""
+    """Scores and probabilities of the bins of one recording, ``[N]``."""
 
     recording: RecordingId
     truth: Tensor
@@ -197,8 +196,8 @@ def _scored(detector: SlipDetector, made: RecordingFeatures, *, half: bool) -> _
 
 def _called_slip(parts: Sequence[_Scored], *, truth: bool) -> float:
     """Part of the bins of a class that is called slip, %."""
-    says = torch.cat([part.score[part.truth == truth] >= 0 for part in parts])
-    return 100 * float(says.double().mean())
+    is_called = torch.cat([part.score[part.truth == truth] >= 0 for part in parts])
+    return 100 * float(is_called.double().mean())
 
 
 def _balanced(parts: Sequence[_Scored]) -> float:
@@ -394,8 +393,8 @@ def _ahead(by_seed: Sequence[Mapping[str, Any]]) -> str:
     means = {label: fmean(of[label]["unseen"] for of in by_seed) for label in by_seed[0]}
     ours = next(iter(means))
     ahead = [label for label in means if "recipe" not in label and means[label] >= means[ours]]
-    told = f"behind {', '.join(ahead)}" if ahead else "ahead of every baseline"
-    return f"On held-out materials `{ours}` is {told}."
+    place = f"behind {', '.join(ahead)}" if ahead else "ahead of every baseline"
+    return f"On held-out materials `{ours}` is {place}."
 
 
 if __name__ == "__main__":

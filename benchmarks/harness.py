@@ -1,6 +1,6 @@
 """The harness of all benchmarks: arguments, machine, trainings, JSON, figure, page section.
 
-A subject is a class derived from ``Benchmark`` in a file of its own, whose fields say how much is
+A subject is a class derived from ``Benchmark`` in a file of its own, whose fields set how much is
 measured; ``python -m benchmarks.NAME`` measures it, prints its tables, and writes ``NAME.json``,
 ``NAME.png`` and its section of docs/benchmarks.md between ``<!-- NAME -->`` and ``<!-- /NAME -->``.
 ``--quick`` measures very little, to see that it runs, and touches no tracked file; ``--render``
@@ -54,10 +54,10 @@ def machine_description() -> dict[str, str]:
     """Processor, cores this process may use, and how busy the machine is already."""
     every = os.cpu_count() or 1
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else every
-    facts = {"processor": _processor_name(), "cores": f"{usable} of {every} cores"}
+    found = {"processor": _processor_name(), "cores": f"{usable} of {every} cores"}
     if hasattr(os, "getloadavg"):
-        facts["load"] = f"load {os.getloadavg()[0]:.1f} before the runs"
-    return facts
+        found["load"] = f"load {os.getloadavg()[0]:.1f} before the runs"
+    return found
 
 
 def _processor_name() -> str:
@@ -99,7 +99,7 @@ def trained(overrides: Sequence[str], folder: Path, cache: Path) -> dict[str, An
         cache: of features.
 
     Raises:
-        SystemExit: if the training fails, which has said why.
+        SystemExit: if the training fails, which has printed why.
     """
     given = [*overrides, "export=false", f"cache={cache}"]
     return result_of("train", given, folder, "metrics.json")
@@ -119,7 +119,7 @@ def result_of(command: str, overrides: Sequence[str], folder: Path, name: str) -
     """The JSON file ``name`` that ``tactslip COMMAND`` leaves in the folder, made by this code.
 
     Raises:
-        SystemExit: if the command fails, which has said why.
+        SystemExit: if the command fails, which has printed why.
     """
 
     def made() -> Any:
@@ -310,7 +310,7 @@ class Benchmark(ABC):
         """Entry point; the exit status, 0.
 
         Raises:
-            SystemExit: with status 2 for bad input, said in one line; 130 or 143 when stopped.
+            SystemExit: with status 2 for bad input, reported in one line; 130 or 143 when stopped.
         """
         parser = argparse.ArgumentParser(
             prog=f"python -m benchmarks.{self.name}", description=f"{self.title}: {self.about}."

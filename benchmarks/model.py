@@ -17,7 +17,6 @@ from sklearn.kernel_ridge import KernelRidge
 from sklearn.svm import SVC
 from torch import Tensor
 
-from benchmarks.gradients import synthetic_bins
 from benchmarks.harness import Benchmark, Job, say
 from benchmarks.tables import Table, listed, number, percent
 from benchmarks.timing import in_fresh_process, interleaved, on_threads, peak_bytes, timed
@@ -80,6 +79,22 @@ class Model(Benchmark):
                 "Any number of bins": listed("statistics in a process of its own", whole),
             }
         }
+
+
+def synthetic_bins(num_bins: int, num_features: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Bounded, correlated features ``[N, K]`` in float64, and labels ``[N]`` by a quadratic rule.
+
+    They are correlated about as the main job's scaled features are; noise mislabels some bins.
+    """
+    rule = np.random.default_rng(num_features)
+    mix = 0.25 * rule.normal(size=(16, num_features)) * np.arange(1.0, 17)[:, None] ** -0.7
+    directions = rule.normal(size=(3, num_features)) / np.sqrt(num_features)
+    draws = np.random.default_rng([seed, 1])
+    common = draws.normal(size=(num_bins, 16)) @ mix
+    z = np.tanh(common + 0.15 * draws.normal(size=(num_bins, num_features)))
+    a, b, c = directions @ z.T / (directions @ z.T).std(1, keepdims=True)
+    score = a * b + c + 0.3 * draws.normal(size=num_bins)
+    return torch.from_numpy(z), torch.from_numpy(score > 0)
 
 
 def accumulate(num_bins: int, num_features: int, threads: int) -> dict[str, float]:

@@ -229,7 +229,7 @@ def read_windows(config: DictConfig, sizes: Real) -> tuple[Windows, list[Split]]
     """
     source: RecordingSource = instantiate(config.data, _convert_="all")
     if source.is_simulated:
-        raise ValueError("recordings of data.root say that they are simulated; give real ones")
+        raise ValueError("recordings of data.root are marked as simulated; give real ones")
     maker = feature_maker(source, instantiate(config.labels), **config.features)
     recordings = _some_of(source.ids, sizes)
     folds: list[Split] = instantiate(config.split, _convert_="all")(recordings)
@@ -456,24 +456,24 @@ def on_folds(
 
 def evaluated(of: OnFolds, windows: Windows) -> dict[str, Any]:
     """All that tables say of the scores of a method, JSON-able."""
-    is_slip, says = windows.is_slip, of.scores >= 0
+    is_slip, called = windows.is_slip, of.scores >= 0
     by_object = {
-        name: float(balanced_accuracy_score(is_slip[own], says[own]))
+        name: float(balanced_accuracy_score(is_slip[own], called[own]))
         for name in sorted(set(windows.objects.tolist()))
         for own in [windows.objects == name]
     }
     worst = min(by_object, key=by_object.__getitem__)
     quiet, detected, _ = (part.round(6).tolist() for part in roc_curve(is_slip, of.scores))
     return {
-        "balanced_accuracy": float(balanced_accuracy_score(is_slip, says)),
+        "balanced_accuracy": float(balanced_accuracy_score(is_slip, called)),
         "auc": float(roc_auc_score(is_slip, of.scores)),
-        "sensitivity": float(says[is_slip].mean()),
-        "specificity": float((~says[~is_slip]).mean()),
+        "sensitivity": float(called[is_slip].mean()),
+        "specificity": float((~called[~is_slip]).mean()),
         "objects": by_object,
         "objects_mean": float(np.mean(list(by_object.values()))),
         "worst": {"object": worst, "balanced_accuracy": by_object[worst]},
         "scenes": {
-            name: float((says == is_slip)[windows.scenes == name].mean())
+            name: float((called == is_slip)[windows.scenes == name].mean())
             for name in sorted(set(windows.scenes.tolist()))
         },
         "curve": {"false_alarms": quiet, "found": detected},
@@ -659,8 +659,8 @@ def _scores(numbers: Report) -> Table:
 
 
 def _groups(numbers: Report, kind: str) -> Table:
-    """Balanced accuracy on each object, or the part of windows told right in each scene."""
-    head = "balanced accuracy %" if kind == "objects" else "windows told right, %"
+    """Balanced accuracy on each object, or the part of windows decided right in each scene."""
+    head = "balanced accuracy %" if kind == "objects" else "windows decided right, %"
     return Table(
         [
             {head: method}
@@ -704,13 +704,13 @@ def _differences(numbers: Report) -> Table:
         row["above in"] = f"{percent(gap['share'], 1)} % of draws"
         rows.append(row | {"AUC, points": words(found["auc"])})
         unsettled += [name] if gap["low"] <= 0 <= gap["high"] else []
-    told = f"**Nothing is settled beside:** {'; '.join(unsettled)}." if unsettled else ""
+    note = f"**Nothing is settled beside:** {'; '.join(unsettled)}." if unsettled else ""
     note = (
         "Recordings are drawn anew within slip and within stable touch, "
         f"{numbers['settings']['draws']:,} times with a fixed seed, the same for both methods; "
         f"brackets hold {100 * COVERAGE:g} % of the differences. Where they hold 0, nothing is "
         "settled. Scores are held, so this says nothing of other training recordings or other "
-        f"objects. {told}"
+        f"objects. {note}"
     )
     return Table(rows, note)
 

@@ -262,7 +262,7 @@ SIGNAL_CHECKS = (
     ),
     SignalCheck("d1", "D1 is nearly empty behind the filter", _d1_fraction, ALL, 0.0, 0.02),
 )
-"""All of REFERENCE.md section 6, row *signals*, and PHYSICS.md's floor of slide over rest."""
+"""What the paper shows and says of its signals, and that every material vibrates."""
 
 
 def check_signals(recordings: Mapping[str, Sequence[Signals]]) -> list[dict[str, Any]]:

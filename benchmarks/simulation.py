@@ -149,8 +149,8 @@ def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> list[dict[str, s
         machine = FittedMachine.of(materials.statistics_of(sizes.materials), recipe)
         row: dict[str, str] = {"balanced accuracy, %": f"trained on {level}"}
         for other, of in bins.items():
-            says = machine.scores(of.features) >= 0
-            row[f"on {other}"] = percent(balanced_accuracy(says, of.is_slip, of.sample_weight))
+            called = machine.scores(of.features) >= 0
+            row[f"on {other}"] = percent(balanced_accuracy(called, of.is_slip, of.sample_weight))
         rows.append(row)
     return rows
 

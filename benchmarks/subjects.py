@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import cycle
 from pathlib import Path
@@ -17,16 +16,15 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 from torch import Tensor
 
-from benchmarks.selection import kept_selection
-from tactslip_torch import AlarmSettings, FeaturePool, HandLayout, SlipDetector
+from tactslip_torch import AlarmSettings, FeaturePool, SlipDetector
 from tactslip_torch.commands.configuration import checked
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm, kernel_from_dict
+from tactslip_torch.model.fit import fit_machine
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import KEY
@@ -87,66 +85,18 @@ def pushing(push: Callable[[Array], object], samples: Array, num: int) -> Callab
     return lambda: push(samples[(start := next(starts)) : start + num])
 
 
-# ------------------------------------------------------------ a detector of the main job's size
-@dataclass(frozen=True, eq=False)
-class MainJobDetector:
-    """The kept selection with a head fitted to some simulated bins.
-
-    Time does not depend on what a head has learned; its size does, and that is the main job's.
-    """
-
-    selected: tuple[int, ...]
-    scaler: FeatureScaler = field(repr=False)
-    z: Tensor = field(repr=False)
-    is_slip: Tensor = field(repr=False)
-    kernel: Polynomial
-    penalty: float
-
-    @classmethod
-    @torch.no_grad()
-    def fitted(cls, num_recordings: int) -> MainJobDetector:
-        """Fit to the bins of so many simulated recordings."""
-        selection = kept_selection()
-        pool = FeaturePool(HandLayout.paper24())
-        place = {str(name): index for index, name in enumerate(pool.names)}
-        selected = tuple(place[name] for name in selection["names"])
-        bins, is_slip = labelled_bins(num_recordings)
-        features = pool.select(selected)(bins)
-        scaler = FeatureScaler.fit(features, compress=True)
-        kernel = kernel_from_dict(selection["trained"]["kernel"])
-        assert isinstance(kernel, Polynomial)  # both recipes have one
-        penalty = float(selection["trained"]["penalty"])
-        return cls(selected, scaler, scaler(features), is_slip, kernel, penalty)
-
-    @property
-    def training(self) -> TrainingBins:
-        """The bins that heads are fitted to."""
-        return TrainingBins(self.z, self.is_slip)
-
-    def detector(
-        self, dtype: torch.dtype = torch.float64, backend: BackendName = "auto", hop: int = 20
-    ) -> SlipDetector:
-        """A detector of its own, which computes in this dtype, with settings for streams."""
-        pool = FeaturePool(
-            HandLayout.paper24(), arithmetic="native" if dtype == torch.float32 else "double"
-        )
-        head = fit_machine(self.training, self.penalty, self.kernel)
-        scaler = copy.deepcopy(self.scaler)
-        made = SlipDetector(
-            pool, ChannelFilter(WINDOW_LENGTHS), self.selected, scaler, head, backend=backend
-        )
-        made.info = {"simulated": True, KEY: alarm_settings(hop).to_dict()}
-        return made.to(dtype).eval()
-
-    def kernel_sum(self) -> KernelSum:
-        """The same machine as a sum over the bins it was fitted to."""
-        head = fit_machine(self.training, self.penalty, self.kernel)
-        beta = self.penalty * (self.training.targets - head(self.z))
-        return KernelSum(self.z, beta, self.kernel)
+# ------------------------------------------------------------------------------- a detector
+def shipped(
+    dtype: torch.dtype = torch.float64, backend: BackendName = "auto", hop: int = 20
+) -> SlipDetector:
+    """The detector that comes with the package, in this dtype, with settings for streams."""
+    detector = SlipDetector.pretrained(backend=backend)
+    detector.info[KEY] = alarm_settings(hop).to_dict()
+    return detector.to(dtype).eval()
 
 
 def alarm_settings(hop: int) -> AlarmSettings:
-    """Usual settings of a stream; what they say of a bin does not matter here."""
+    """Usual settings of a stream; their decisions do not matter here."""
     rule = Cusum(drift=0.1, evidence=min(1.0, hop / 100), ceiling=10.0)
     return AlarmSettings(hop, Platt(1.0, 0.0), rule, 8.0, target_per_hour=1.0)
 

@@ -80,8 +80,8 @@ def alarms_of(run: Path) -> tuple[SlipDetector, dict[str, AlarmSettings]]:
     """
     detector = SlipDetector.load(run / "detector.pt")
     joint, hand = AlarmSettings.of(detector), detector.pool.hand
-    told = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
-    methods: Mapping[str, Any] = told.get("alarm", {}).get("methods", {})
+    metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    methods: Mapping[str, Any] = metrics.get("alarm", {}).get("methods", {})
     if joint.onset is None or DETAIL not in methods:
         raise ValueError(f"{run} has no onset alarm beside others; train with +exp=onset")
     names = [each.name for each in fields(AlarmSettings) if each.name != "onset"]

@@ -42,7 +42,7 @@ def pytest_configure(config: pytest.Config) -> None:
         if config.option.dist == "load":  # the plugin's choice where the user made none
             config.option.dist = "loadfile"
         config.option.loadscopereorder = False  # the order is that of slow_files_first
-        config.option.maxworkerrestart = "0"  # a crash ends the run and is told, in place of a wait
+        config.option.maxworkerrestart = "0"  # a crash ends the run with a message
     if not hasattr(config, "workerinput"):
         reason_unavailable()  # builds the native engine once, before any test
 
@@ -71,8 +71,8 @@ def seed_hypothesis(config: pytest.Config, items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    said = f"property tests: seed {generated.SEED} (TACTSLIP_SEED={generated.SEED} repeats them)"
-    terminalreporter.write_line(said)
+    line = f"property tests: seed {generated.SEED} (TACTSLIP_SEED={generated.SEED} repeats them)"
+    terminalreporter.write_line(line)
 
 
 # A folder of recordings, and a detector of each recipe that was trained on it: ask for these

@@ -1,4 +1,4 @@
-"""Which part of the package imports which (DESIGN.md's arrows), held against the sources."""
+"""Parts of the package import each other along one direction."""
 
 import ast
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Each benchmark runs in its smallest form, and writes where it is told."""
+"""Each benchmark runs in its smallest form, and writes where it is asked to."""
 
 import json
 from functools import partial
@@ -38,7 +38,7 @@ def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path, monkeypa
     """In this process, as most commands that a subject runs; figures are small."""
     monkeypatch.chdir(ROOT)
     arguments = ["--quick", "--out", str(tmp_path)]
-    if name in ("real", "realism"):
+    if name == "real":
         arguments.append(f"data.root={_real_set(tmp_path / 'set')}")
     subject = _subject(name)()
     assert subject.run(arguments) == 0

@@ -32,7 +32,7 @@ Course = Callable[[float], float]
 
 @dataclass(frozen=True)
 class Element:
-    """PHYSICS.md's skin on a smooth surface, and its equations in plain NumPy; SI units."""
+    """Skin on a smooth surface, and its equations in plain NumPy; SI units."""
 
     m: float = 5e-3
     k: float = 1e3

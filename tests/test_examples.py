@@ -1,5 +1,6 @@
-"""The example scripts run, and do what they say."""
+"""The example scripts run."""
 
+import copy
 import json
 import math
 import sys
@@ -7,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from small_detector import HAND, alarming_detector
 
 from tactslip_torch import AlarmSettings
 from tactslip_torch.model.calibration import Platt
@@ -30,20 +30,21 @@ def grip():
 
 
 @pytest.fixture(scope="module")
-def onset_run(tmp_path_factory):
-    """A folder as ``+exp=onset`` leaves it, of a small detector with a quickly fitted alarm."""
-    detector, folder = alarming_detector(), tmp_path_factory.mktemp("run")
-    source = SimulatedRecordings(cycles=1, materials=["M1", "M6"], channels=HAND.to_rows())
+def onset_run(paper, tmp_path_factory):
+    """A folder as ``+exp=onset`` leaves it, of a detector with a quickly fitted alarm."""
+    detector, folder = copy.deepcopy(paper.detector), tmp_path_factory.mktemp("run")
+    channels = detector.pool.hand.to_rows()
+    source = SimulatedRecordings(cycles=1, materials=["M1", "M6"], channels=channels)
     onset, _, _ = OnsetTraining()(source, source.ids, 0)
     bins = AlarmSettings.of(detector)
     score = onset.score_recording(source.load(source.ids[0]).samples)
     joint = replace(bins, onset=replace(onset, threshold=float(score.quantile(0.995))))
     plain = replace(bins, hop_samples=10, calibration=Platt(1.0, 0.0), rule=KOfN(1, 1))
     methods = {bins.rule.name: bins, "largest detail": replace(plain, threshold=-2.0)}
-    told = {name: {**own.to_dict(), "scorer": "-"} for name, own in methods.items()}
+    metrics = {name: {**own.to_dict(), "scorer": "-"} for name, own in methods.items()}
     detector.info |= {"alarm": joint.to_dict(), "train_materials": ["M1", "M6"]}
     detector.save(folder / "detector.pt")
-    (folder / "metrics.json").write_text(json.dumps({"alarm": {"methods": told}}))
+    (folder / "metrics.json").write_text(json.dumps({"alarm": {"methods": metrics}}))
     return folder
 
 
@@ -59,8 +60,8 @@ def test_a_grip_reacts_to_the_three_alarms_of_a_run(tmp_path, capsys, grip, onse
     assert all(float(row["mm, median"]) < grip.REACH_MM for row in at_once)
 
 
-def test_a_run_without_onset_alarm_is_refused(tmp_path, grip):
-    alarming_detector().save(tmp_path / "detector.pt")
+def test_a_run_without_onset_alarm_is_refused(paper, tmp_path, grip):
+    paper.detector.save(tmp_path / "detector.pt")
     (tmp_path / "metrics.json").write_text("{}")
     with pytest.raises(ValueError, match="train with \\+exp=onset"):
         grip.main(tmp_path)

@@ -454,7 +454,7 @@ def test_a_stream_is_decided_on_and_recovers_when_the_cable_is_pulled(
     rows = [json.loads(line) for text in lines for line in text.splitlines()]
     assert [row["score"] for row in rows if "score" in row] == kept.column("score").tolist()
     alarms = int(kept.column("is_alarm").sum())
-    assert alarms == counts.alarms > 2
+    assert alarms == counts.alarms > 1
     assert rows[-1] == {"decisions": 2 * num, "alarms": alarms, "seconds": rows[-1]["seconds"]}
 
 

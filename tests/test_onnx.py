@@ -291,11 +291,19 @@ def test_a_model_of_other_imputation_values_is_refused_and_a_right_one_measured(
         check_model(model_of(other, kind, precision), detector, kind, precision)
 
 
-@pytest.mark.parametrize(("kind", "hop"), [("joint", 20), ("detector", 70), ("detector", 3000)])
-def test_a_stream_graph_of_any_hop_is_compared(request, kind, hop):
-    """The last samples are of no whole hop, or the hop is longer than the recording."""
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    [
+        ("joint", {}),
+        ("detector", {"rule": KOfN(2, 3)}),  # which knows nothing before the second decision
+        ("detector", {"hop_samples": 70}),  # the last samples are of no whole hop
+        ("detector", {"hop_samples": 3000}),  # longer than half of the recording
+    ],
+    ids=str,
+)
+def test_a_stream_graph_of_any_alarm_is_compared(request, kind, changes):
     other = copy.deepcopy(request.getfixturevalue(kind))
-    other.info[KEY] = replace(AlarmSettings.of(other), hop_samples=hop).to_dict()
+    other.info[KEY] = replace(AlarmSettings.of(other), **changes).to_dict()
     assert check_model(model_of(other, "stream"), other, "stream", "float32")["worst_sd"] < 1e-3
 
 

@@ -1,6 +1,5 @@
 """What else there is to make features and scores with; nothing in here imports the package.
 
-``loop`` is the obvious SciPy and PyWavelets loop, ``arrays`` the same features in batched NumPy;
-both agree with ``FeaturePool``. ``others`` make other features: TSFEL, MiniRocket,
-and MultiRocket with Hydra.
+``arrays`` makes the features of ``FeaturePool`` in batched NumPy and PyWavelets and agrees with it,
+``others`` makes other features: TSFEL, MiniRocket, and MultiRocket with Hydra.
 """

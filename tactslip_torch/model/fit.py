@@ -17,8 +17,8 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,6 +30,7 @@ from tactslip_torch.model.kernels import (
     KernelSum,
     Polynomial,
     QuadraticForm,
+    SolveReport,
     collapse,
 )
 
@@ -49,45 +50,6 @@ _LEAST_EIGENVALUE = 1e-6  # of I - H_gg; below, the rounding of the factor shows
 _CHUNK = 256  # bins in whole groups that are treated together, unless one group is larger
 
 # Solve -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class SolveReport:
-    """How a system was solved, and how far rounding may reach.
-
-    Attributes:
-        method: by which factorisation.
-        size: number of unknowns.
-        penalty: the paper's ``C``.
-        condition: of the components kept; for ``"cholesky"`` an estimate, of the system scaled to a
-            diagonal of ones.
-        rank: components kept; all but for ``"pinv"``.
-        error: of the scores of training bins relative to the targets, in the mean square by weight,
-            to first order in the rounding of the matrix. For ``"pinv"`` it counts what the
-            components left out could add: nothing if they are null, as those of duplicates are.
-    """
-
-    method: Literal["cholesky", "pinv"]
-    size: int
-    penalty: float
-    condition: float
-    rank: int
-    error: float
-
-    def metadata(self) -> dict[str, Any]:
-        """All of it as JSON holds it; an infinite number is the string ``"inf"``."""
-        return {
-            name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in asdict(self).items()
-        }
-
-    def __str__(self) -> str:
-        kept = f", {self.rank} of them kept" if self.rank < self.size else ""
-        return (
-            f"{self.method} of {self.size} unknowns at C={self.penalty:g}{kept}: condition "
-            f"{self.condition:.1e}, relative error of training scores up to {self.error:.0e}"
-            f"{', unless what is left out is null' if self.rank < self.size else ''}"
-        )
 
 
 class Solution(NamedTuple):

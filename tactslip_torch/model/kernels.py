@@ -12,15 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from tactslip_torch.model.products import ProductSums
-
-if TYPE_CHECKING:
-    from tactslip_torch.model.fit import SolveReport
 
 
 @dataclass(frozen=True)
@@ -186,6 +183,45 @@ class Cost(NamedTuple):
         return (
             f"{self.multiply_adds / 1000:.1f} k multiply-adds a bin and "
             f"{self.num_bytes / 1000:.1f} kB"
+        )
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """How a system was solved, and how far rounding may reach.
+
+    Attributes:
+        method: by which factorisation.
+        size: number of unknowns.
+        penalty: the paper's ``C``.
+        condition: of the components kept; for ``"cholesky"`` an estimate, of the system scaled to a
+            diagonal of ones.
+        rank: components kept; all but for ``"pinv"``.
+        error: of the scores of training bins relative to the targets, in the mean square by weight,
+            to first order in the rounding of the matrix. For ``"pinv"`` it counts what the
+            components left out could add: nothing if they are null, as those of duplicates are.
+    """
+
+    method: Literal["cholesky", "pinv"]
+    size: int
+    penalty: float
+    condition: float
+    rank: int
+    error: float
+
+    def metadata(self) -> dict[str, Any]:
+        """All of it as JSON holds it; an infinite number is the string ``"inf"``."""
+        return {
+            name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in asdict(self).items()
+        }
+
+    def __str__(self) -> str:
+        kept = f", {self.rank} of them kept" if self.rank < self.size else ""
+        return (
+            f"{self.method} of {self.size} unknowns at C={self.penalty:g}{kept}: condition "
+            f"{self.condition:.1e}, relative error of training scores up to {self.error:.0e}"
+            f"{', unless what is left out is null' if self.rank < self.size else ''}"
         )
 
 

@@ -22,7 +22,6 @@ from tactslip_torch.simulation.simulate import (
     SimulatedRecordings,
     Timeline,
     simulate,
-    simulate_many,
     timeline,
 )
 
@@ -46,6 +45,5 @@ __all__ = [
     "Timeline",
     "paper_scenes",
     "simulate",
-    "simulate_many",
     "timeline",
 ]

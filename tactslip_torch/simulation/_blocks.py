@@ -1,12 +1,8 @@
 """Blocks of time and the random numbers in them, so that any interval can be computed alone.
 
-Every draw comes from a Philox counter generator. Its key is a hash of the draw's purpose (seed,
-session, material, cycle, name), its counter the block of time the draw belongs to. So the same
-scene gives the same bytes whatever the worker, the order, or the interval asked for.
-
-A block has a fixed place on the recording's time axis. Everything in it is computed whole, from
-itself and the block before it. Filters are finite (at most one block plus one tap) and run by
-overlap-save at one fixed FFT length.
+Every draw comes from a Philox counter generator; its key is a hash of the draw's purpose, its
+counter the block of time it belongs to. A block has a fixed place on the recording's time axis and
+is computed whole, from itself and the block before it, filters by overlap-save.
 """
 
 from __future__ import annotations

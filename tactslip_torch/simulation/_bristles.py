@@ -1,11 +1,10 @@
 """Skin and bristles: friction integrated in time, one lane for one element in one stroke.
 
-PHYSICS.md, skin and friction: a mass behind a spring, a damper and a Maxwell arm (standard linear
-solid), carried over the surface by bristles under a Hertz pressure (Canudas de Wit, Olsson, Astrom
-and Lischinsky 1995, IEEE TAC 40(3), 419-425). One bristle is LuGre's model, 16 to 64 are a patch
-whose edge lets go first. SI units throughout.
+A mass behind a spring, a damper and a Maxwell arm (standard linear solid) is carried over the
+surface by bristles under a Hertz pressure (Canudas de Wit, Olsson, Astrom and Lischinsky 1995, IEEE
+TAC 40(3), 419-425). One bristle is LuGre's model, 16 to 64 are a patch. SI units.
 
-The scheme is SDIRK2 (PHYSICS.md, stiffness): two implicit stages a step, order 2, L-stable, and the
+The scheme is SDIRK2: two implicit stages a step, order 2, L-stable, and the
 second stage ends at the step's end, so that what a trace holds obeys the balance of forces to
 rounding (Alexander 1977, SIAM J. Numer. Anal. 14(6), 1006-1021). A stage of length ``a`` from base
 values in small letters, the arm's speed ``w``::
@@ -14,10 +13,8 @@ values in small letters, the arm's speed ``w``::
     m V = m v + a (k U + Q + c (w - V) - sigma2 V - F(V))
 
 Skin and bristles are eliminated; the last is one scalar equation ``A V + B + a F(V) = 0`` a lane,
-with ``A > 0`` and ``F`` bounded, so there is always a root and a bracket.
-
-This module is the definition: torch on any device, differentiable. ``native/bristles.cpp`` carries
-it out for float64 on the CPU.
+with ``A > 0`` and ``F`` bounded, so there is always a root and a bracket. Torch defines it, on any
+device and differentiable; ``native/bristles.cpp`` computes it for float64 on the CPU.
 """
 
 from __future__ import annotations
@@ -187,28 +184,15 @@ def integrate(
     return carry(lanes, state, arm_m_s, load_n, step_s, every)
 
 
-def integrator(
-    backend: BackendName = "auto",
-    dtype: torch.dtype = torch.float64,
-    device: torch.device | str = "cpu",
-) -> dict[str, str]:
-    """What carries lanes of a kind here without gradient: backends and their releases round apart.
-
-    Raises:
-        ValueError: for an unknown backend, or one that cannot be used here.
-
-    Example:
-        >>> integrator("torch")["backend"]
-        'torch'
-    """
-    kind = torch.device(device).type
-    chosen = native.backend_of(backend) if (dtype, kind) == (torch.float64, "cpu") else "torch"
+def integrator() -> dict[str, str]:
+    """What integrates recordings here: backends and their releases round apart."""
+    chosen = native.backend_of("auto")
     runs_on = "tactslip_torch" if chosen == "native" else "torch"
     return {
         "backend": chosen,
         f"{runs_on}_version": version(runs_on),
-        "dtype": str(dtype).removeprefix("torch."),
-        "device": kind,
+        "dtype": "float64",
+        "device": "cpu",
     }
 
 

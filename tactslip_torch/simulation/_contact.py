@@ -1,30 +1,16 @@
-"""How the hand touches, and how its elements stick, let go and slide.
+"""Contact of a hand: how its elements stick, let go and slide.
 
-A *session* is one mounting of one material (the paper confounds the two): load shares, gains,
-noise floor, mains, offsets, the material's own friction and texture. A *recording* grasps anew:
-shares, lifted elements, presliding, offsets vary again, and less. An *element* is a segment of a
-finger, with all the channels in it. Every draw is made for the whole hand, whichever channels
-are asked for.
+A *session* is one mounting of one material, a *recording* grasps anew, an *element* is a segment of
+a finger with all the channels in it. Every draw is made for the whole hand.
 
-While an element sticks, the arm's travel stretches its skin and the friction force grows in
-proportion. At ``mu_s N`` it lets go, falls to ``mu_k N`` and slides until, shortly before the arm
-stops, the remaining travel is taken up by the skin again. Over the pause the shear relaxes;
-the next stroke starts with what is left and needs only the rest of the presliding travel.
-PHYSICS.md, friction and skin; the rules are those of a Coulomb slider behind a spring.
+*Kinematic* contact is a Coulomb slider behind a spring, every sample a formula: while an element
+sticks, friction grows with the arm's travel. At ``mu_s N`` it lets go, falls to ``mu_k N`` and
+slides until shortly before the arm stops. Over the pause the shear relaxes.
 
-Truth, vibration and sensors are made from what a contact says, whichever it is.
-
-*Kinematic*: every sample is a formula; bursts are drawn where skin lets go.
-
-*Bristles*: each stroke that slides is integrated alone (``_bristles.py``), element by element: from
-the shear that the quasi-static contact has at its start, spring and bristles at rest and in
-balance, the Maxwell arm relaxed, through the stroke and a quarter second of settling. In the pause
-the shear relaxes in closed form; the two are blended over the settling by a raised cosine. So a
-stroke does not need the strokes before it. What that approximates: the shear with which a stroke
-ends is replaced by the quasi-static one, and creep of bristles over a pause is left out. An
-element slides grossly from the first to the last time at which its slip speed exceeds half of the
-speed of an arm that moves. It takes every stroke of every touching element, whatever windows and
-channels are asked for.
+With *bristles* each stroke that slides is integrated alone, element by element, from the shear that
+the kinematic contact has at its start, through a quarter second of settling behind its end; then
+the two are blended. An element slides grossly from the first to the last time at which its slip
+speed exceeds half of the arm's.
 """
 
 from __future__ import annotations
@@ -33,14 +19,12 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tactslip_torch.native import BackendName
 from tactslip_torch.simulation._blocks import (
     Array,
     Grid,
@@ -65,7 +49,7 @@ from tactslip_torch.simulation.scene import (
     Scene,
 )
 
-GROSS_FRACTION = 0.5
+_GROSS_FRACTION = 0.5
 """Of the arm's speed, above which an element of bristles slides grossly."""
 
 _SLIDE_RISE_S = 0.004  # with which an element that let go reaches the arm's speed (ours)
@@ -262,7 +246,7 @@ class ElementContact:
         slide: slip speed over the speed between hand and object, on the grid: 0 sticking, or
             where nothing drives it; 1 sliding steadily; above 1 where the skin springs back, by
             much where the arm is slow.
-        release_v: what a film of unit gain hears of letting go and sticking again, on the grid.
+        release_v: fast channel's volts by letting go and sticking again, on the grid.
     """
 
     normal_n: Array
@@ -357,8 +341,6 @@ class _BristleContact:
     Args:
         scene: whose contact; its fidelity is ``"bristles"``.
         grasp: how the hand touches.
-        traces: of its strokes; ``None`` to integrate them now, or take those of the last few
-            scenes again.
 
     Attributes:
         slips: when each element slides grossly, over all strokes that do.
@@ -367,11 +349,8 @@ class _BristleContact:
         ValueError: if no whole number of steps makes a sample, or the hand never slides.
     """
 
-    def __init__(
-        self, scene: Scene, grasp: Grasp, traces: tuple[StrokeTrace, ...] | None = None
-    ) -> None:
-        self._scene, self._grasp = scene, grasp
-        self._traces = _scene_traces(scene) if traces is None else traces
+    def __init__(self, scene: Scene, grasp: Grasp) -> None:
+        self._scene, self._grasp, self._traces = scene, grasp, _scene_traces(scene)
         rest = quasi_static_slips(grasp, scene.slides)
         start_s, end_s = np.full_like(rest.start_s, np.nan), np.full_like(rest.end_s, np.nan)
         load = grasp.load_n[grasp.touching]
@@ -410,13 +389,10 @@ Contacts = _KinematicContact | _BristleContact
 """Either model of a recording's contact."""
 
 
-def scene_contact(
-    scene: Scene, grasp: Grasp, traces: tuple[StrokeTrace, ...] | None = None
-) -> Contacts:
-    """The contact of a scene by its fidelity; ``traces`` where they are integrated already."""
-    if scene.fidelity == "kinematic":
-        return _KinematicContact(scene, grasp)
-    return _BristleContact(scene, grasp, traces)
+def scene_contact(scene: Scene, grasp: Grasp) -> Contacts:
+    """The contact of a scene by its fidelity."""
+    model = _KinematicContact if scene.fidelity == "kinematic" else _BristleContact
+    return model(scene, grasp)
 
 
 def _blend(out: Array, grid: Grid, stroke: _Stroke, values: NDArray[np.float32]) -> None:
@@ -438,10 +414,9 @@ def _lanes_of(scene: Scene, grasp: Grasp) -> Lanes:
 
     ``mu_s N0`` over the presliding travel is the stiffness of skin and bristles in series; the
     bristles take ``bristle_share`` of the travel, a single one what its stiffness leaves it.
-    Resonance and damping ratio say how heavy and how damped the skin is, its relaxation which part
+    Resonance and damping ratio give mass and damping of the skin, its relaxation which part
     of it is a Maxwell arm. Part of the damping goes with friction, as what feeds stick-slip does:
-    a damping ratio alone is too little for some skins or too much for others. PHYSICS.md, *Chain
-    per sensing element*.
+    a damping ratio alone is too little for some skins or too much for others.
     """
     dynamics, material = scene.dynamics, grasp.material
     touching = grasp.touching
@@ -523,7 +498,7 @@ class _Stroke:
         return np.broadcast_to(1e-3 * self.stroke.speed_mm_s(time_s), load_n.shape), load_n
 
 
-class StrokeTrace(NamedTuple):
+class _StrokeTrace(NamedTuple):
     """One stroke of the touching elements of a recording, integrated, at its samples.
 
     Attributes:
@@ -566,86 +541,50 @@ def _steps_per_sample(scene: Scene) -> int:
 
 
 @lru_cache(maxsize=_RECORDINGS_KEPT)
-def _scene_traces(scene: Scene) -> tuple[StrokeTrace, ...]:
-    """The traces of a scene; of the last few they are kept, as a timeline and samples need them."""
-    return traces_of([scene])[0]
-
-
-def traces_of(
-    scenes: Sequence[Scene],
-    *,
-    device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float64,
-    backend: BackendName = "auto",
-) -> list[tuple[StrokeTrace, ...]]:
-    """Every stroke that slides of every recording; those that last equally long run side by side.
-
-    However many run beside it, each is the same: bitwise by the native one, to rounding by
-    torch.
-
-    Args:
-        scenes: of fidelity ``"bristles"``.
-        device: where lanes are integrated.
-        dtype: in which they are.
-        backend: see ``integrate``.
+def _scene_traces(scene: Scene) -> tuple[_StrokeTrace, ...]:
+    """Every stroke that slides; of the last few scenes, as a timeline and samples need them.
 
     Raises:
         ValueError: if no whole number of steps makes a sample.
     """
-    strokes = [_strokes_of(scene) for scene in scenes]
-    groups: dict[tuple[float, ...], list[_Stroke]] = {}
-    for stroke in chain.from_iterable(strokes):
-        scene = stroke.scene
-        alike = (stroke.num, _steps_per_sample(scene), scene.sample_rate_hz)
-        groups.setdefault((*alike, scene.dynamics.num_bristles), []).append(stroke)
-    traces = {}
-    for group in groups.values():
-        for trace in _integrated(group, torch.device(device), dtype, backend):
-            traces[trace.stroke] = trace
-    return [tuple(traces[stroke] for stroke in of_scene) for of_scene in strokes]
+    return tuple(map(_integrated, _strokes_of(scene)))
 
 
-def _integrated(
-    strokes: list[_Stroke], device: torch.device, dtype: torch.dtype, backend: BackendName
-) -> list[StrokeTrace]:
-    """Strokes of one length, side by side."""
+def _integrated(stroke: _Stroke) -> _StrokeTrace:
+    """A stroke of the touching elements, side by side."""
+    scene = stroke.scene
+    every, rate_hz = _steps_per_sample(scene), scene.sample_rate_hz
+    step_s, lanes = 1.0 / (rate_hz * every), _lanes_of(scene, stroke.grasp)
 
     def drive(since_s: Array) -> list[torch.Tensor]:
-        """Arm and load of all lanes, ``[n, L]``."""
-        columns = zip(*(stroke.drive(since_s) for stroke in strokes), strict=True)
-        return [torch.from_numpy(np.concatenate(c, axis=1)).to(device, dtype) for c in columns]
+        """Arm and load of all lanes, ``[n, E]``."""
+        return [torch.from_numpy(np.ascontiguousarray(of)) for of in stroke.drive(since_s)]
 
-    every, num = _steps_per_sample(strokes[0].scene), strokes[0].num
-    step_s = 1.0 / (strokes[0].scene.sample_rate_hz * every)
-    *columns, pressures = zip(*(_lanes_of(s.scene, s.grasp) for s in strokes), strict=True)
-    lanes = Lanes(*(torch.cat(c).to(device, dtype) for c in (*columns, pressures[:1])))
-    shear = torch.from_numpy(np.concatenate([stroke.shear for stroke in strokes]))
     _, load_n = drive(np.zeros(1))
-    shear_n = shear.to(lanes.mu_s) * lanes.mu_s * load_n[0]
+    shear_n = torch.from_numpy(stroke.shear) * lanes.mu_s * load_n[0]
     state, pieces = LaneState.sticking(lanes, shear_n), []
-    for first in range(0, num, _SAMPLES_AT_ONCE):
-        num_steps = every * (min(first + _SAMPLES_AT_ONCE, num) - first)
+    for first in range(0, stroke.num, _SAMPLES_AT_ONCE):
+        num_steps = every * (min(first + _SAMPLES_AT_ONCE, stroke.num) - first)
         arm, load = drive(stage_times_s(num_steps, step_s, first * every).numpy())
-        with torch.no_grad():
-            trace, state = integrate(lanes, state, arm, load, step_s, every, backend)
-        pieces.append(torch.stack(trace).double().cpu().numpy())
-    whole = np.concatenate(pieces, axis=1)  # friction, inertia, slip: [3, num, L]
-    start = np.stack([shear_n.double().cpu().numpy(), *np.zeros((2, len(shear_n)))])
-    whole = np.concatenate([start[:, None], whole], axis=1)
-    ends = np.cumsum([len(stroke.shear) for stroke in strokes])[:-1]
-    return list(map(_trace, strokes, np.split(whole, ends, axis=2)))
+        trace, state = integrate(lanes, state, arm, load, step_s, every)
+        pieces.append(torch.stack(trace).numpy())
+    start = np.stack([shear_n.numpy(), *np.zeros((2, len(shear_n)))])
+    whole = np.concatenate([start[:, None], *pieces], axis=1)  # friction, inertia, slip
+    return _trace(stroke, whole)
 
 
-def _trace(stroke: _Stroke, values: Array) -> StrokeTrace:
+def _trace(stroke: _Stroke, values: Array) -> _StrokeTrace:
     """What is kept of a stroke's friction, inertia and slip speed, ``[3, num + 1, E]``."""
     slip, rate_hz = values[2], stroke.scene.sample_rate_hz
     arm, _ = stroke.drive(np.arange(stroke.num + 1) / rate_hz)
     least_m_s = _MOVING_FRACTION * 1e-3 * stroke.stroke.peak_mm_s
     moves = arm > least_m_s
-    excess = np.where(moves, slip - GROSS_FRACTION * arm, -np.abs(slip))
+    excess = np.where(moves, slip - _GROSS_FRACTION * arm, -np.abs(slip))
     relative = np.where(moves, np.maximum(slip / np.maximum(arm, least_m_s), 0.0), 0.0)
     kept = np.stack([*values[:2], relative]).astype(np.float32)
-    return StrokeTrace(stroke, kept, *(t + stroke.first / rate_hz for t in _gross(excess, rate_hz)))
+    return _StrokeTrace(
+        stroke, kept, *(t + stroke.first / rate_hz for t in _gross(excess, rate_hz))
+    )
 
 
 def _gross(excess: Array, rate_hz: float) -> tuple[Array, Array]:

@@ -1,31 +1,17 @@
-"""From the skin to volts: what sliding sounds like, the strain gauge, the film, the front end.
+"""From the skin to volts: vibration of sliding, slow and fast channels, what disturbs them.
 
-*Vibration* is in volts at a PVDF film of unit gain. Three parts while an element slides: a *high*
-part, broadband behind the skin's resonance (friction noise of every contact, and the texture's
-``k^-a`` part, whose spectrum keeps its shape at any speed); a *low* part below 25 Hz; and *lines*
-at speed over wavelength, which run with the arm's position. Then a burst where it lets go.
+*Vibration* is in volts at a fast channel of unit gain. While an element slides it has a *high*
+part, broadband behind the skin's resonance; a *low* part below 25 Hz; and *lines* at speed over
+wavelength, which run with the arm's position. Then a burst where it lets go.
 
-An SG channel follows force slowly and stays: preload, shear, creep, offset, drift. A PVDF channel
-gives the rate of strain: nothing of what stays passes its high-pass. Both end in white noise and a
-converter with rails. Last links of the chain in PHYSICS.md.
+A slow channel (SG, strain gauge) follows force and stays: preload, shear, creep, offset, drift. A
+fast one (PVDF film) gives the rate of strain, behind a high-pass. Both end in white noise and a
+converter with rails.
 
-What is in a recording and is no slip of the hand: disturbances, handling, imperfections, faults.
-
-*Disturbances* reach every channel: arm, motor, mains, knocks, a machine beside the hand, pick-up.
-Each is a common signal (or a few) times one coupling per channel.
-
-*Handling* loads the contact without sliding: a carried object's inertia, taps, changes of grip. It
-comes on top of what the contact says, and only where nothing slides: at rest and in strokes that
-move ``"both"``, a tenth of a second away from any stroke that slides. One thing reaches further: a
-carried object's shear outlasts its stroke by 30 ms, into a slide that begins sooner, where it is
-sensed and moves no onset. Taps and grips press harder and never less, and carried shear stays below
-half of static friction, so a contact that sticks goes on sticking: no slip begins or ends by them.
-
-*Imperfections* are noise, wander and partial slip of single elements; *faults* are what is broken
-between the sensors and the file. Neither moves what slides and when.
-
-Everything is a function of absolute time and of keys of its own, so any interval can be computed
-alone, and nothing moves by what is switched on beside it.
+*Disturbances* reach every channel through one coupling each. *Handling* loads a contact that does
+not slide and begins no slip. *Imperfections* are noise, wander and partial slip of single elements;
+*faults* are what is broken between the sensors and the file. Everything is a function of absolute
+time and of keys of its own, so any interval can be computed alone.
 """
 
 from __future__ import annotations
@@ -57,17 +43,19 @@ _BANDS = ("high", "low")  # parts of vibration, above and below 25 Hz
 _REFERENCE_MM_S = 40.0  # the speed at which levels are given
 _LOW_BAND_HZ = 25.0  # where the low part of friction noise ends
 _LINE_DAMPING = 0.5  # ratio with which lines meet the skin: a patch is many bristles (prior, ours)
-_SG_VIBRATION = 0.08  # of a film's vibration, what an SG channel sees (prior, ours)
+_SLOW_VIBRATION = 0.08  # of a fast channel's vibration, what a slow one sees (prior, ours)
 _FORCE_FLUCTUATION = 0.03  # slow, of friction over its mean while sliding, rms (prior, ours)
 _DRIFT_HZ = (0.05, 2.0)  # where a channel's drift lies
 _DRIFT_NODES = 8  # per block
 _WARMING_TIMES = 2.0  # time constants of warming that a recording lasts (prior, ours)
-_PVDF_WARMING = 0.02  # of an SG channel's warming, what passes a film's high-pass (prior, ours)
+_FAST_WARMING = (
+    0.02  # of a slow channel's warming, what passes a fast one's high-pass (prior, ours)
+)
 
 # --- vibration ------------------------------------------------------------------------------------
 
 
-class Vibration(NamedTuple):
+class _Vibration(NamedTuple):
     """One element's vibration on a grid.
 
     Attributes:
@@ -136,8 +124,8 @@ def _band_responses(
     return causal_response(np.stack([high, low]))
 
 
-class Vibrations:
-    """What the touching elements of a recording sound like on a grid.
+class _Vibrations:
+    """Vibration of the touching elements of a recording on a grid.
 
     Args:
         scene: of the recording.
@@ -151,7 +139,7 @@ class Vibrations:
         self._levels_v = _levels_v(scene, grasp, motion.speed_mm_s)  # [K, B] each
         self._lines = _lines(scene, grasp, motion)
 
-    def element(self, element: int, contact: ElementContact) -> Vibration:
+    def element(self, element: int, contact: ElementContact) -> _Vibration:
         """One element's vibration, imperfections included; work only in blocks that slide."""
         scene, grasp, grid = self._scene, self._grasp, self._grid
         low_fraction = scene.contact.friction_noise_low_share
@@ -164,7 +152,7 @@ class Vibrations:
             slide = contact.slide[rows]
             keys = [(*scene.key(band), element) for band in _BANDS]
             high, low = self._band_noises(element, rows, keys)
-            if scene.fidelity == "bristles":  # a speed of its own, with the sound of that speed
+            if scene.fidelity == "bristles":  # a speed of its own, with the vibration of that speed
                 friction_gate = _powered(slide, scene.contact.friction_noise_exponent)
                 texture_gate = _powered(slide, grasp.texture_exponent)
             else:  # a fading in
@@ -178,7 +166,7 @@ class Vibrations:
             bands[1, rows] += np.sqrt(low_fraction) * friction * low
             fluctuation[rows] += np.minimum(slide, 1.0) * low
         self._add_imperfections(bands, element, contact)
-        return Vibration(bands, fluctuation)
+        return _Vibration(bands, fluctuation)
 
     def _add_imperfections(self, bands: Array, element: int, contact: ElementContact) -> None:
         """Partial slip or sticking, and local noise."""
@@ -236,7 +224,7 @@ def _runs(chosen: Flags) -> list[slice]:
 # --- sensors --------------------------------------------------------------------------------------
 
 
-class Front(NamedTuple):
+class _Front(NamedTuple):
     """Parameters of every channel in one recording, ``[C]`` each.
 
     Attributes:
@@ -250,7 +238,7 @@ class Front(NamedTuple):
     offset_v: Array
 
 
-def draw_front(scene: Scene) -> Front:
+def draw_front(scene: Scene) -> _Front:
     """Gains, noise floors and offsets: per session, and a little again per recording."""
     sensors, num = scene.sensors, len(scene.hand)
     session, rng = generator(*scene.session_key("front")), generator(*scene.key("f"))
@@ -260,20 +248,20 @@ def draw_front(scene: Scene) -> Front:
     sg_offset = sensors.sg_session_offset_v * session.standard_normal(num)
     sg_offset = sg_offset + sensors.sg_offset_v * rng.standard_normal(num)
     pvdf_offset = 1e-3 * sensors.pvdf_offset_mv * rng.uniform(-1.0, 1.0, num)
-    return Front(
+    return _Front(
         gain=gain,
         white_v=1e-3 * floor_mv * lognormal(session, 0.2, num),
-        offset_v=np.where(is_slow(scene), sg_offset, pvdf_offset),
+        offset_v=np.where(_is_slow(scene), sg_offset, pvdf_offset),
     )
 
 
-def is_slow(scene: Scene) -> Flags:
+def _is_slow(scene: Scene) -> Flags:
     """Which channels are slow, ``[C]``."""
     return np.isin(np.arange(len(scene.hand)), scene.hand.slow)
 
 
 @lru_cache(maxsize=8)
-def highpass_response(corner_hz: float, block_samples: int, sample_rate_hz: float) -> Spectrum:
+def _highpass_response(corner_hz: float, block_samples: int, sample_rate_hz: float) -> Spectrum:
     """A film and its amplifier: first-order high-pass that passes no constant, ``[B + 1]``.
 
     The one-pole filter with a zero at 0 Hz, cut after one block and freed of what the cut leaves
@@ -287,17 +275,17 @@ def highpass_response(corner_hz: float, block_samples: int, sample_rate_hz: floa
     return np.asarray(np.fft.rfft(taps, 2 * block_samples))
 
 
-def _slow_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: Vibration) -> Array:
-    """What an SG channel of unit gain says of its element; all on one grid."""
+def _slow_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: _Vibration) -> Array:
+    """Volts of a slow channel of unit gain on its element; all on one grid."""
     sensors = scene.sensors
     shear_v = sensors.sg_shear_v_per_n * friction_n
     shear_v = shear_v * (1.0 + _FORCE_FLUCTUATION * vibration.fluctuation)
-    vibration_v = _SG_VIBRATION * (vibration.bands[0] + vibration.bands[1])
+    vibration_v = _SLOW_VIBRATION * (vibration.bands[0] + vibration.bands[1])
     return np.asarray(sensors.sg_preload_v_per_n * normal_n + shear_v + vibration_v)
 
 
-def _fast_volts(scene: Scene, grid: Grid, force_n: Array, vibration: Vibration) -> Array:
-    """What a PVDF channel of unit gain says of its element.
+def _fast_volts(scene: Scene, grid: Grid, force_n: Array, vibration: _Vibration) -> Array:
+    """Volts of a fast channel of unit gain on its element.
 
     Args:
         scene: whose sensors.
@@ -306,7 +294,7 @@ def _fast_volts(scene: Scene, grid: Grid, force_n: Array, vibration: Vibration) 
         vibration: on ``grid``; behind the high-pass already.
     """
     corner_hz = scene.sensors.pvdf_highpass_hz
-    response = highpass_response(corner_hz, grid.block_samples, grid.sample_rate_hz)
+    response = _highpass_response(corner_hz, grid.block_samples, grid.sample_rate_hz)
     strain_v = grid.filtered(scene.sensors.pvdf_shear_v_per_n * force_n, response)
     return np.asarray(strain_v + vibration.bands[0] + vibration.bands[1])
 
@@ -324,15 +312,15 @@ def _warming_v(scene: Scene, index: int, grid: Grid) -> Array:
     Nothing at first, fast in the beginning and slower later, with a sign and size of the channel's.
     """
     rng = generator(*scene.key("warming"), index)
-    fraction = 1.0 if index in scene.hand.slow else _PVDF_WARMING
+    fraction = 1.0 if index in scene.hand.slow else _FAST_WARMING
     sign = 1.0 if rng.random() < 0.5 else -1.0
     far_v = 1e-3 * scene.sensors.warming_mv * fraction * sign * lognormal(rng, 0.5)
     since = np.maximum(grid.time_s, 0.0) / scene.end_s
     return np.asarray(far_v * np.expm1(-_WARMING_TIMES * since) / np.expm1(-_WARMING_TIMES))
 
 
-def _converted(scene: Scene, front: Front, index: int, grid: Grid, volts: Array) -> Array:
-    """What the converter says: with offset, drift and white noise, between the rails, in steps."""
+def _converted(scene: Scene, front: _Front, index: int, grid: Grid, volts: Array) -> Array:
+    """Volts of the converter: with offset, drift and white noise, between the rails, in steps."""
     noise = grid.white_noise((*scene.key("white"), scene.hand.names[index]))
     total = volts + front.offset_v[index] + front.white_v[index] * noise
     total += _drift_v(scene, index, grid)
@@ -348,7 +336,7 @@ def volts_of(
 ) -> list[Array]:
     """Volts of the channels asked for on the grid, ``[K, B]`` each."""
     history, _, now = grid.history
-    front, vibrations = draw_front(scene), Vibrations(scene, grasp, grid)
+    front, vibrations = draw_front(scene), _Vibrations(scene, grasp, grid)
     motion, handled = Motion(scene.slides, history), Handled(scene, grasp)
     volts = dict(zip(indices, _common_volts(scene, grid, indices), strict=True))
     elements = set(grasp.element_of_channel[indices].tolist()) & set(grasp.touching.tolist())
@@ -384,13 +372,13 @@ _ARM_MODE_WEIGHTS = (0.25, 0.15, 0.25, 0.2, 0.1, 0.05)  # of a transient's first
 _MAINS_ORDERS = np.array([1, 2, 3, 5, 7, 9])  # up to 450 Hz
 _MAINS_BURST_S = (0.1, 1.0)  # how long the mains is stronger; log-uniform (prior, ours)
 _MAINS_RAMP_S = 0.02  # of a burst, at both ends
-_MOTOR_PITCH_MM = (0.37, 0.61)  # arm travel per turn of two gears that are heard (prior, ours)
+_MOTOR_PITCH_MM = (0.37, 0.61)  # arm travel per turn of two gears that vibrate (prior, ours)
 _MACHINE_ORDERS = np.array([1, 2, 3, 4, 6, 8])  # harmonics of the rotation
 _MACHINE_RUN_S = (1.0, 4.0)  # how long a run lasts; log-uniform (ours)
 _MACHINE_BREAK_S = (0.5, 2.0)  # how long it stands between runs; log-uniform (ours)
 _MACHINE_RAMP_S = 0.3  # how long it runs up and down, at both ends of a run (ours)
 _PICKUP_COUPLING_SPREAD = 0.7  # of the channels (ours)
-_SG_PICKUP = 0.1  # coupling of a strain gauge's bridge, of low resistance, over a film's (ours)
+_SLOW_PICKUP = 0.1  # coupling of a slow channel, of low resistance, over a fast one's (ours)
 _LEVEL_SPREAD = 0.5  # of levels of pick-up and local noise over time, and between elements (ours)
 _WANDER_HZ = (0.1, 2.0)  # where levels wander
 _WANDER_NODES = 16  # per block
@@ -441,7 +429,7 @@ def _common_volts(scene: Scene, grid: Grid, channels: list[int]) -> Array:
     if scene.imperfections.pickup_mv > 0:
         session = generator(*scene.session_key("pick-up"))
         signs = np.where(session.random(num) < 0.5, -1.0, 1.0)
-        signs *= np.where(is_slow(scene), _SG_PICKUP, 1.0)
+        signs *= np.where(_is_slow(scene), _SLOW_PICKUP, 1.0)
         add(signs * lognormal(session, _PICKUP_COUPLING_SPREAD, num), _pickup_v(scene, grid))
     return volts
 
@@ -514,7 +502,7 @@ def _arm_ringing(scene: Scene, driven: Motion) -> tuple[slice, list[Array]]:
 
 
 def _draw_knocks(scene: Scene) -> list[tuple[Array, float, float, float]]:
-    """Knocks at random times, each in about half of the channels, weakly in SG channels (ours).
+    """Knocks at random times, each in about half of the channels, weakly in slow ones (ours).
 
     Volts of every channel, time, angular frequency and decay of each.
     """
@@ -527,7 +515,7 @@ def _draw_knocks(scene: Scene) -> list[tuple[Array, float, float, float]]:
     reached = rng.random((num, num_channels)) < 0.5
     sizes_v = 1e-3 * of.burst_mv * lognormal(rng, 0.5, (num, 1))
     sizes_v = sizes_v * lognormal(rng, 0.5, (num, num_channels)) * reached
-    sizes_v *= np.where(is_slow(scene), 0.3, 1.0)
+    sizes_v *= np.where(_is_slow(scene), 0.3, 1.0)
     return list(zip(sizes_v, times_s.tolist(), omegas.tolist(), decays.tolist(), strict=True))
 
 
@@ -585,7 +573,7 @@ def _machine_wave(scene: Scene, grid: Grid) -> Array:
 
 
 def _pickup_v(scene: Scene, grid: Grid) -> Array:
-    """Broadband pick-up at a film of coupling 1; its level wanders, ``[K, B]``."""
+    """Broadband pick-up at a fast channel of coupling 1; its level wanders, ``[K, B]``."""
     f = grid.frequency_hz
     response = causal_response(f / (f + 20.0) / (1 + f / 200.0))
     level = _wandering(_LEVEL_SPREAD, generator(*scene.key("pick-up level")), grid)
@@ -608,11 +596,13 @@ def _at_random(scene: Scene, key: Key, per_s: float, lengths_s: Interval) -> lis
 # --- handling -------------------------------------------------------------------------------------
 
 _MARGIN_S = 0.1  # between a tap or grip, with its settling, and a stroke that slides (ours)
-_SETTLE_S = 0.1  # how long a film still tells of a tap or grip that is over (ours)
+_SETTLE_S = 0.1  # how long a fast channel still shows a tap or grip that is over (ours)
 _EVENT_SPREAD = 0.3  # how unevenly elements take part in a tap or grip (ours)
 _RINGING_S = 0.3  # how long the arm's ringing counts as handling after a stroke (ours)
 _MOST_CARRIED = 0.5  # of static friction, what a carried object may take
-_KNOCK_V_PER_N = 0.05  # first swing of a knock's modes at a film, per newton of the peak (ours)
+_KNOCK_V_PER_N = (
+    0.05  # first swing of a knock's modes at a fast channel, per newton of the peak (ours)
+)
 _KNOCK_HZ = (60.0, 800.0)  # where a knock's modes lie
 _KNOCK_DECAY_S = (0.002, 0.008)
 _KNOCK_MODES = 8
@@ -763,7 +753,7 @@ class Handled:
         return extra
 
     def knock_v(self, element: int, grid: Grid) -> Array:
-        """What a film of unit gain hears of the taps beyond their force: many modes, soon gone.
+        """Volts of a fast channel of unit gain by taps beyond their force: many modes, soon gone.
 
         Shape:
             - output: ``[K, B]``

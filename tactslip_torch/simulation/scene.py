@@ -1,13 +1,8 @@
-"""A scene: everything that determines one simulated recording, and how its arm moves.
+"""Scenes: everything that determines one simulated recording, and how its arm moves.
 
-Defaults are the starting values of PHYSICS.md unless marked. Every ``*_spread`` is the standard
-deviation of the logarithm of a factor of median 1. Times are in seconds from the start of the
-recording, positions in millimetres from where the arm was then.
-
-Three parameters are *calibrated*: set once, by ``tactslip calibrate``, on seen-material test
-accuracy and the signal checks alone, and frozen with where they come from in ``calibrated.json``.
-They move together along one line of difficulty: ``d`` prior standard deviations harder means less
-friction noise, longer presliding and more bursts, each by its own spread to the power ``d``.
+Every ``*_spread`` is the standard deviation of the logarithm of a factor of median 1. Times are in
+seconds from the start of the recording, positions in millimetres from where the arm was then. Three
+parameters were calibrated once on test accuracy of seen materials (``calibrated.json``).
 """
 
 from __future__ import annotations
@@ -144,11 +139,11 @@ class Contact(_Parameters):
         recoil_s: time constant of the shear's fall from static to kinetic (prior, ours). On the
             kinematic fidelity alone: bristles integrate that fall.
         friction_noise_mv: *calibrated.* Broadband friction noise of every sliding element, rms
-            at a PVDF film for mu = 1, 1 N and 40 mm/s.
+            in a fast channel for mu = 1, 1 N and 40 mm/s.
         friction_noise_exponent: power of speed it grows with.
         friction_noise_low_share: share of its power below 25 Hz.
         texture_scale: factor on every material's texture (prior, ours).
-        onset_pulse_v: first swing of the PVDF burst when an element lets go, per newton of
+        onset_pulse_v: first swing of a fast channel's burst when an element lets go, per newton of
             friction. On kinematic fidelity alone: see ``Dynamics.release_v_per_n``.
         runout: relative change of normal load along the travel.
         skin_resonance_hz: range of the skin's resonance, drawn per session.
@@ -210,18 +205,19 @@ class Sensors(_Parameters):
         white_noise_mv: rms of each channel's white noise.
         white_noise_session_spread: its spread between sessions.
         gain_spread: spread of the channels' gains between sessions (a third between recordings).
-        sg_preload_v_per_n: SG volts per newton of normal force (prior, ours).
-        sg_shear_v_per_n: SG volts per newton of friction (prior, ours).
-        sg_session_offset_v: spread of SG offsets between sessions (prior, ours).
-        sg_offset_v: spread of SG offsets between recordings, from grasping again.
-        sg_drift_mv: size of the SG's slow drift (prior, ours).
-        pvdf_shear_v_per_n: PVDF volts per newton of friction, before the high-pass (prior, ours).
+        sg_preload_v_per_n: volts of a slow channel per newton of normal force (prior, ours).
+        sg_shear_v_per_n: volts of a slow channel per newton of friction (prior, ours).
+        sg_session_offset_v: spread of slow channels' offsets between sessions (prior, ours).
+        sg_offset_v: spread of slow channels' offsets between recordings, from grasping again.
+        sg_drift_mv: size of a slow channel's drift (prior, ours).
+        pvdf_shear_v_per_n: volts of a fast channel per newton of friction, before the high-pass
+            (prior, ours).
         pvdf_highpass_hz: corner of the film and its amplifier (6.6 Hz at 10 MOhm, MSI
             manual), at least 2 Hz.
         pvdf_offset_mv: largest offset behind the high-pass; keep it at or below 2 mV.
-        pvdf_drift_mv: size of the film's slow (pyroelectric) drift.
-        warming_mv: how far an SG channel's zero moves over the recording as the hand warms up,
-            with a sign and size of its own in every channel; a PVDF channel moves a fiftieth of it.
+        pvdf_drift_mv: size of a fast channel's (pyroelectric) drift.
+        warming_mv: how far a slow channel's zero moves over the recording as the hand warms up,
+            with a sign and size of its own in every channel; a fast one moves a fiftieth of it.
         num_bits: of the converter.
         rail_v: the converter's range is plus and minus this.
 
@@ -249,7 +245,7 @@ class Sensors(_Parameters):
         super().__post_init__()
         self._require("num_bits", 2 <= self.num_bits <= 32, "2 to 32")
         self._require("rail_v", self.rail_v > 0, "positive")
-        wanted = "at least 2, for slower films outlast a block of a quarter second"
+        wanted = "at least 2, for slower ones outlast a block of a quarter second"
         self._require("pvdf_highpass_hz", self.pvdf_highpass_hz >= 2, wanted)
 
 
@@ -259,7 +255,7 @@ class Disturbances(_Parameters):
 
     Args:
         mains_mv: amplitude of the mains' fundamental, the session's median (prior, ours: at
-            PHYSICS.md's 4 to 10 mV rest would exceed the 1.5 to 4 mV rms it asks for).
+            4 to 10 mV would exceed the 1.5 to 4 mV rms of rest).
         mains_session_spread: its spread between sessions.
         mains_hz: nominal frequency; harmonics up to the ninth share a common phase.
         arm_transient_mv: ringing of the arm's modes at each start and stop, in every channel.
@@ -366,7 +362,7 @@ class Dynamics(_Parameters):
     """Friction and steps of fidelity ``"bristles"``; the kinematic one has none.
 
     Stiffness, mass and damping of the skin follow from what both share: the presliding travel,
-    the resonance and its damping ratio. PHYSICS.md, *Stiffness*.
+    the resonance and its damping ratio.
 
     Args:
         step_us: of the integration; a whole number of steps makes a sample.
@@ -385,9 +381,9 @@ class Dynamics(_Parameters):
             and the other sticks and slips, but for the softest skins of all and most patches.
         bristle_damping: damping ratio of the bristles with the skin's mass (prior, ours).
         viscous_n_s_m: viscous friction, which the closed forms do not have.
-        release_v_per_n: PVDF volts per newton of the skin's inertia: what a film at the
-            surface hears when the skin lets go (prior, ours: so that the bursts of M2 to M5
-            stand out of their slides with a single bristle, REFERENCE.md section 6, *signals*).
+        release_v_per_n: volts of a fast channel per newton of the skin's inertia, when the skin
+            lets go (prior, ours: so that the bursts of M2 to M5
+            stand out of their slides with a single bristle, as the paper shows).
 
     Raises:
         ValueError: if a parameter is negative or not finite, a step is longer than 5 ms or zero, or
@@ -418,20 +414,20 @@ class Imperfections(_Parameters):
     """What makes channels differ without slip, and what makes slip differ between channels.
 
     On the paper's simulated hand, slip alone makes channels differ: everything else (mains, arm,
-    motor) moves them together. On real electrodes at rest neighbours are nearly independent
-    (``python -m benchmarks.realism``). None of these moves an onset.
+    motor) moves them together. On real electrodes at rest neighbours are nearly independent.
+    None of these moves an onset.
 
     Args:
         local_noise_mv: noise of every element that touches, sliding or not, independent between
-            elements, rms at a PVDF film at 1 N. It stands for creep and settling of asperities
+            elements, rms in a fast channel at 1 N. It stands for creep and settling of asperities
             behind the skin's resonance, so it has the spectrum of friction noise; its level wanders
             within the recording and differs between elements (prior, ours: below the 1.5 to 4 mV
-            rms that PHYSICS.md gives rest; independent, as a real fingertip's electrodes in touch).
+            rms of rest; independent, as a real fingertip's electrodes in touch).
         share_wander: spread of the logarithm of each element's load while a grasp lasts, over
             half a second to ten (prior: in the real set a channel's level wanders about the mean
             over channels by .2 to .3 within seconds).
         gain_drift: the same of each channel's gain: temperature, glue (prior, ours).
-        pickup_mv: broadband pick-up, one signal in all channels, rms at a film of coupling 1. Each
+        pickup_mv: broadband pick-up, one signal in all channels, rms at a coupling of 1. Each
             channel has a coupling and sign of its own, so it too makes channels differ; its level
             wanders (a film is a source of high impedance, near motor drives and cables: MSI/TE
             Piezo Film Sensors Technical Manual asks for shielding; level prior, ours).
@@ -467,7 +463,8 @@ class Material:
         mu_s: static friction coefficient, the centre of its lognormal prior; dimensionless.
         ra_um: lowest and highest roughness Ra; with ``texture_mv`` it sets how strongly the
             material vibrates (a session rougher than the middle of its range vibrates more).
-        texture_mv: rms of the texture's vibration at 40 mm/s and 1 N at a PVDF film (prior, ours).
+        texture_mv: rms of the texture's vibration at 40 mm/s and 1 N in a fast channel (prior,
+            ours).
         character: see ``Character``.
         wavelength_mm: shortest and longest dominant wavelength, or ``None`` without one. For a
             tacky material: travel per stick-slip cycle.
@@ -476,7 +473,7 @@ class Material:
             rest is the broad ``k^-a`` part.
         mu_ratio: lowest and highest kinetic over static friction, dimensionless.
         stribeck_mm_s: speed over which static becomes kinetic friction of bristles;
-            near the speeds of sliding it makes a material stick and slip (PHYSICS.md).
+            near the speeds of sliding it makes a material stick and slip.
         fast_ratio: kinetic over static friction far above that speed, of bristles, where
             it is not ``mu_ratio``: a tacky material's is the mean over sticking and slipping at
             the speeds of sliding. The range is drawn with ``mu_ratio``, low with low.
@@ -507,7 +504,7 @@ class Material:
             )
 
 
-# Friction, Ra and wavelengths: PHYSICS.md's table, as priors: none was measured on this hand.
+# Friction, Ra and wavelengths are usual values of such materials; none was measured on this hand.
 # Each session draws its own from the ranges. Texture levels: rough 150 mV and smooth 10 mV
 # (its starting values), the materials between by roughness and softness (prior, ours). The tacky
 # fast_ratio: with it the force oscillates by about a quarter (prior, ours).

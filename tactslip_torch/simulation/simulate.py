@@ -1,20 +1,13 @@
-"""A scene in, its truth and its recording out.
+"""Simulated recordings with their truth, one at a time and as a set.
 
-Arm motion, contact, handling, vibration, imperfections, sensors, faults. Only the channels and the
-intervals of time that are asked for are computed; elements out of contact cost no friction.
-
-The hand's elements do not let go together. Its *onset* is when elements that carry half of the
-normal load have let go (the load-weighted median of their breakaways), between the releases of the
-first and of the last one; its sliding ends when elements that carry half of it stick again. All are
-read from the contact, not from the arm.
-
-Sets of simulated recordings, each made when asked for.
+Elements do not let go together. The *onset* is when elements that carry half of the normal load
+have let go; sliding ends when elements that carry half of it stick again.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -26,17 +19,14 @@ from numpy.typing import NDArray
 from tactslip_torch.data.recording import Recording, RecordingId, Stretch
 from tactslip_torch.data.recording import Timeline as _Timeline
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import check_number
 from tactslip_torch.simulation._blocks import Array, Grid, generator
 from tactslip_torch.simulation._bristles import integrator
 from tactslip_torch.simulation._contact import (
     Grasp,
     Slips,
-    StrokeTrace,
     draw_grasp,
     scene_contact,
-    traces_of,
 )
 from tactslip_torch.simulation._sensors import (
     Handled,
@@ -122,79 +112,8 @@ def simulate(
     """
     if not dtype.is_floating_point:
         raise ValueError(f"dtype must be floating, got {dtype}")
-    by = integrator() if scene.fidelity == "bristles" else {}
-    return _recording(scene, None, by, windows, channels, dtype)
-
-
-def simulate_many(
-    scenes: Iterable[Scene],
-    *,
-    windows: Sequence[Sequence[tuple[float, float]] | None] | None = None,
-    channels: Iterable[str] | None = None,
-    device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float64,
-    backend: BackendName = "auto",
-    at_once: int = 32,
-) -> Iterator[Recording]:
-    """The recordings of several scenes, in their order, each when it is asked for.
-
-    Bristles of many recordings are integrated side by side, on any device. The native engine
-    carries lanes by 16, which the elements of one recording nearly fill, so there this saves
-    little; torch makes few large calls of what would be many small ones.
-
-    On the CPU in float64, backend ``"auto"``, each has the bytes that ``simulate`` gives it; by
-    torch, in float32 or on a GPU what it differs by is the integration's rounding.
-
-    Args:
-        scenes: of any fidelity; kinematic ones are simulated one by one.
-        windows: of every scene, as ``simulate`` takes them; ``None`` for all of all.
-        channels: names of the channels to compute, ``None`` for all.
-        device: where bristles are integrated; sensors are simulated on the CPU.
-        dtype: in which bristles are integrated, float32 or float64; samples are float32.
-        backend: ``"native"`` or ``"torch"``, ``"auto"`` for what there is.
-        at_once: how many recordings are integrated together.
-
-    Raises:
-        ValueError: as ``simulate``; or if there are not as many windows as scenes, or ``at_once``
-            is not positive.
-
-    Example:
-        >>> scenes = [Scene("M2", fidelity="bristles", cycle=cycle) for cycle in range(2)]
-        >>> [len(recording.onsets_s) for recording in simulate_many(scenes, channels=["SG1"])]
-        [3, 3]
-    """
-    scenes = list(scenes)
-    check_number("at_once", at_once, whole=True)
-    if windows is not None and len(windows) != len(scenes):
-        raise ValueError(f"expected windows of each of {len(scenes)} scenes, got {len(windows)}")
-    wanted = [None] * len(scenes) if windows is None else list(windows)
-    if channels is not None and not isinstance(channels, str):
-        channels = list(channels)
-
-    def made() -> Iterator[Recording]:
-        for start in range(0, len(scenes), at_once):
-            some = scenes[start : start + at_once]
-            distinct = list(dict.fromkeys(one for one in some if one.fidelity == "bristles"))
-            integrated = traces_of(distinct, device=device, dtype=dtype, backend=backend)
-            traces = dict(zip(distinct, integrated, strict=True))
-            by = integrator(backend, dtype, device) if distinct else {}
-            for scene, intervals in zip(some, wanted[start : start + at_once], strict=True):
-                yield _recording(scene, traces.get(scene), by, intervals, channels)
-
-    return made()
-
-
-def _recording(
-    scene: Scene,
-    traces: tuple[StrokeTrace, ...] | None,
-    by: Mapping[str, str],
-    windows: Sequence[tuple[float, float]] | None = None,
-    channels: Iterable[str] | None = None,
-    dtype: torch.dtype = torch.float32,
-) -> Recording:
-    """``simulate`` with the traces of bristles, ``None`` to integrate, and the ``integrator``."""
     grasp = draw_grasp(scene)
-    contact = scene_contact(scene, grasp, traces)
+    contact = scene_contact(scene, grasp)
     truth = _timeline(scene, grasp, contact.slips)
     volts = np.full((len(scene.hand), truth.num_samples), np.nan)
     wanted, indices = _wanted_samples(scene, truth, windows), _channel_indices(scene, channels)
@@ -221,7 +140,7 @@ def _recording(
         sliding_s=truth.sliding_s,
         annotated_onsets_s=truth.annotated_onsets_s,
         non_slip_s=truth.non_slip_s,
-        provenance=_provenance(scene, by),
+        provenance=_provenance(scene),
         released_s=truth.released_s,
     )
 
@@ -288,7 +207,7 @@ def _channel_indices(scene: Scene, channels: Iterable[str] | None) -> list[int]:
     return [index for index, name in enumerate(names) if name in asked]
 
 
-def _provenance(scene: Scene, by: Mapping[str, str]) -> dict[str, object]:
+def _provenance(scene: Scene) -> dict[str, object]:
     """Where the recording comes from."""
     provenance: dict[str, object] = {
         "simulated": True,
@@ -302,7 +221,7 @@ def _provenance(scene: Scene, by: Mapping[str, str]) -> dict[str, object]:
         "numpy_version": np.__version__,
     }
     if scene.fidelity == "bristles" and scene.slides:
-        provenance["integrator"] = dict(by)
+        provenance["integrator"] = integrator()
     return provenance
 
 

@@ -68,7 +68,7 @@ def write_set(folder: Path, versions: dict[str, int] | None = None) -> Path:
 
 
 def of_set(root: Path) -> list[str]:
-    """What commands are told of such a folder."""
+    """Overrides of commands for such a folder."""
     return settings(data="files", root=root, channels=CHANNELS)
 
 
