@@ -1,6 +1,6 @@
 """The hand: which tactile channels there are, in file order, and where each one sits.
 
-Section III-A of the paper (REFERENCE.md section 1). Everything that depends on the number or the
+Section III-A of the paper. Everything that depends on the number or the
 kind of channels asks a ``HandLayout``, so another hand is another layout and nothing else.
 """
 
@@ -180,9 +180,9 @@ class HandLayout:
             for finger in ("little", "ring", "middle", "index")
             for segment in ("distal", "middle", "proximal")
         ] + [("thumb", "distal"), ("thumb", "proximal")]
-        with_film = [place for place in places if place[0] == "thumb" or place[1] != "proximal"]
+        with_fast = [place for place in places if place[0] == "thumb" or place[1] != "proximal"]
         slow = [Channel(f"SG{i}", "SG", *place) for i, place in enumerate(places, 1)]
-        fast = [Channel(f"PVDF{i}", "PVDF", *place) for i, place in enumerate(with_film, 1)]
+        fast = [Channel(f"PVDF{i}", "PVDF", *place) for i, place in enumerate(with_fast, 1)]
         return cls(tuple(slow + fast))
 
     @classmethod

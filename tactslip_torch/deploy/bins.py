@@ -239,10 +239,10 @@ def described(windows: Value, detector: SlipDetector) -> tuple[Value, Value, Val
     frames = [
         Frame(
             tuple(channels),
-            is_film,
+            is_fast,
             overlap_matrix(layer.kernel(channels[0]), detector.pool.bin_samples).T.contiguous(),
         )
-        for (_, is_film), channels in alike.items()
+        for (_, is_fast), channels in alike.items()
     ]
     samples, alive, span = zip(
         *(_samples(windows, detector, frame) for frame in frames), strict=True

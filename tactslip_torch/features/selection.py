@@ -1,4 +1,4 @@
-"""Which features to keep: a t-test on class moments (paper section IV-D, REFERENCE.md section 5).
+"""Which features to keep: a t-test on class moments (paper section IV-D).
 
 Moments are gathered in passes over recordings and merge, so a ranking needs one look at each bin,
 and the ranking of a validation fold is a merge of what the other groups gathered.

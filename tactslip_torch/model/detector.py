@@ -197,7 +197,7 @@ class SlipDetector(nn.Module):
     def look_ahead(self) -> int:
         """Samples after a bin that its score needs, by the filters of the channels in use.
 
-        What comes after them may be anything; so a stream that uses films alone waits for 5
+        What comes after them may be anything; so a stream of the paper's fast channels waits for 5
         samples, 2.5 ms, and fills up the rest.
         """
         return max(self.channel_filter.reaches[i][1] for i in self.extractor.plan.channels)

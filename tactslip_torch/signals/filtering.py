@@ -1,4 +1,4 @@
-"""The Savitzky-Golay filter of a hand, the first step (paper IV-B, REFERENCE.md section 2).
+"""The Savitzky-Golay filter of a hand, the first step (paper section IV-B).
 
 Order 1 is a moving average: -3 dB at 81 Hz for the 11-sample frame of the PVDF channels and at
 17 Hz for the 51-sample frame of the SG channels. Where in its frame a sample lies is a choice of
@@ -12,7 +12,7 @@ but half a frame late.
 ``savgol_filter`` is the filter of one frame; ``ChannelFilter`` has a frame of its own for every
 channel, of whole recordings and of bins, with Savitzky-Golay's weights or others.
 
-Cutting recordings into bins, the paper's 50 ms analysis unit (REFERENCE.md section 2).
+Cutting recordings into bins, the paper's 50 ms analysis unit.
 """
 
 from __future__ import annotations

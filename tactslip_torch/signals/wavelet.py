@@ -1,11 +1,11 @@
-"""Wavelet branches of a bin (paper section IV-C, REFERENCE.md section 3), through ptwt.
+"""Wavelet branches of a bin (paper section IV-C), through ptwt.
 
 A branch is a component *reconstructed to the bin's length*: all other coefficients are set to
 zero and the transform is inverted. Every step is linear in the bin, so ``branch_matrix`` says it
 all; features use the matrix, and ``wavelet_branches`` is what the matrix is made of. A wavelet is a
 name that PyWavelets knows or, of one without a name, its four filters (``WaveletFilters``).
 
-Amplitude spectra of branches (REFERENCE.md section 3), the authors' and a clean one.
+Amplitude spectra of branches, the authors' and a clean one.
 """
 
 from __future__ import annotations
