@@ -179,7 +179,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary name beside ``path`` to write to; renamed to ``path`` when all went well.
 
     A failure leaves what was at ``path`` before, and no temporary file. What a killed process left
-    is removed, where Linux tells that it is no more.
+    is removed, where Linux reports that it is no more.
 
     Raises:
         OSError: that names the folder, if its disk is full.
@@ -207,8 +207,8 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             raise
         if isinstance(error, OSError) and error.errno != errno.ENOSPC:
             raise
-        said = f"no space left on the disk of {path.parent}; {path.name} was not written"
-        raise OSError(errno.ENOSPC, said) from error
+        message = f"no space left on the disk of {path.parent}; {path.name} was not written"
+        raise OSError(errno.ENOSPC, message) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -362,16 +362,16 @@ class Progress(tqdm):  # type: ignore[misc]
             return super().display(*args, **options)
         if time.monotonic() - self._told >= _EVERY_S:
             self._told = time.monotonic()
-            told = self.format_dict
-            of = "" if told["total"] is None else f" of {told['total']}"
+            state = self.format_dict
+            of = "" if state["total"] is None else f" of {state['total']}"
             what = (self.desc or "").removesuffix(": ").strip()
             left = (
                 ""
-                if not told["rate"] or told["total"] is None
-                else (f", {(told['total'] - told['n']) / told['rate']:.0f} s left")
+                if not state["rate"] or state["total"] is None
+                else (f", {(state['total'] - state['n']) / state['rate']:.0f} s left")
             )
             log.info(
-                "%s: %s%s%s in %.0f s%s", what, told["n"], of, self.unit, told["elapsed"], left
+                "%s: %s%s%s in %.0f s%s", what, state["n"], of, self.unit, state["elapsed"], left
             )
         return True
 
@@ -466,7 +466,7 @@ def _call(item: Any) -> Any:
 
 
 def is_first_process() -> bool:
-    """Whether this is the only process of a run, or the one that writes and speaks for all."""
+    """Whether this is the only process of a run, or the one that writes for all."""
     return process_number() == 0
 
 

@@ -19,7 +19,7 @@ from tactslip_torch.data.labels import (
 from tactslip_torch.data.recording import Timeline
 
 RATE = 2000.0
-ONSETS = (2.0, 9.0, 13.5)  # REFERENCE.md section 1, with slides of 100 mm at 20, 40, 60 mm/s
+ONSETS = (2.0, 9.0, 13.5)  # as in the paper, with slides of 100 mm at 20, 40, 60 mm/s
 SLIDES = ((2.0, 7.0), (9.0, 11.5), (13.5, 13.5 + 100 / 60))
 DURATION = 15.5
 HALF = LabelRule(layout="half_second")

@@ -8,7 +8,7 @@ const ROOM = 1.25; // height of a lane, in ranges of these
 const LEAST = 0.04; // of the highest lane of a kind: what rests is not made to look busy
 const HEIGHT = { marks: 14, title: 20, gap: 10, status: 12, trace: 54, axis: 18 }; // CSS pixels
 const LANE = 12; // least height
-const FILM = 2; // lanes of films are so much higher than others
+const FAST = 2; // lanes of fast channels are so much higher than others
 
 /**
  * What stands in the middle of each channel's lane, and how much its height is, in the samples' unit.
@@ -94,7 +94,7 @@ export function leastHeight(facts) {
 }
 
 function share(kind) {
-  return kind === "PVDF" ? FILM : 1;
+  return kind === "PVDF" ? FAST : 1;
 }
 
 function fixed(facts) {

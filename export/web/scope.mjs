@@ -12,7 +12,7 @@ import {
   withUnit,
 } from "./lanes.mjs";
 
-const COLOURS = "ink muted grid panel gauge rest slip pale alarm hatch".split(" ");
+const COLOURS = "ink muted grid panel slow rest slip pale alarm hatch".split(" ");
 const FONT = "10px system-ui, sans-serif";
 const TITLE = "600 11px system-ui, sans-serif";
 const [LEFT, RIGHT] = [[60, 120], 46]; // widths of the margins; the left one by the longest name
@@ -172,7 +172,7 @@ export class Scope {
     if (isKnown) fill(isOn ? colours.slip : colours.rest, status);
     if (isKnown && history.isDoubtful(now)) for (const p of traces) fill(this.#hatch, p);
     for (const group of groups) {
-      const colour = group.kind === "SG" ? colours.gauge : isOn ? colours.slip : colours.rest;
+      const colour = group.kind === "SG" ? colours.slow : isOn ? colours.slip : colours.rest;
       for (const channel of group.members) {
         const top = this.panels.centre[channel] - group.lane / 2;
         const lost = isKnown && history.isLost(now, channel);

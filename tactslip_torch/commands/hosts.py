@@ -9,7 +9,7 @@ from pathlib import Path
 from tactslip_torch.commands.packaged import copy_host, host_names
 
 
-def add_sample(page: Path) -> None:
+def _add_sample(page: Path) -> None:
     """Put the pretrained detector as ``stream.onnx``, and the sample recording, beside the page."""
     from tactslip_torch.deploy.export import export_detector  # of no need for --help
     from tactslip_torch.model.detector import SlipDetector
@@ -34,5 +34,5 @@ def main() -> None:
     with errors_in_one_line():
         copied = copy_host(given.name, given.folder)
         if given.name == "web":
-            add_sample(copied)
+            _add_sample(copied)
         print(f"{copied}\nhow to build and run it: {copied / 'README.md'}")

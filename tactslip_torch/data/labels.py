@@ -1,13 +1,8 @@
-"""Which bins of a recording are slip and which are not (REFERENCE.md section 1, *Labels*).
+"""Labels of the bins of a recording: slip or not.
 
-``whole_slide`` is what the authors' scripts do and the published confusion matrices fit: one second
-of non-slip before each onset, the whole slide as slip, the onset moved 10 ms earlier.
-``half_second`` is what the paper's text says: half a second on either side of each onset. Stretches
-in which the hand is handled without slip, which the paper did not record, are non-slip in both, and
-those that are known to be slip, but not since when, are slip in both.
-
-Bins that hold both labels are left out (``assign="whole"``), or get the label of most of their
-samples or of their last one, as sets of sliding windows are labelled.
+``whole_slide`` is what the authors' scripts do: one second of non-slip before each onset, the whole
+slide as slip, the onset moved 10 ms earlier. ``half_second`` is what the paper's text has: half a
+second on either side of each onset.
 """
 
 from __future__ import annotations

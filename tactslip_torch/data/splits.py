@@ -1,9 +1,6 @@
-"""Who is trained on and who is not (REFERENCE.md section 5, *Split*).
+"""Splits of recordings into training, test and held-out ones.
 
-A split gives every bin of every recording a role. The default groups by cycle, stratified by
-material: neighbouring bins of one slide never stand on both sides. Of a set with several kinds of
-scenes, a cycle is on one side in all of them; cycles of different sessions have nothing to do with
-each other. The authors' split, random over bins, is here to show
+The default groups by cycle, stratified by material; the authors' split, random over bins, shows
 what that leaks.
 """
 

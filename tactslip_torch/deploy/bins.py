@@ -232,10 +232,10 @@ def described(windows: Value, detector: SlipDetector) -> tuple[Value, Value, Val
           twice, bool and float64
     """
     used, graph = RawBin.of(detector).channels, windows.graph
-    layer, films = detector.channel_filter, set(detector.pool.hand.fast)
+    layer, fast = detector.channel_filter, set(detector.pool.hand.fast)
     alike: dict[tuple[int, bool], list[int]] = {}
     for channel in used:
-        alike.setdefault((layer.window_lengths[channel], channel in films), []).append(channel)
+        alike.setdefault((layer.window_lengths[channel], channel in fast), []).append(channel)
     frames = [
         Frame(
             tuple(channels),

@@ -1,17 +1,8 @@
 """The features of a plan: rows are formed by linear maps, brought to order one, and described.
 
-``make_plan`` tells by names and places alone which channels, branches and spectra some features
-need; what none of them needs is not read, formed or sorted. ``Bank`` carries a plan out.
-
-A channel's samples go to a few coordinates of each row (51, 27, 15 or 9 of a branch of 100 samples)
-and to its mean, in float64; filter and wavelet are one matrix by then. Here what is rounding beside
-its bin becomes exactly constant, and every row gets the length one. From these coordinates rows go
-on to branches and spectra, which are then good to rounding in any precision, and which
-``descriptors.py`` describes without a thought of extremes. All constants are float64, made from
-``branch_matrix`` and ``spectrum_matrix``, so from ptwt and torch.fft evaluated on an identity.
-
-Everything is written in operations that tensors and values of an ONNX graph share: on tensors it is
-the reference, on values it writes the graph.
+``make_plan`` finds which channels, branches and spectra some features need; ``Bank`` computes them,
+on tensors as the reference, on values of an ONNX graph to write the graph. Filter and wavelet are
+one matrix in float64; what is rounding beside its bin becomes exactly constant.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def matching(
     """Which features have, for every attribute that is named, one of its values, ``[F]``, bool.
 
     Args:
-        hand: tells kind and finger of a channel.
+        hand: gives kind and finger of a channel.
         names: of the features.
         wanted: of each attribute a value or several, such as ``{"kind": "SG"}``.
 

@@ -26,7 +26,7 @@ def is_traced() -> bool:
     return bool(is_jit or torch.compiler.is_compiling())
 
 
-def has_values(x: Tensor) -> bool:
+def _has_values(x: Tensor) -> bool:
     """Whether a decision may be taken on the values, wherever they lie and whatever comes along.
 
     Not so where a graph is recorded or ``x`` is transformed (vmap, func.grad, jvp).
@@ -141,7 +141,7 @@ def power_of_two_below(magnitude: Tensor) -> Tensor:
 
 def is_all_false(mask: Tensor) -> bool:
     """Whether a mask is known to hold nowhere, so that what depends on it can be passed over."""
-    return mask.device.type == "cpu" and has_values(mask) and not bool(mask.any())
+    return mask.device.type == "cpu" and _has_values(mask) and not bool(mask.any())
 
 
 def bounded_gradient(x: Tensor) -> Tensor:
@@ -192,7 +192,7 @@ def signed_log(features: Tensor, scale: Tensor) -> Tensor:
     size = torch.where(is_negative, -features, features)  # abs() has derivative 0 at 0
     ratio = size / scale
     bent = scale * ratio.log1p()
-    if not has_values(features) or bool(ratio.isinf().any()):
+    if not _has_values(features) or bool(ratio.isinf().any()):
         far = torch.maximum(size, scale).log() - scale.log()
         far = far.clamp(min=math.log(dtype_info.max))  # no step back where log1p ends
         bent = torch.where(ratio.isinf(), scale * far, bent)

@@ -203,7 +203,7 @@ class ChannelPooling(nn.Module):
                 n.statistic for n in self.names if n.channel == kind and n.is_pooled
             )
             groups.append(
-                PooledKind(
+                _PooledKind(
                     channels=by_kind[kind],
                     families=tuple(own),
                     columns=tuple(place[n] for i in own for n in members[self.families[i]]),
@@ -391,7 +391,7 @@ class ChannelPooling(nn.Module):
 
 
 @dataclass(frozen=True)
-class PooledKind:
+class _PooledKind:
     """What is pooled over the channels of one kind.
 
     Attributes:

@@ -35,7 +35,7 @@ FEWEST_SAMPLES = 16
 RANGE_FACTOR = 3.0
 """By which a span may lie outside those of training and still count as in range."""
 LEVEL_FACTOR = 10.0
-"""By which levels at rest must differ from those of training to be told."""
+"""By which levels at rest must differ from those of training to be reported."""
 LARGEST_SAMPLE = torch.finfo(torch.float64).max / 64
 """Volts; what is larger counts as Inf, because its branches and spectra may leave float64."""
 REST_QUANTILE = 0.01

@@ -2,7 +2,7 @@
 
 The library lies beside this file if the package was installed, or is built at the first use, into
 this folder or the user's cache. Without it (no compiler, or ``TACTSLIP_NATIVE=0``) what it does is
-done by torch; ``reason_unavailable`` tells why. ``TACTSLIP_NATIVE=v3`` uses no instruction set
+done by torch; ``reason_unavailable`` says why. ``TACTSLIP_NATIVE=v3`` uses no instruction set
 beyond AVX2, ``v2`` the one of any 64-bit processor.
 """
 

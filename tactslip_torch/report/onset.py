@@ -40,7 +40,7 @@ _WIDTH, _ROOM = 1.2, 40  # of marks, in points, as long as there are no more of 
 _INVALID: dict[str, Any] = {
     "facecolor": "none", "edgecolor": "#999999", "hatch": "////", "linewidth": 0, "zorder": 0.5,
 }  # fmt: skip
-_MOST_DELAYS = 12  # told beside their alarms
+_MOST_DELAYS = 12  # reported beside their alarms
 _ONSET: dict[str, Any] = {"color": style.INK, "linestyle": "-."}
 _RELEASE: dict[str, Any] = {"color": style.GREY, "linestyle": ":"}
 _ALARM: dict[str, Any] = {"color": style.ALARM, "linestyle": "-"}
@@ -140,7 +140,7 @@ class Traces:
         onset_score: Array,
     ) -> None:
         """Take the next decisions, each ``[m]``; without onset score it is not finite."""
-        since_s = self.view[0] - self._hop_s  # the one before the view tells the status there
+        since_s = self.view[0] - self._hop_s  # the one before the view has the status there
         is_seen = (available_s > since_s) & (available_s <= self.view[1])
         if self._first_s is None and is_seen.any():
             self._first_s = float(available_s[is_seen][0])
@@ -171,7 +171,7 @@ class DecisionCounts:
     Attributes:
         num_decisions: so far.
         num_invalid: of them, those that do not count: too few channels are alive.
-        first_positive_s: of each onset, the first decision from it on that speaks for slip; NaN.
+        first_positive_s: of each onset, the first decision from it on that is slip; NaN.
     """
 
     def __init__(self, onsets_s: Sequence[float] = ()) -> None:
@@ -457,18 +457,20 @@ def _draw_channels(axes: Axes, traces: Traces, slips: Segments) -> None:
     axes.set_yticks(middles, list(traces.channels), fontsize=7)
     axes.set_ylim(middles[-1] - 0.8, 0.8)
     axes.grid(visible=False)
-    told = ", ".join(f"{kind} {high:.2g} {traces.units}".strip() for kind, high in heights.items())
-    axes.set_ylabel(f"channels; distance of lanes: {told}")
+    heights_shown = ", ".join(
+        f"{kind} {high:.2g} {traces.units}".strip() for kind, high in heights.items()
+    )
+    axes.set_ylabel(f"channels; distance of lanes: {heights_shown}")
 
 
 def _tell_delays(axes: Axes, alarms: Sequence[Mapping[str, Any]]) -> None:
     """How late each alarm came, beside its line, where there is place for it."""
     first, last = axes.get_xlim()
     known = [alarm for alarm in alarms if alarm.get("delay_s") is not None]
-    told = [alarm for alarm in known if first <= alarm["alarm_s"] <= last]
+    inside = [alarm for alarm in known if first <= alarm["alarm_s"] <= last]
     look: dict[str, Any] = {"color": style.ALARM, "fontsize": 8, "va": "bottom"}
     look |= {"xycoords": axes.get_xaxis_transform(), "textcoords": "offset points"}
-    for alarm in told if len(told) <= _MOST_DELAYS else ():
+    for alarm in inside if len(inside) <= _MOST_DELAYS else ():
         text = f"{1000 * alarm['delay_s']:+.0f} ms"
         axes.annotate(text, (alarm["alarm_s"], 1.0), xytext=(4, 2), **look)
 

@@ -1,8 +1,7 @@
 """The paper's results, as constants that tables and figures put beside ours.
 
-Source: He et al. 2026, arXiv:2603.18370, section V (REFERENCE.md section 6). Two things to know
-when comparing: the paper splits at random over *bins*, so neighbouring bins of one slide lie on
-both sides of its train/test split; and its features were ranked on all bins.
+Source: He et al. 2026, arXiv:2603.18370, section V. The paper splits at random over bins, so
+neighbouring bins of one slide lie on both sides, and its features were ranked on all bins.
 """
 
 from __future__ import annotations
