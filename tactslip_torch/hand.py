@@ -35,12 +35,12 @@ class Channel:
         finger: the finger it sits in, such as ``"index"``.
         segment: the part of the finger, such as ``"distal"``.
         adapting: ``"slow"`` or ``"fast"``; decides the features of the channel. What the kind
-            implies if it is one of ``KNOWN_KINDS`` and nothing else is said; never ``None`` once
+            implies if it is one of ``KNOWN_KINDS`` and nothing else is given; never ``None`` once
             the channel is made.
 
     Raises:
         ValueError: if a name is no text, the kind is no single word, or how the channel adapts
-            is neither said nor known.
+            is neither given nor known.
 
     Example:
         >>> Channel("SG1", "SG", "index", "distal").adapting

@@ -50,7 +50,7 @@ class Rows:
         is_sorted: whether ``ascending`` is asked for, so that ``ranked`` may take it.
 
     Shape:
-        - values, film, amplitude: ``[*, R, n]``; mean, unit, scale: ``[*, R]``;
+        - values, filtered, amplitude: ``[*, R, n]``; mean, unit, scale: ``[*, R]``;
           frequency_hz: ``[n]``
     """
 
@@ -59,7 +59,7 @@ class Rows:
     unit: Tensor
     num: int
     scale: Tensor
-    film: Tensor | None = None
+    filtered: Tensor | None = None
     amplitude: Tensor | None = None
     frequency_hz: Tensor | None = None
     is_sorted: bool = False
@@ -74,7 +74,7 @@ class Rows:
             mean=taken(self.mean, index, -1),
             unit=taken(self.unit, index, -1),
             scale=taken(self.scale, index, -1),
-            film=None if self.film is None else taken(self.film, index, -2),
+            filtered=None if self.filtered is None else taken(self.filtered, index, -2),
             amplitude=None if self.amplitude is None else taken(self.amplitude, index, -2),
         )
 

@@ -54,7 +54,7 @@ from tactslip_torch.signals.wavelet import (
 
 Arithmetic = Literal["double", "native"]
 NATIVE_SPAN = 2.0**-10
-"""Part of a film's magnitude; in float32 throughout, less may be lost in a branch."""
+"""Part of a fast channel's magnitude; in float32 throughout, less may be lost in a branch."""
 LEAST_SPAN = {torch.float32: 2.0**-17, torch.float64: 2.0**-22}
 """Part of the largest raw sample within reach that a filtered span must exceed, by the dtype of the
 raw samples: 64 roundings of float32; of float64, what leaves seven digits to a filtered sample."""
@@ -249,8 +249,8 @@ class FeaturePool(nn.Module):
         x = self.widen(bins)
         if x.dtype not in self._banks:
             frames = [
-                Frame(tuple(sorted(own)), is_film)
-                for is_film, kind in ((False, self.hand.slow), (True, self.hand.fast))
+                Frame(tuple(sorted(own)), is_fast)
+                for is_fast, kind in ((False, self.hand.slow), (True, self.hand.fast))
                 if (own := set(kind).intersection(self.plan.channels))
             ]
             self._banks[x.dtype] = Bank(self.maps, self.plan, frames, x.dtype)
@@ -323,8 +323,8 @@ class FeaturePool(nn.Module):
             span = LEAST_SPAN[given] if is_raw else 64 * torch.finfo(given).eps
             least = [span] * len(self.hand)
             if self.arithmetic == "native" and given == torch.float32:
-                for film in self.hand.fast:
-                    least[film] = NATIVE_SPAN
+                for channel in self.hand.fast:
+                    least[channel] = NATIVE_SPAN
             with torch.inference_mode(False):  # it may be needed for a gradient later
                 inverse = torch.tensor(least, dtype=torch.float64, device="cpu").reciprocal()
             self._inverses[given, is_raw] = inverse

@@ -240,7 +240,7 @@ def branch_matrix(
         return wavelet_branches(identity, wavelet, level, mode).movedim(0, -1).contiguous()
 
 
-class WaveletSteps(NamedTuple):
+class _WaveletSteps(NamedTuple):
     """``branch_matrix`` in steps through the coefficients, whose matrices are narrow bands.
 
     Args:
@@ -264,7 +264,7 @@ def wavelet_steps(
     wavelet: Wavelet = "rbio2.2",
     level: int = 4,
     mode: ExtensionMode = "symmetric",
-) -> WaveletSteps:
+) -> _WaveletSteps:
     """The steps from a bin to its branches, float64. Do not write into them.
 
     Raises:
@@ -285,7 +285,7 @@ def wavelet_steps(
         for kept in ([one, 0 * one], [0 * one, one]):
             branch = waverec([*kept, *finer], filters)[..., :num_samples]
             out.append(branch.T.contiguous())
-    return WaveletSteps(tuple(low), tuple(high), tuple(out))
+    return _WaveletSteps(tuple(low), tuple(high), tuple(out))
 
 
 SpectrumMethod = Literal["reference", "clean"]
