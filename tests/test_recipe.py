@@ -8,7 +8,6 @@ import torch
 from scipy.stats import ttest_ind
 from small_set import SMALL_HAND, SmallSet, refitted_scores, small_maker, small_recipe
 
-from tactslip_torch.analysis.pareto import ParetoSearch
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.groups import matching
@@ -265,8 +264,6 @@ def test_a_filter_is_never_silently_ignored(rng):
     recipe = Recipe(num_features=3, feature_filter={"kind": "SG"})
     with pytest.raises(ValueError, match=r"needs the names of features; hand over the pool"):
         planning.plan_detector(recipe, told_apart(rng, SMALL_POOL))
-    with pytest.raises(ValueError, match=r"recipe.feature_filter is not for a search"):
-        ParetoSearch({}, None, None, recipe)
     maker = small_maker(SmallSet())
     for wanted, message in (
         ({"descriptor": "meen"}, "no feature has descriptor='meen', expected some of mean, median"),

@@ -305,7 +305,5 @@ TIME_DESCRIPTORS = (*COMMON_DESCRIPTORS, "correlation")
 SPECTRUM_DESCRIPTORS = (*COMMON_DESCRIPTORS, *tuple(DESCRIPTORS)[14:])
 SORTED = ("median", "mode", "iqr")
 """Descriptors of sorted values."""
-ORDERED = (*SORTED, "entropy")
-"""Descriptors of the distribution of the values of a row."""
 STEPPED = ("mode", "entropy")
 """Descriptors that step where a value moves; of float64 values, whatever the dtype of others."""

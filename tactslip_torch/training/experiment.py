@@ -143,7 +143,7 @@ def feature_maker(
 
 
 def features_of(
-    detector: SlipDetector, source: RecordingSource, rule: LabelRule, cache: FeatureCache
+    detector: SlipDetector, source: RecordingSource, rule: LabelRule, cache: FeatureCache | None
 ) -> FeatureMaker:
     """The features of a detector, computed as in its training."""
     dtype = DTYPES[detector.info.get("features_dtype", "float64")]
