@@ -136,8 +136,8 @@ def _run(commands: list[list[str]]) -> None:
         subprocess.Popen(c, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         for c in commands
     ]
-    for process, output in [(process, process.communicate()[0]) for process in running]:
+    for process, said in [(process, process.communicate()[0]) for process in running]:
         if process.returncode:
-            lines = [line for line in output.splitlines() if "error" in line] or output.splitlines()
+            lines = [line for line in said.splitlines() if "error" in line] or said.splitlines()
             what = lines[0].strip() if lines else f"status {process.returncode}"
             raise OSError(f"{commands[0][0]} failed: {what}; {REMEDY}")
