@@ -156,13 +156,6 @@ def _mcap(path: Path) -> Array:
         return _decoded([(message.data, schema.name) for schema, _, message in messages if schema])
 
 
-def _rosbag2(path: Path) -> Array:
-    from rosbags.rosbag2 import Reader
-
-    with Reader(path) as bag:
-        return _decoded([(raw, connection.msgtype) for connection, _, raw in bag.messages()])
-
-
 def _decoded(messages: list[tuple[bytes, str]]) -> Array:
     from rosbags.typesys import Stores, get_typestore
 
@@ -181,7 +174,6 @@ _LIBRARIES: dict[str, tuple[str, Callable[[Path], Array]]] = {
     "hdf5": ("h5py", _hdf5),
     "mat": ("scipy.io.loadmat", _mat),
     "mcap": ("mcap and rosbags", _mcap),
-    "rosbag2": ("rosbags", _rosbag2),
     "parquet": ("pyarrow.parquet", _parquet),
 }
 """By the format: its library, and all samples ``[C, T]`` by it."""

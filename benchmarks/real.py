@@ -592,7 +592,6 @@ def _through_detect(detector: SlipDetector, file: Path, config: DictConfig, fold
     detector.save(folder / "detector.pt")
     given = composed("detect", [f"model='{folder / 'detector.pt'}'", f"input='{file}'"])
     OmegaConf.update(given, "reading", config.data.reading, force_add=True)
-    OmegaConf.update(given, "tare_s", config.data.tare_s, force_add=True)
     detect(given, folder)
 
 

@@ -63,22 +63,34 @@ def test_check_lists_every_problem_and_warning(tmp_path, capsys):
         assert line.startswith(f"problem: {place}: ")
         assert what in line
     assert lines[len(expected) :] == [
+        "warning: manifest.csv:2: 0.csv: b never changes, it is 2.5 throughout",
         "warning: manifest.csv:2: 0.csv: c is not finite in 10 samples, first at 0.2000 s; leave "
         "the stretch out as missing_s, or repair it",
-        "warning: manifest.csv:2: 0.csv: b never changes, it is 2.5 throughout",
         "channels: a, b, c",
         "3 recordings of 2 materials, 9.0 s, 3 channels at 200 Hz in V: 6 problems, 2 warnings",
     ]
+
+
+@pytest.mark.parametrize(("lost", "num"), [((40, 50), 0), ((330, 340), 1), ((70, 80), 1)])
+def test_samples_that_train_refuses_are_a_problem(tmp_path, capsys, lost, num):
+    """The onset is at sample 300, non-slip is the second before, and a filter reads 25 more."""
+    content = samples(0)
+    content[2, slice(*lost)] = torch.nan
+    table(tmp_path / "a.csv", content)
+    manifest(tmp_path, "a.csv,wood,0,1.5,1.5-2.5,")
+    assert run("check", tmp_path) == num
+    line = f"{'problem' if num else 'warning'}: manifest.csv:2: a.csv: c is not finite in 10"
+    assert line in capsys.readouterr().out
 
 
 def test_a_file_that_is_damaged_in_its_samples_is_a_problem(root, capsys, monkeypatch):
     assert run("check", root, ROWS) == 0
     assert "4 recordings of 2 materials, 12.0 s, 3 channels at 200" in capsys.readouterr().out
 
-    def fails(source, recording):
+    def fails(source, recording, windows=None):
         raise ValueError("the block at byte 7 is damaged")
 
-    monkeypatch.setattr(FileRecordings, "inspect", fails)
+    monkeypatch.setattr(FileRecordings, "load", fails)
     assert run("check", root, ROWS) == 4
     assert "problem: manifest.csv:5: day 2/d.csv: the block" in capsys.readouterr().out
     assert run("check", root, ROWS, "samples=false") == 0
@@ -128,7 +140,7 @@ def test_what_was_finished_is_kept_and_what_changed_is_made_again(root, tmp_path
     text = (root / "manifest.csv").read_text()
     (root / "manifest.csv").write_text(text.replace("1.5-2.0", "1.5-1.75"))
     assert converted(root, out) == [False, True, True, True]
-    assert converted(root, out, "data.tare_s=[0,1]") == [True] * 4
+    assert converted(root, out, "data.reading.tare_s=[0,1]") == [True] * 4
 
 
 def test_the_first_that_fails_stops_it_or_is_left_out_on_request(

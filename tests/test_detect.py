@@ -265,7 +265,11 @@ REFUSED = {
     "units": (lambda: recording(units="counts"), [], "a.npz is in counts, the detector was traine"),
     "threshold": (recording, ["threshold=high"], "threshold must be a finite number, got 'high'"),
     "backend": (recording, ["backend=steam"], "steam"),
-    "tare": (recording, ["tare_s=[0,a]"], "tare_s must be [start, end] in seconds, got [0, 'a']"),
+    "tare": (
+        recording,
+        ["reading.tare_s=[0,a]"],
+        "reading.tare_s must be [start, end] in seconds",
+    ),
     "view": (recording, ["view=3"], "view must be [start, end] in seconds, got 3"),
 }
 

@@ -85,14 +85,13 @@ def noise(*shape):
 
 
 @pytest.mark.parametrize("version", PATHS)
-@pytest.mark.parametrize("isolate", [False, True])
-def test_every_episode_is_a_recording(version, isolate, tmp_path):
+def test_every_episode_is_a_recording(version, tmp_path):
     episodes = [noise(length, 4) for length in LENGTHS]
     dataset(tmp_path / "a", version, episodes, names=list(HAND.names))
     paths = recording_files(tmp_path / "a")
     assert recording_files(tmp_path, in_folders=True) == paths
-    for path, values in zip(paths[-isolate:], episodes[-isolate:], strict=True):
-        with open_file(path, Reading(isolate=isolate)) as opened:
+    for path, values in zip(paths, episodes, strict=True):
+        with open_file(path) as opened:
             assert opened.names == HAND.names
             assert (opened.archived, opened.sample_rate_hz) == (None, RATE_HZ)
             np.testing.assert_array_equal(opened.samples.read(0, 10**6).T, values)

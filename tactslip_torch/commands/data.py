@@ -12,15 +12,17 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from hydra.utils import get_object, instantiate
+from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.commands.stopping import fail, one_line
-from tactslip_torch.data.file_recordings import FileRecordings, Inspected
+from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest, write_template
 from tactslip_torch.data.manifest import Problem
 from tactslip_torch.data.recording import Recording, RecordingId
@@ -36,9 +38,11 @@ from tactslip_torch.report.recordings import (
 from tactslip_torch.report.style import SIMULATED_LINE
 from tactslip_torch.runtime import __version__, in_processes
 
-FIGURE = Path("outputs/data.png")
+_FIGURE = Path("outputs/data.png")
 _SHOWN = 5  # rows of a template
 _LEVELS_S = 30.0  # of a recording, from which levels are taken
+_BEFORE_ONSET_S = 1.01  # that the labels of train take as non-slip, unless it is told
+_CONTEXT = 25  # samples that the longest filter reads on either side of a bin
 _BIN_MS, _FEWEST = 50.0, 8  # the bin that train takes unless it is told, and samples it should have
 
 
@@ -57,7 +61,8 @@ def check(config: DictConfig) -> int:
             if isinstance(found, str):
                 problems.append(entry.problem(found))
             else:
-                warnings += map(entry.problem, found.oddities(source.hand.names))
+                problems += map(entry.problem, found.problems)
+                warnings += map(entry.problem, found.warnings)
     if config.model is not None and source.ids:
         warnings += _levels(config, source)
     for line in (*(f"problem: {p}" for p in problems), *(f"warning: {w}" for w in warnings)):
@@ -89,14 +94,13 @@ def summary(config: DictConfig) -> list[dict[str, Any]]:
         print("labels= takes up to a second before each onset as non-slip; it is not counted here")
     ranges = np.full((len(hand), 2), np.nan)
     if config.samples:
-        found = [one for _, one in _inspect_all(config, source) if isinstance(one, Inspected)]
-        if found:
-            with np.errstate(all="ignore"):
-                ranges[:, 0] = np.fmin.reduce([one.least for one in found])
-                ranges[:, 1] = np.fmax.reduce([one.greatest for one in found])
+        for _, found in _inspect_all(config, source):
+            if isinstance(found, _Inspected):
+                ranges[:, 0] = np.fmin(ranges[:, 0], found.ranges[:, 0])
+                ranges[:, 1] = np.fmax(ranges[:, 1], found.ranges[:, 1])
     print("\n" + ranges_table(hand.to_rows(), ranges, source.units))
     print("\n" + _headline(source, source.problems, source.warnings))
-    path = FIGURE if config.output is None else Path(config.output)
+    path = _FIGURE if config.output is None else Path(config.output)
     what = "SIMULATED recordings" if source.is_simulated else "Recordings"
     title = f"{what} in {source.root.resolve().name}"
     dataset_figure(trials, _example(source), hand.names, path, title=title)
@@ -181,14 +185,56 @@ def _source(config: DictConfig, **options: bool) -> FileRecordings:
     return source
 
 
+class _Inspected(NamedTuple):
+    """What the samples of a recording are.
+
+    Args:
+        ranges: ``[C, 2]``, least and greatest of each channel; NaN if none is finite.
+        problems: why ``train`` refuses it.
+        warnings: what is worth a look.
+    """
+
+    ranges: NDArray[np.float64]
+    problems: list[str]
+    warnings: list[str]
+
+
+def _inspected(source: FileRecordings, recording: RecordingId) -> _Inspected:
+    samples, times = source.load(recording).samples.double(), source.timeline(recording)
+    rate_hz = source.sample_rate_hz
+    is_there = torch.ones(samples.shape[-1], dtype=torch.bool)
+    is_needed = ~is_there  # by bins
+    for start_s, end_s in times.missing_s:
+        is_there[round(start_s * rate_hz) : round(end_s * rate_hz)] = False
+    before = [(onset - _BEFORE_ONSET_S, onset) for onset in times.annotated_onsets_s]
+    for start_s, end_s in (*before, *times.sliding_s, *times.slip_s, *times.non_slip_s):
+        first = max(round(start_s * rate_hz) - _CONTEXT, 0)
+        is_needed[first : round(end_s * rate_hz) + _CONTEXT] = True
+    found = _Inspected(np.full((len(samples), 2), np.nan), [], [])
+    for row, name, ends in zip(samples, source.hand.names, found.ranges, strict=True):
+        is_broken = ~row.isfinite() & is_there
+        if is_broken.any():
+            first_s = int(is_broken.int().argmax()) / rate_hz
+            is_refused = bool((is_broken & is_needed).any())
+            (found.problems if is_refused else found.warnings).append(
+                f"{name} is not finite in {int(is_broken.sum())} samples, first at {first_s:.4f} "
+                "s; leave the stretch out as missing_s, or repair it"
+            )
+        if len(finite := row[row.isfinite()]):
+            ends[:] = finite.min(), finite.max()
+            if ends[0] == ends[1]:
+                found.warnings.append(f"{name} never changes, it is {ends[0]:g} throughout")
+    return found
+
+
 def _inspect_all(
     config: DictConfig, source: FileRecordings
-) -> list[tuple[RecordingId, Inspected | str]]:
+) -> list[tuple[RecordingId, _Inspected | str]]:
     """What the samples of every recording are, or why they cannot be read."""
 
-    def one(recording: RecordingId) -> Inspected | str:
+    def one(recording: RecordingId) -> _Inspected | str:
         try:
-            return source.inspect(recording)
+            return _inspected(source, recording)
         except (ValueError, OSError) as error:
             return one_line(error)
 

@@ -144,7 +144,7 @@ def _detect_in(
     """One recording, also drawn: its entry, and its events where the truth is known."""
     detector, config, hand = context.detector, context.config, context.detector.pool.hand
     rate, table = detector.pool.sample_rate_hz, context.folder / f"{name}_decisions.csv"
-    given = hand_file(path, hand, rate, context.reading, context.units, config.tare_s)
+    given = hand_file(path, hand, rate, context.reading, context.units)
     columns = Decisions._fields[:-1]
     written = csv_writer(table, columns) if config.decisions else nullcontext()
     with given as opened, written as write, ExitStack() as stack:

@@ -21,7 +21,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig
 
 from tactslip_torch.commands.entry import entry_point, save_config
-from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written, write_manifest
+from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest
+from tactslip_torch.data.manifest import MANIFEST
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.features.cache import source_digest
 from tactslip_torch.report.recordings import signals_figure, view_around, written_table

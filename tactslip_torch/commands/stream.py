@@ -103,7 +103,6 @@ def _source(config: DictConfig, detector: SlipDetector) -> Source:
         Frames.of(plain_section(config.frame)),
         baud=config.baud,
         reading=Reading.of(plain_section(config.reading)),
-        tare_s=config.tare_s,
         speed=config.speed,
         repeat=config.repeat,
     )

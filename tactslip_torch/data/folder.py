@@ -18,10 +18,8 @@ from tactslip_torch.data.formats import (
     format_of,
     named_format,
 )
-from tactslip_torch.data.manifest import NAMES, write_table
+from tactslip_torch.data.manifest import MANIFEST, write_table
 from tactslip_torch.data.recording import TIMES, RecordingId, RecordingSource
-
-MANIFEST = NAMES[0]
 
 
 def recording_files(place: Path, *, in_folders: bool = False) -> list[Path]:
@@ -46,7 +44,7 @@ def recording_files(place: Path, *, in_folders: bool = False) -> list[Path]:
             found += episodes
             continue
         for path in sorted(folder.iterdir()):
-            if path.name.startswith(".") or path.name in NAMES:
+            if path.name.startswith(".") or path.name == MANIFEST:
                 continue
             if find_format(path) is not None:
                 found.append(path)
@@ -194,7 +192,6 @@ class RecordingFolder:
             content = self.source.load(recording)
             path.parent.mkdir(parents=True, exist_ok=True)
             self.format.save(path, content, self.source.hand, key)
-        inner = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
         origin = content.provenance
         line = {
             "file": path.relative_to(self.folder).as_posix(),
@@ -208,8 +205,7 @@ class RecordingFolder:
             "fidelity": origin.get("fidelity", ""),
             "seed": origin.get("seed", ""),
         }
-        num_bytes = sum(file.stat().st_size for file in inner)
-        return Written(line, made, content.duration_s, num_bytes)
+        return Written(line, made, content.duration_s, path.stat().st_size)
 
 
 def write_manifest(folder: Path, written: Sequence[Written]) -> None:
@@ -307,11 +303,9 @@ def write_template(
         ValueError: if there is a manifest already, no recording, or the pattern is none or can
             read a name in two ways.
     """
-    there = [root / name for name in NAMES] if path is None else [path]
-    for other in there:
-        if other.exists():
-            raise ValueError(f"{other} is there already; move it away, or give output=FILE")
-    path = root / NAMES[0] if path is None else path
+    path = root / MANIFEST if path is None else path
+    if path.exists():
+        raise ValueError(f"{path} is there already; move it away, or give output=FILE")
     if not root.is_dir():
         raise FileNotFoundError(f"no folder at {root}")
     found = recording_files(root, in_folders=True)

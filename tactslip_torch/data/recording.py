@@ -1,12 +1,10 @@
-"""A recording: one cycle of the protocol as the sensors gave it, with what is true of it.
-
-Where recordings come from is a ``RecordingSource``: a simulation, or files.
-"""
+"""A recording: one trial as the sensors gave it, and when slip begins and ends in it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 from torch import Tensor
@@ -82,6 +80,71 @@ class Timeline:
     released_s: tuple[Stretch, ...] = ()
     label: Label | None = None
     duration_s: float = 0.0
+
+
+def on_time(
+    truth: Timeline,
+    duration_s: float,
+    *,
+    skip_s: float = 0.0,
+    slide_s: float = 0.5,
+    slack_s: float = 0.0,
+    missing_s: Iterable[Stretch] = (),
+) -> tuple[Timeline, list[str]]:
+    """A timeline on the time of its recording, and what does not fit there.
+
+    Args:
+        truth: as it was annotated.
+        duration_s: of the recording.
+        skip_s: at the start that a label of all of it does not stand for.
+        slide_s: how long a slide lasts of which only the onset is known; it ends before that with
+            the next onset, stretch without slip, or the recording.
+        slack_s: by which a stretch may leave the recording; it is cut then.
+        missing_s: further stretches without samples, of the file.
+    """
+    problems = []
+    for name in SPANS:
+        for start, end in getattr(truth, name):
+            if start >= duration_s or (end > duration_s + slack_s and end != math.inf):
+                span = f"{start:g}-{'end' if end == math.inf else format(end, 'g')} s"
+                problems.append(f"{name}: {span} leaves the recording of {duration_s:.4g} s")
+    for name in ("onsets_s", "annotated_onsets_s"):
+        late = [onset for onset in getattr(truth, name) if onset >= duration_s]
+        problems += [f"{name}: {onset:g} s is behind the end, {duration_s:.4g} s" for onset in late]
+    if truth.label and skip_s >= duration_s:
+        problems.append(
+            f"label: of {duration_s:.4g} s nothing is left behind the first {skip_s:g} s; "
+            "lower skip_s"
+        )
+    if problems:
+        return Timeline(duration_s=duration_s), problems
+    onsets = truth.onsets_s
+    cut: dict[str, Any] = {
+        name: tuple((start, min(end, duration_s)) for start, end in getattr(truth, name))
+        for name in SPANS
+    }
+    if not cut["sliding_s"]:
+        stops = [*onsets, duration_s, *(start for start, _ in truth.non_slip_s)]
+        ends = [min([onset + slide_s, *(s for s in stops if s > onset)]) for onset in onsets]
+        cut["sliding_s"] = tuple(zip(onsets, ends, strict=True))
+    if truth.label is not None:
+        cut["slip_s" if truth.label == "slip" else "non_slip_s"] = ((skip_s, duration_s),)
+    cut["missing_s"] = tuple(sorted({*cut["missing_s"], *missing_s}))
+    speeds = truth.speeds_mm_s if len(truth.speeds_mm_s) == len(onsets) else (0.0,) * len(onsets)
+    annotated = truth.annotated_onsets_s or onsets
+    return Timeline(onsets, annotated, speeds, **cut, duration_s=duration_s), []
+
+
+def scaled(truth: Timeline, factor: float) -> Timeline:
+    """A timeline of a clock that runs ``factor`` times as fast as the one wanted."""
+    changes: dict[str, Any] = {
+        name: tuple(moment * factor for moment in getattr(truth, name))
+        for name in ("onsets_s", "annotated_onsets_s")
+    }
+    for name in SPANS:
+        spans = getattr(truth, name)
+        changes[name] = tuple((start * factor, end * factor) for start, end in spans)
+    return replace(truth, **changes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -123,7 +123,7 @@ class FeaturePool(nn.Module):
         if bin_samples > MOST_BIN_SAMPLES:
             raise ValueError(
                 f"bins have at most {MOST_BIN_SAMPLES} samples, got {bin_samples}; take shorter "
-                "bins (labels.bin_ms) or a lower rate (data.resample_hz)"
+                "bins (labels.bin_ms) or a lower rate (data.reading.resample_hz)"
             )
         check_choice("arithmetic", arithmetic, get_args(Arithmetic))
         self.hand = hand

@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from tactslip_torch.data.file_recordings import place_of
-from tactslip_torch.data.formats._names import NUMBER, number_in
+from tactslip_torch.data.formats._inference import NUMBER, number_in
 from tactslip_torch.live.sinks import Array, Block, Event, Notices, counted
 from tactslip_torch.runtime import check_choice, check_number
 

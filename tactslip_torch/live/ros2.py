@@ -30,10 +30,9 @@ from typing import Any
 
 import numpy as np
 
-from tactslip_torch.data.formats import Reading
-from tactslip_torch.data.formats._choice import unit_of_time
+from tactslip_torch.data.formats import Reading, Refused
+from tactslip_torch.data.formats._inference import SECONDS, time_unit_in
 from tactslip_torch.data.formats._messages import Message, Topic, TopicColumns, Types
-from tactslip_torch.data.formats._reading import SECONDS, Refused
 from tactslip_torch.live.sinks import Block, Event, Sink
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import Decisions
@@ -91,7 +90,10 @@ class TopicMessages:
             return Event("garbage", f"a message on {self._topic.name} was passed over: {said}")
         time_s = stamp / 1e9 if stamp else None
         if named is not None:
-            time_s = float(named) * SECONDS[unit_of_time(self._columns.time_name, self._how)]
+            time_s = (
+                float(named)
+                * SECONDS[self._how.time_unit or time_unit_in(self._columns.time_name) or "s"]
+            )
         if time_s is None:
             return Block(samples)
         begin_s = self._followed(time_s)

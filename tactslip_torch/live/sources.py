@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -346,8 +346,7 @@ class FileInTime:
     Args:
         path: of any format that ``data.formats`` knows.
         detector: whose channels, rate and unit it has.
-        reading: what the file does not say.
-        tare_s: stretch whose mean is taken off each channel, as for training.
+        reading: what the file does not say, and what was done for training.
         speed: times faster than real time; ``None``: as fast as it is taken.
         repeat: whether it begins again at its end.
 
@@ -368,7 +367,6 @@ class FileInTime:
         detector: SlipDetector,
         reading: Reading | None = None,
         *,
-        tare_s: Sequence[float] | None = None,
         speed: float | None = 1.0,
         repeat: bool = False,
     ) -> None:
@@ -377,7 +375,7 @@ class FileInTime:
         pool, self.name = detector.pool, f"file:{path.name}"
         self._rate, self._speed, self._repeat = pool.sample_rate_hz, speed, repeat
         how, units = reading or Reading(), str(detector.info.get("units", "V"))
-        self._given = (path, pool.hand, self._rate, how, units, tare_s)
+        self._given = (path, pool.hand, self._rate, how, units)
         self._stopped = threading.Event()
         with hand_file(*self._given) as opened:
             self.recording = opened.archived and opened.archived.recording
@@ -424,7 +422,6 @@ def source_of(
     *,
     baud: int = 115200,
     reading: Reading | None = None,
-    tare_s: Sequence[float] | None = None,
     speed: float | None = 1.0,
     repeat: bool = False,
 ) -> Source:
@@ -437,7 +434,6 @@ def source_of(
         frames: how samples are written, but of a file.
         baud: of ``SerialPort``.
         reading: of ``FileInTime`` and ``RosTopic``.
-        tare_s: of ``FileInTime``, as are ``speed`` and ``repeat``.
         speed: times faster than real time; ``None``: as fast as it is taken.
         repeat: whether the file begins again at its end.
 
@@ -462,4 +458,4 @@ def source_of(
     path = Path(text)
     if not path.exists():
         raise FileNotFoundError(f"no file at {text}; source is {KINDS}")
-    return FileInTime(path, detector, reading, tare_s=tare_s, speed=speed, repeat=repeat)
+    return FileInTime(path, detector, reading, speed=speed, repeat=repeat)

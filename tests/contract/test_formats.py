@@ -1,6 +1,5 @@
 """Files: ours there and back, other people's as they meant them, by stretches; or one line."""
 
-import contextlib
 import importlib.util
 import json
 import os
@@ -43,7 +42,7 @@ from tactslip_torch.data.formats import endings, find_format, format_of, pieces
 
 from .names import FORMATS, INSTALL_FORMATS, Reading, named_format, open_file, rate_in_set
 
-ENDINGS = ("npz", "csv", "txt", "h5", "mat", "mcap", "parquet", "bag2")
+ENDINGS = ("npz", "csv", "txt", "h5", "mat", "mcap", "parquet")
 ALIKE = ("npy", "tsv", "dat", "lvm", "hdf5", "he5")
 KEY = {"scene": {"seed": 3}, "list": [1, None]}
 FLOATS = "std_msgs/msg/Float64MultiArray"
@@ -190,21 +189,6 @@ def test_what_cannot_be_kept_is_refused_and_nothing_is_lost(tmp_path, ending):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_folder_is_replaced_only_if_it_is_a_bag(tmp_path):
-    form, bag = named_format("bag2"), tmp_path / "bag #1?%41 ü.bag2"
-    form.save(bag, recording(), hand_of("ab"), {"n": 1})
-    form.save(bag, recording(), hand_of("ab"), {"n": 2})
-    assert form.load(bag).key == {"n": 2}
-    (tmp_path / "home").mkdir()
-    (tmp_path / "home" / "thesis.tex").write_text("years of work")
-    (tmp_path / "file").write_text("a file")
-    (tmp_path / "link").symlink_to(bag)
-    for name in ("home", "file", "link"):
-        with pytest.raises(ValueError, match="give another name"):
-            form.save(tmp_path / name, recording(), hand_of("ab"), {})
-    assert (tmp_path / "home" / "thesis.tex").read_text() == "years of work"
-
-
 def test_libraries_alone_read_ours(tmp_path):
     wanted, hand = recording(), hand_of(["a", "Fö"])
     samples = wanted.samples.numpy()
@@ -231,12 +215,11 @@ def test_libraries_alone_read_ours(tmp_path):
     with (tmp_path / "a.mcap").open("rb") as file:
         kinds = {(s.name, c.topic) for s, c, _ in make_reader(file, True).iter_messages()}
     assert kinds == {(FLOATS, "/tactile")}
-    for name in ("a.mcap", "a.bag2"):
-        with AnyReader([tmp_path / name]) as reader:
-            sent = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()]
-        assert [axis.label for axis in sent[0].layout.dim] == ["samples", "channels"]
-        joined = np.concatenate([message.data.reshape(-1, 2) for message in sent])
-        np.testing.assert_array_equal(joined.T, samples)
+    with AnyReader([tmp_path / "a.mcap"]) as reader:
+        sent = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()]
+    assert [axis.label for axis in sent[0].layout.dim] == ["samples", "channels"]
+    joined = np.concatenate([message.data.reshape(-1, 2) for message in sent])
+    np.testing.assert_array_equal(joined.T, samples)
 
 
 def test_ours_saved_again_by_others_are_ours(tmp_path):
@@ -254,25 +237,23 @@ def test_ours_saved_again_by_others_are_ours(tmp_path):
         assert_truth(archived, wanted, hand)
 
 
-@pytest.mark.parametrize("ending", ["npz", "csv", "h5", "mcap", "parquet", "bag2"])
+@pytest.mark.parametrize("ending", ["npz", "csv", "h5", "mcap", "parquet"])
 def test_a_damaged_sample_of_ours_is_noticed(tmp_path, ending):
     """MAT files of version 5 keep no check sums; all others must notice, or text be no number."""
     form, path = named_format(ending), tmp_path / f"a.{ending}"
     form.save(path, recording(), hand_of("ab"), KEY)
-    inner = path / "recording.db3" if path.is_dir() else path
-    whole, values = inner.read_bytes(), recording().samples.numpy()
+    whole, values = path.read_bytes(), recording().samples.numpy()
     plain = {
         "csv": repr(float(values[0, 700])).encode(),
         "mcap": values[:, 700].tobytes(),
-        "bag2": values[:, 700].tobytes(),
     }.get(ending, values[0, 700:703].tobytes())
     turned = bytearray(whole)
     turned[turned.index(plain) + 2] ^= 0x40
     for content in (bytes(turned), *(whole[: len(whole) * part // 100] for part in (19, 57, 95))):
-        inner.write_bytes(content)
+        path.write_bytes(content)
         with pytest.raises(ValueError, match=f"a.{ending}"):
             form.load(path)
-    inner.write_bytes(turned)
+    path.write_bytes(turned)
     with pytest.raises(ValueError, match=f"a.{ending}"), open_file(path) as opened:
         opened.samples.read(0, 1234)
     assert form.is_ours(path)
@@ -282,8 +263,8 @@ def test_a_damaged_sample_of_ours_is_noticed(tmp_path, ending):
 
 
 def test_formats_are_known_by_their_ending(tmp_path):
-    wanted = {*ENDINGS, *ALIKE} - {"bag2"}
-    assert wanted == {*endings()} - {"bag2"}
+    wanted = {*ENDINGS, *ALIKE}
+    assert wanted == {*endings()}
     for ending in wanted:
         assert find_format(tmp_path / f"A.{ending.upper()}") is named_format(ending)
     assert find_format(tmp_path / "a.png") is find_format(tmp_path / ".csv") is None
@@ -294,7 +275,7 @@ def test_formats_are_known_by_their_ending(tmp_path):
         named_format("png")
 
 
-@pytest.mark.parametrize("ending", [e for e in ENDINGS if e != "bag2"])
+@pytest.mark.parametrize("ending", ENDINGS)
 def test_what_is_no_such_file_is_one_line(tmp_path, ending):
     path = tmp_path / f"a.{ending}"
     junk = [b"", bytes(5000), b"to be or not to be\n" * 50, b"\x89PNG\r\n\x1a\n" + bytes(99)]
@@ -641,21 +622,6 @@ def test_a_message_lost_from_an_mcap_file_is_noticed(tmp_path, monkeypatch):
     )
     path = write_mcap(tmp_path / "a.mcap", [wrenches(7)[0]])
     assert "holds 7 messages, where its metadata say 8" in refused(path)
-
-
-def test_a_byte_of_a_mat_file_that_states_a_size_ends_no_process(tmp_path):
-    """The tag of the sizes of a matrix with a size of 0 killed Python in SciPy's reader."""
-    values = {"volts": noise(9, 2), "a": {"b": np.array(["x", "yz"], "O")}, "t": 1 + 2j}
-    scipy.io.savemat(tmp_path / "a.mat", values)
-    content = (tmp_path / "a.mat").read_bytes()
-    path, counts = tmp_path / "b.mat", [0, 0]
-    for place in range(128, len(content)):
-        for value in (0, 255):
-            path.write_bytes(content[:place] + bytes([value]) + content[place + 1 :])
-            with contextlib.suppress(ValueError), open_file(path) as opened:
-                opened.samples.read(0, 9)
-                counts[value > 0] += 1
-    assert all(counts)
 
 
 # Arrays: NumPy, HDF5, MAT, Parquet -------------------------------------------------------------
@@ -1010,7 +976,7 @@ def test_a_cut_mcap_file_is_refused_with_its_remedy(tmp_path):
 
 # Libraries that are not there ------------------------------------------------------------------
 
-NEEDED = {"a.h5": "h5py", "a.mcap": "mcap", "a.bag2": "rosbags", "a.parquet": "pyarrow"}
+NEEDED = {"a.h5": "h5py", "a.mcap": "mcap", "a.parquet": "pyarrow"}
 
 
 @pytest.mark.parametrize("name", NEEDED)
@@ -1024,31 +990,6 @@ def test_an_absent_library_is_one_line_with_its_remedy(tmp_path, monkeypatch, na
     with pytest.raises(ValueError, match=f"needs {library}, which is not installed") as caught:
         named_format(name[2:]).save(tmp_path / name, recording(), hand_of("ab"), KEY)
     assert INSTALL_FORMATS in str(caught.value)
-
-
-# Files from strangers --------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_isolated_reading_gives_the_same_or_is_refused_in_a_line(tmp_path):
-    path = write_mcap(tmp_path / "a.mcap", [wrenches(50)[0]])
-    wanted, found = read(path), read(path, Reading(isolate=True))
-    assert torch.equal(found[0], wanted[0])
-    assert found[1] == wanted[1]
-    np.testing.assert_allclose(found[2], wanted[2], rtol=0, atol=1e-15)
-    named_format("h5").save(tmp_path / "a.h5", recording(), hand_of("ab"), KEY)
-    with open_file(tmp_path / "a.h5", Reading(isolate=True)) as opened:
-        assert_truth(opened.archived, recording(), hand_of("ab"))
-        assert torch.equal(opened.samples.read(100, 200), recording().samples[:, 100:200])
-    (tmp_path / "c.csv").write_text("t,a,label\n0,1,1\n1,2,0\n")
-    with open_file(tmp_path / "c.csv", Reading(isolate=True)) as opened:
-        assert (opened.names, opened.left_out) == (("a",), ("label",))
-    (tmp_path / "b.csv").write_text("t,a\n0,1\n1,two\n")
-    assert "line 3" in refused(tmp_path / "b.csv", Reading(isolate=True))
-    path = tmp_path / "a.mat"
-    scipy.io.savemat(path, {"x": np.random.default_rng(0).random((2, 2**22))})
-    assert "memory" in refused(path, Reading(isolate=True, isolate_gib=0.01))
-    assert "0.01 s" in refused(path, Reading(isolate=True, isolate_s=0.01))
 
 
 def test_a_rate_with_a_small_error_is_the_round_one(tmp_path):

@@ -1,43 +1,28 @@
-"""Recordings in files: NumPy, text, HDF5, MAT, Parquet, MCAP and rosbag2, through one door.
+"""Recordings in files: NumPy, text, HDF5, MAT, Parquet, MCAP, and rosbag2 and LeRobot to read.
 
-Episodes of LeRobot datasets are read as well, each as if it were a file (``_lerobot``).
-
-Whatever a library raises of a file becomes one line that names it; nothing in a file is executed;
-what it claims is held against its size before anything is allocated; files are written to a
-temporary name and renamed. ``reading.isolate`` reads in a process of its own, with a limit of
-memory and of time, since libraries written in C may be kept busy for ever, take all memory or die
-of a file made on purpose. It costs the start of a Python with torch, a few seconds a file.
+Whatever a library raises of a file becomes one line that names it. Nothing in a file is executed,
+and what it claims is held against its size before anything is allocated; beyond that the libraries
+are trusted. Files are written to a temporary name and renamed.
 """
 
 from __future__ import annotations
 
 import importlib
-import json
-import os
-import signal
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
-from tactslip_torch.data.formats import _lerobot
+from tactslip_torch.data.formats import _parquet
+from tactslip_torch.data.formats._inference import Refused
 from tactslip_torch.data.formats._reading import (
-    MOST_WHOLE,
     Archived,
     Opened,
     Reading,
-    Refused,
     Samples,
     guarded,
     header_of,
-    opened_from,
     pieces,
     unfolded,
 )
@@ -51,6 +36,7 @@ __all__ = [
     "Format",
     "Opened",
     "Reading",
+    "Refused",
     "Samples",
     "endings",
     "episodes_of",
@@ -73,7 +59,7 @@ class Format:
         endings: of its files, the first that of files that are written.
         module: the adapter, with its functions ``write`` and ``read``.
         kind: behind the names of these functions, where a module serves several formats.
-        is_folder: whether a recording is a folder, known by ``metadata.yaml``.
+        is_folder: whether a recording is a folder, known by ``metadata.yaml``; only read.
     """
 
     name: str
@@ -88,7 +74,7 @@ class Format:
         """Write a recording, whole or not at all; equal input, equal bytes.
 
         Args:
-            path: of the file or folder.
+            path: of the file.
             recording: samples in float32 or float64; tuples in its provenance come back as lists.
             hand: its channels, in the order of its rows.
             key: JSON-able metadata that determined the samples, kept to find the file again.
@@ -100,18 +86,18 @@ class Format:
         """
         header = header_of(recording, hand, key)
         samples = recording.samples.detach().cpu().contiguous().numpy()
-        with (_whole_folder if self.is_folder else whole_file)(path) as temporary:
+        with whole_file(path) as temporary:
             try:
                 self._adapter("write")(temporary, samples, header)
             except Refused as error:
                 raise Refused(f"{path} {error}".replace(str(temporary), str(path))) from None
 
     def load(self, path: Path) -> Archived:
-        """Read a recording of ours, bit for bit (of text a NaN is a NaN).
+        """Read a package file, bit for bit (of text a NaN is a NaN).
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: if it is damaged or no file of ours.
+            ValueError: if it is damaged or no package file.
         """
         with self.open(path) as opened:
             if opened.archived is None:
@@ -121,17 +107,17 @@ class Format:
             return opened.archived._replace(recording=recording)
 
     def is_ours(self, path: Path) -> bool:
-        """Whether a file is ours, even one that is damaged: only such may be replaced."""
+        """Whether a file is a package file, even one that is damaged: only such may be replaced."""
         try:
             with self.open(path) as opened:
                 return opened.archived is not None
         except ValueError:
-            files = [f for f in path.rglob("*") if f.is_file()] if path.is_dir() else [path]
-            return any(b"tactslip_torch" in f.read_bytes().replace(b"\0", b"") for f in files)
+            is_file = path.is_file()
+            return is_file and b"tactslip_torch" in path.read_bytes().replace(b"\0", b"")
 
     @contextmanager
     def open(self, path: Path, how: Reading | None = None) -> Iterator[Opened]:
-        """Open a file, ours or another's, to read its samples by stretches.
+        """Open a file, native or foreign, to read its samples by stretches.
 
         Args:
             path: of the file or folder.
@@ -146,8 +132,8 @@ class Format:
         with ExitStack() as stack:
             with guarded(path):
                 self._check(path)
-                opened = (_isolated if how.isolate else self._adapter("read"))(path, how, stack)
-                if opened.archived is None and not how.isolate:
+                opened = self._adapter("read")(path, how, stack)
+                if opened.archived is None:
                     if how.speed is not None and opened.speed is None:
                         raise Refused(f"is of {self.name}, of which reading.speed is not read")
                     if how.samples_per_row > 1:
@@ -176,21 +162,21 @@ class Format:
                 raise Refused("is a Git LFS pointer, not the file itself; run: git lfs pull")
 
 
+_LFS = b"version https://git-lfs.github.com/spec/"
 FORMATS = {
     form.name: form
     for form in (
-        Format("npz", ("npz", "npy"), "_npz"),
+        Format("npz", ("npz", "npy"), "_arrays", "_npz"),
         Format("text", ("csv", "tsv", "txt", "dat", "lvm"), "_text"),
-        Format("hdf5", ("h5", "hdf5", "he5"), "_hdf5"),
-        Format("mat", ("mat",), "_mat"),
+        Format("hdf5", ("h5", "hdf5", "he5"), "_arrays", "_hdf5"),
+        Format("mat", ("mat",), "_arrays", "_mat"),
         Format("mcap", ("mcap",), "_messages", "_mcap"),
         Format("parquet", ("parquet",), "_parquet"),
-        Format("rosbag2", ("bag2",), "_messages", "_rosbag2", is_folder=True),
     )
 }
-"""By name; all can be written."""
-_LFS = b"version https://git-lfs.github.com/spec/"
-_EPISODE = Format("LeRobot", (_lerobot.ENDING[1:],), "_lerobot")
+"""By name; all are written and read."""
+_BAG = Format("rosbag2", ("bag2",), "_messages", "_rosbag2", is_folder=True)
+_EPISODE = Format("LeRobot", (_parquet.EPISODE_ENDING[1:],), "_parquet", "_episode")
 
 
 def episodes_of(folder: Path) -> list[Path] | None:
@@ -200,7 +186,7 @@ def episodes_of(folder: Path) -> list[Path] | None:
         ValueError: if it is a damaged one.
     """
     with guarded(folder):
-        return _lerobot.episodes_of(folder) if _lerobot.is_dataset(folder) else None
+        return _parquet.episodes_of(folder) if _parquet.is_dataset(folder) else None
 
 
 def is_there(path: Path) -> bool:
@@ -215,7 +201,7 @@ def file_of(path: Path) -> Path:
         ValueError: if there is no such episode.
     """
     with guarded(path):
-        return _lerobot.table_of(path) if find_format(path) is _EPISODE else path
+        return _parquet.table_of(path) if find_format(path) is _EPISODE else path
 
 
 def endings() -> tuple[str, ...]:
@@ -226,11 +212,11 @@ def endings() -> tuple[str, ...]:
 def find_format(path: Path) -> Format | None:
     """The format of a file, or of a folder that is a bag; None if there is none."""
     if path.is_dir():
-        return FORMATS["rosbag2"] if (path / "metadata.yaml").is_file() else None
-    if path.suffix == _lerobot.ENDING and _lerobot.is_dataset(path.parent):
+        return _BAG if (path / "metadata.yaml").is_file() else None
+    if path.suffix == _parquet.EPISODE_ENDING and _parquet.is_dataset(path.parent):
         return _EPISODE
     ending = "" if path.name.startswith(".") else path.suffix[1:].lower()
-    return next((f for f in FORMATS.values() if ending in f.endings and not f.is_folder), None)
+    return next((form for form in FORMATS.values() if ending in form.endings), None)
 
 
 def format_of(path: Path) -> Format:
@@ -266,131 +252,3 @@ def open_file(path: Path, how: Reading | None = None) -> Iterator[Opened]:
     """Open a recording of any format; errors as ``format_of`` and ``Format.open``."""
     with format_of(path).open(path, how) as opened:
         yield opened
-
-
-@contextmanager
-def _whole_folder(path: Path) -> Iterator[Path]:
-    """A folder to write, put in the place of ``path`` when all went well.
-
-    Raises:
-        Refused: if something other than a bag is there.
-    """
-    if path.exists() and not _is_only_bag(path):
-        raise Refused(f"{path} is there and no folder of rosbag2; give another name")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as around:
-        made = Path(around, path.name)
-        yield made
-        if path.exists():
-            path.rename(Path(around, f"{path.name}.before"))
-        made.rename(path)
-
-
-def _is_only_bag(path: Path) -> bool:
-    """Whether a folder holds the files of a bag and nothing else, so that it may be replaced."""
-    if not path.is_dir() or path.is_symlink():
-        return False
-    files = list(path.iterdir())
-    are_of_bags = all(file.suffix in (".db3", ".mcap", ".yaml") for file in files)
-    return not files or (find_format(path) is not None and are_of_bags)
-
-
-# A process of its own ---------------------------------------------------------------------------
-
-_STRETCH = 2**16  # samples at a time
-_LIBRARIES = ("scipy.io", "h5py", "pyarrow.parquet", "mcap.reader", "rosbags.rosbag2")
-
-
-def _isolated(path: Path, how: Reading, stack: ExitStack) -> Opened:
-    """A file as a process of its own reads it, all samples in a temporary folder (``TMPDIR``).
-
-    Raises:
-        Refused: if it is refused there, or the process goes beyond a limit or dies.
-    """
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-    asked = {"path": str(path), "how": asdict(replace(how, isolate=False))}
-    program = "from tactslip_torch.data import formats; formats._read_for_parent()"
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", program, folder],
-            input=json.dumps(asked).encode(),
-            capture_output=True,
-            timeout=how.isolate_s,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        raise Refused(
-            f"took more than {how.isolate_s:g} s to read; raise reading.isolate_s if it may"
-        ) from None
-    answer = folder / "answer.json"
-    if done.returncode or not answer.exists():
-        name = signal.Signals(-done.returncode).name if done.returncode < 0 else done.returncode
-        raise Refused(
-            f"ended the process that read it ({name}), within {how.isolate_gib:g} GiB of "
-            "memory; raise reading.isolate_gib if it may take more"
-        )
-    found = json.loads(answer.read_text())
-    if "refused" in found:
-        raise Refused(found["refused"])
-    kept: dict[str, Any] = {}
-    for path_of in folder.glob("*.npy"):
-        kept[path_of.stem] = np.load(path_of, mmap_mode="r")
-    if found["header"] is not None:
-        return opened_from(found["header"], path, kept["samples"])
-    stamps, speed = (Samples(path, [kept[n]]) if n in kept else None for n in ("times", "speed"))
-    names = None if found["names"] is None else tuple(found["names"])
-    samples, rate = Samples(path, kept["samples"]), found["sample_rate_hz"]
-    return Opened(samples, None, names, stamps, "s", rate, speed, tuple(found["left_out"]))
-
-
-def _read_for_parent() -> None:
-    """Read the file that standard input names, within the limits it states."""
-    folder, asked = Path(sys.argv[1]), json.loads(sys.stdin.read())
-    path, how = Path(asked["path"]), Reading(**asked["how"])
-    for name in _LIBRARIES:
-        with suppress(ImportError):
-            importlib.import_module(name)
-    _limit(how)
-    try:
-        with open_file(path, how) as opened:
-            answer = _written(opened, folder)
-    except (OSError, ValueError, MemoryError) as error:
-        answer = {"refused": str(error) or f"{path} needs more memory than reading.isolate_gib"}
-    (folder / "answer.json").write_text(json.dumps(answer))
-
-
-def _limit(how: Reading) -> None:
-    """Limits of memory beyond what is in use, of computing time, and of files written."""
-    import resource  # of Unix alone
-
-    torch.set_num_threads(1)
-    in_use = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    limits = {
-        resource.RLIMIT_AS: in_use + int(how.isolate_gib * 2**30),
-        resource.RLIMIT_CPU: int(how.isolate_s) + 1,
-        resource.RLIMIT_FSIZE: 16 * MOST_WHOLE,
-        resource.RLIMIT_CORE: 0,
-    }
-    for limit, most in limits.items():
-        resource.setrlimit(limit, (most, most))
-
-
-def _written(opened: Opened, folder: Path) -> dict[str, Any]:
-    """Samples, times and speed as arrays in files, and the rest as plain values."""
-    samples, archived, times, speed = opened.samples, opened.archived, opened.times(), opened.speed
-    head = {"fortran_order": False, "shape": (samples.num_samples, samples.num_channels)}
-    head["descr"] = "<f4" if samples.dtype == torch.float32 else "<f8"
-    with (folder / "samples.npy").open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, head)  # type: ignore[no-untyped-call]
-        for piece in pieces(samples, _STRETCH):
-            file.write(piece.T.contiguous().numpy().data)
-    if times is not None:
-        np.save(folder / "times.npy", times)
-    if speed is not None:
-        np.save(folder / "speed.npy", speed.read(0, speed.num_samples)[0].double())
-    header = None
-    if archived is not None:
-        header = header_of(archived.recording, archived.hand, archived.key)
-        header["shape"] = [samples.num_channels, samples.num_samples]
-    plain = {name: getattr(opened, name) for name in ("names", "sample_rate_hz", "left_out")}
-    return plain | {"header": header}

@@ -1,10 +1,11 @@
-"""Recordings as MCAP files and as folders of rosbag2: messages on topics as samples, without ROS.
+"""Recordings as MCAP files, and rosbag2 folders to read: messages as samples, without ROS.
 
-Ours have one topic, ``/tactile``, of ``std_msgs/msg/Float32MultiArray`` or ``Float64MultiArray`` in
-CDR: a block of up to 0.1 s a message, ``[samples, channels]``, logged at the time of its first
-sample on the clock of the recording; metadata hold the rest. Of others are read ``std_msgs``
-arrays, any numbers of ROS 2 in CDR, and JSON (MCAP alone), on one topic. Every message is looked
-at when a file is opened; the samples are kept in a temporary file (``TMPDIR``).
+Package files have one topic, ``/tactile``, of ``std_msgs/msg/Float32MultiArray`` or
+``Float64MultiArray`` in CDR: a block of up to 0.1 s a message, ``[samples, channels]``, logged at
+the time of its first sample on the clock of the recording; a metadata record holds the rest. Of
+foreign ones are read ``std_msgs`` arrays, any numbers of ROS 2 in CDR, and JSON (MCAP alone), on
+one topic. Every message is looked at when a file is opened; the samples are kept in a temporary
+file (``TMPDIR``).
 """
 
 from __future__ import annotations
@@ -13,9 +14,7 @@ import json
 import keyword
 import os
 import re
-import shutil
 import tempfile
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -23,23 +22,19 @@ from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote, unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._choice import chosen_columns
-from tactslip_torch.data.formats._names import epoch_unit, time_unit_in
+from tactslip_torch.data.formats._inference import SECONDS, Refused, epoch_unit, time_unit_in
 from tactslip_torch.data.formats._reading import (
-    MOST_HEADER,
     MOST_MEMBERS,
-    SECONDS,
     Opened,
     Reading,
-    Refused,
     Samples,
     Spool,
     check_plausible,
+    chosen_columns,
     header_in,
     needs,
     opened_from,
@@ -55,14 +50,9 @@ _LOG_TIME = "log_time"
 _BLOCK_S = 0.1
 RECORDING = "tactslip_torch recording"
 _MOST_CHUNK = 256 * 2**20
-_METADATA = "metadata.yaml"
-_CHECKSUM = "tactslip_torch_message_sum"
-_SAFE = "{}[]:,"  # all else is written as in URLs: YAML writers wrap quoted text, and may err there
 _SECOND = 10**9  # in nanoseconds, as all times of messages
-_LONGEST = 2**62
 _GAP = 1.5  # usual spacings between messages; beyond, something is missing
 _MOST_NUMBERS = 4096  # of one instant; a picture is no set of channels
-_MOST_DEPTH = 16
 _STRETCH = 2**16  # rows at a time
 _ARRAY = re.compile(r"std_msgs/msg/(Float|U?Int)(8|16|32|64)MultiArray|std_msgs/msg/ByteMultiArray")
 
@@ -143,40 +133,13 @@ def _sizes(kind: Any) -> Iterator[int]:
         what, of = of[0]
 
 
-# Ours --------------------------------------------------------------------------------------------
+# Package files -----------------------------------------------------------------------------------
 
 
 def kind_of(header: Mapping[str, Any]) -> str:
     """The type of the messages that hold the samples."""
     bits = header["dtype"].removeprefix("float")
     return f"std_msgs/msg/Float{bits}MultiArray"
-
-
-def blocks(
-    samples: NDArray[Any], header: Mapping[str, Any], types: Types
-) -> Iterator[tuple[int, bytes]]:
-    """Samples ``[C, T]`` as messages of up to 0.1 s: nanoseconds since the first, and bytes."""
-    rate, (num_channels, num_samples) = header["sample_rate_hz"], samples.shape
-    if num_samples / rate * 1e9 >= 2**63 or num_channels > _MOST_NUMBERS:
-        raise Refused(
-            f"cannot hold {num_channels} channels of {num_samples / rate:g} s: too long for "
-            f"messages, or more than {_MOST_NUMBERS}"
-        )
-    kind, known = kind_of(header), types.store.types
-    axis, layout = (known[f"std_msgs/msg/MultiArray{part}"] for part in ("Dimension", "Layout"))
-    step = max(int(rate * _BLOCK_S), 1)
-    for first in range(0, num_samples, step):
-        block = np.ascontiguousarray(samples[:, first : first + step].T)
-        axes = [axis("samples", len(block), block.size)]
-        axes += [axis("channels", num_channels, num_channels)]
-        message = known[kind](layout(axes, 0), block.reshape(-1))
-        content = types.store.serialize_cdr(message, kind, little_endian=True)
-        yield round(first / rate * 1e9), bytes(content)
-
-
-def checksum_text(checksum: int) -> str:
-    """A CRC-32 as words, which no YAML takes for a number."""
-    return f"crc32 {checksum:08x}"
 
 
 # Messages as numbers -----------------------------------------------------------------------------
@@ -204,19 +167,17 @@ def _rows_of(message: Any) -> NDArray[Any]:
     return data.reshape(sizes[0], -1) if time == 0 else data.reshape(-1, sizes[-1]).T
 
 
-def _numbers(part: Any, name: str = "", depth: int = _MOST_DEPTH) -> Iterator[tuple[str, Any]]:
+def _numbers(part: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """All numbers in a message by name, such as ``wrench.force.x``; arrays are one list.
 
     Where a field names as many words as arrays beside it have elements, each has its word:
     ``position[wrist]``. Times and texts are none, ``null`` is NaN.
     """
-    if depth < 0:
-        raise Refused(f"messages nested deeper than {_MOST_DEPTH}")
     if isinstance(part, np.ndarray):
         yield name, part.reshape(-1)[: _MOST_NUMBERS + 1].tolist()
     elif isinstance(part, list):
         for place, value in enumerate(part):
-            yield from _numbers(value, f"{name}[{place}]", depth - 1)
+            yield from _numbers(value, f"{name}[{place}]")
     elif part is None or isinstance(part, (int, float)):
         yield name, float("nan") if part is None else part
     elif _clock(part) is None:
@@ -227,9 +188,9 @@ def _numbers(part: Any, name: str = "", depth: int = _MOST_DEPTH) -> Iterator[tu
             if words and isinstance(value, np.ndarray | list) and len(value) == len(words):
                 elements = value if isinstance(value, list) else value.tolist()
                 for word, element in zip(words, elements, strict=True):
-                    yield from _numbers(element, f"{whole}[{word}]", depth - 1)
+                    yield from _numbers(element, f"{whole}[{word}]")
             else:
-                yield from _numbers(value, whole, depth - 1)
+                yield from _numbers(value, whole)
 
 
 def _words_in(fields: Mapping[str, Any]) -> list[str]:
@@ -310,13 +271,12 @@ class TopicColumns:
             raise Refused("two numbers of one name")
         if how.time == _LOG_TIME or (how.time == "auto" and (is_stamped or names is None)):
             how = replace(how, time=None)
-        self._time, self._columns = chosen_columns(names, num_columns, how)
-        self.names = None if names is None else tuple(names[place] for place in self._columns)
-        self.time_name = names[self._time] if names and self._time is not None else None
-        rest = {*range(num_columns)} - {*self._columns, self._time}
-        is_asked = names is None or how.channels is not None
-        self.left_out = () if is_asked or names is None else tuple(names[n] for n in sorted(rest))
-        self.num_channels = len(self._columns)
+        self._chosen = chosen_columns(names, num_columns, replace(how, speed=None))
+        time, named = self._chosen.time, names or ()
+        self.names = None if names is None else tuple(named[n] for n in self._chosen.channels)
+        self.time_name = named[time] if named and time is not None else None
+        self.left_out = tuple(named[n] for n in self._chosen.left_out)
+        self.num_channels = len(self._chosen.channels)
         self.is_small = self._is_array and np.can_cast(rows.dtype, np.float32)
 
     def _decoded(self, message: bytes) -> tuple[NDArray[Any], tuple[str, ...] | None, int | None]:
@@ -355,8 +315,8 @@ class TopicColumns:
                 f"holds a message on {self.topic} with other channels than the first: "
                 f"{rows.shape[1]} numbers, or other names"
             )
-        named = None if self._time is None else rows[0, self._time]
-        return rows[:, self._columns], stamp, named
+        named = None if self._chosen.time is None else rows[0, self._chosen.time]
+        return rows[:, self._chosen.channels], stamp, named
 
 
 class _TopicSamples(TopicColumns):
@@ -369,9 +329,9 @@ class _TopicSamples(TopicColumns):
 
     def __init__(self, first: Message, types: Types | None, how: Reading, stack: ExitStack) -> None:
         super().__init__(first, types, how)
-        self._how, self._stack, self.checksum = how, stack, 0
+        self._how, self._stack = how, stack
         self.spool = Spool(self.num_channels, "f4" if self.is_small else "f8", stack)
-        self._marks = Spool(3, np.int64, stack)  # when recorded, stamp or 0, number of samples
+        self._marks: list[tuple[int, int, int]] = []  # when recorded, stamp or 0, samples
         self._named: list[Any] = []  # the times that ``how`` names
 
     def add(self, message: Message) -> None:
@@ -382,8 +342,7 @@ class _TopicSamples(TopicColumns):
         """
         rows, stamp, named = self.rows(message.content)
         self.spool.add(rows)
-        self._marks.add(np.array([[message.log_time, stamp or 0, len(rows)]], np.int64))
-        self.checksum = zlib.crc32(message.content, self.checksum)
+        self._marks.append((message.log_time, stamp or 0, len(rows)))
         if named is not None:
             self._named.append(named)
 
@@ -392,7 +351,7 @@ class _TopicSamples(TopicColumns):
 
         No times if nobody asks for them, or of a single block where nobody gives the rate.
         """
-        rows, (logged, stamps, counts) = self.spool.array(), self._marks.array().T
+        rows, (logged, stamps, counts) = self.spool.array(), np.array(self._marks, np.int64).T
         times = stamps if self._how.time == "auto" and stamps.any() else logged
         if times is stamps and (stamps == 0).sum() > 1:  # one alone may be where a clock begins
             raise Refused(
@@ -400,11 +359,7 @@ class _TopicSamples(TopicColumns):
                 "one in others; say reading.time=log_time to go by the times of recording"
             )
         if self._named:
-            named = np.array(self._named)
-            unit = self._how.time_unit or time_unit_in(self.time_name)
-            if unit is None and named.dtype.kind in "iuf":
-                unit = epoch_unit(float(named.max()))
-            times = _nanoseconds(named, SECONDS[unit or "s"])
+            times = self._named_times()
         if (np.diff(times) < 0).any():
             order = np.argsort(times, kind="stable")
             starts = np.cumsum(counts) - counts  # the first row of each message
@@ -415,6 +370,15 @@ class _TopicSamples(TopicColumns):
             rows, times, counts = spool.array(), times[order], counts[order]
         return rows, None if self._how.time is None else self._seconds(times, counts)
 
+    def _named_times(self) -> NDArray[np.int64]:
+        """Nanoseconds since the least of the times that are numbers in messages."""
+        times = np.array(self._named)
+        if times.dtype.kind not in "iuf" or not np.isfinite(times).all():
+            raise Refused("holds a time that is no number; say reading.time")
+        unit = self._how.time_unit or time_unit_in(self.time_name)
+        seconds = SECONDS[unit or epoch_unit(float(times.max())) or "s"]
+        return np.asarray(np.round((times - times.min()) * round(seconds * _SECOND)), np.int64)
+
     def _seconds(
         self, times: NDArray[np.int64], counts: NDArray[np.int64]
     ) -> NDArray[np.float64] | None:
@@ -424,39 +388,23 @@ class _TopicSamples(TopicColumns):
         shows.
         """
         spacings = np.diff(times) / counts[:-1]
+        if self._how.sample_rate_hz is None and not len(spacings) and counts[0] > 1:
+            return None
+        usual = float(np.median(spacings)) if len(spacings) else 0.0
         if self._how.sample_rate_hz is not None:
             usual = _SECOND / self._how.sample_rate_hz
-        elif len(spacings):
-            usual = float(np.median(spacings))
-        elif counts[0] > 1:
-            return None
-        else:
-            usual = 0.0
         spacing = np.append(np.where(spacings > _GAP * usual, usual, spacings), usual)
         number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         since = np.repeat((times - times[0]).astype(np.float64), counts)
         return np.asarray((since + number * np.repeat(spacing, counts)) / _SECOND)
 
 
-def _nanoseconds(times: NDArray[Any], seconds: float) -> NDArray[np.int64]:
-    """Times of a unit of so many seconds since the least; of whole numbers nothing is lost."""
-    unit = round(seconds * _SECOND)
-    if times.dtype.kind not in "iuf" or not np.isfinite(times).all():
-        raise Refused("holds a time that is no number; say reading.time")
-    first, last = times.min().item(), times.max().item()
-    if (last - first) * unit > _LONGEST:
-        raise Refused(f"has times {(last - first) * seconds:g} s apart; see reading.time_unit")
-    since = (times - times.dtype.type(first)) * unit
-    return np.asarray(np.round(since), np.int64)
-
-
-def opened_messages(
+def _opened_messages(
     path: Path,
     messages: Iterable[Message],
     header: Mapping[str, Any] | None,
     how: Reading,
     stack: ExitStack,
-    checksum: str | None = None,
 ) -> Opened:
     """The samples of the one topic that holds any, and their times.
 
@@ -471,7 +419,6 @@ def opened_messages(
         header: of a recording of ours.
         how: what a person says of the file; ``samples`` names the topic.
         stack: closes what is kept.
-        checksum: that the messages must have, as ``checksum_text`` writes it.
 
     Raises:
         Refused: if no topic or more than one holds samples, or the messages are damaged or hold
@@ -479,10 +426,8 @@ def opened_messages(
     """
     if header is not None and how.samples in (None, TOPIC):
         topic, _ = _read_topic(messages, Reading(samples=TOPIC, time=None), stack)
-        if checksum is not None and checksum != checksum_text(topic.checksum if topic else 0):
-            raise ValueError("the messages fail their checksum")
-        nothing = np.empty((0, header["shape"][0]))
-        return opened_from(header, path, topic.spool.array() if topic else nothing)
+        rows = topic.spool.array() if topic else np.empty((0, len(header["channels"])))
+        return opened_from(header, path, Samples(path, rows))
     topic, others = _read_topic(messages, how, stack)
     if topic is not None:
         rows, seconds = topic.ordered()
@@ -555,29 +500,35 @@ def _counted(messages: Iterable[Message], said: int | None) -> Iterator[Message]
 def write_mcap(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
     """Write blocks of samples, and a metadata record with everything else; nothing is packed."""
     writer = needs("mcap.writer", "writing .mcap")
-    types, kind = Types(), kind_of(header)
+    types, kind, rate = Types(), kind_of(header), header["sample_rate_hz"]
+    num_channels, num_samples = samples.shape
+    if num_channels > _MOST_NUMBERS:
+        raise Refused(f"cannot hold {num_channels} channels, at most {_MOST_NUMBERS} are read")
+    known = types.store.types
+    axis, layout = (known[f"std_msgs/msg/MultiArray{part}"] for part in ("Dimension", "Layout"))
+    step = max(int(rate * _BLOCK_S), 1)
     with path.open("wb") as file:
         output = writer.Writer(file, compression=writer.CompressionType.NONE)
         output.start(profile="ros2", library="tactslip_torch")
         output.add_metadata(RECORDING, {HEADER: text_of(header)})
         schema = output.register_schema(kind, "ros2msg", types.definition(kind).encode())
         channel = output.register_channel(TOPIC, "cdr", schema)
-        for number, (time, message) in enumerate(blocks(samples, header, types)):
-            output.add_message(channel, time, message, time, number)
+        for number, first in enumerate(range(0, num_samples, step)):
+            block = np.ascontiguousarray(samples[:, first : first + step].T)
+            axes = [axis("samples", len(block), block.size)]
+            axes += [axis("channels", num_channels, num_channels)]
+            message = known[kind](layout(axes, 0), block.reshape(-1))
+            content = bytes(types.store.serialize_cdr(message, kind, little_endian=True))
+            time = round(first / rate * _SECOND)
+            output.add_message(channel, time, content, time, number)
         output.finish()
 
 
 def read_mcap(path: Path, how: Reading, stack: ExitStack) -> Opened:
-    """A file of ours or of others, every message looked at once.
+    """A native or foreign file, every message looked at once, in the order of the file.
 
     A file without its end is refused, not read up to there.
     """
-    reader = _mcap_reader(path, stack)
-    return opened_messages(path, _mcap_messages(reader), _mcap_header(reader), how, stack)
-
-
-def _mcap_reader(path: Path, stack: ExitStack) -> Any:
-    """The reader of a file that has its end, and claims no more than is plausible."""
     library = needs("mcap.reader", "reading .mcap")
     file = stack.enter_context(path.open("rb"))
     size = file.seek(0, os.SEEK_END)
@@ -594,23 +545,14 @@ def _mcap_reader(path: Path, stack: ExitStack) -> Any:
     sizes = [chunk.uncompressed_size for chunk in summary.chunk_indexes] if summary else []
     check_plausible("its largest chunk", max(sizes, default=0), size, _MOST_CHUNK)
     check_plausible("it", sum(sizes), size)
-    return reader
-
-
-def _mcap_header(reader: Any) -> dict[str, Any] | None:
-    summary = reader.get_summary()
-    if summary is None or all(one.name != RECORDING for one in summary.metadata_indexes):
-        return None
-    own = next(one.metadata for one in reader.iter_metadata() if one.name == RECORDING)
-    return header_in(own.get(HEADER))
-
-
-def _mcap_messages(reader: Any) -> Iterator[Message]:
-    """In the order in which they stand in the file."""
-    summary = reader.get_summary()
+    header = None
+    if summary and any(one.name == RECORDING for one in summary.metadata_indexes):
+        own = next(one.metadata for one in reader.iter_metadata() if one.name == RECORDING)
+        header = header_in(own.get(HEADER))
     statistics = summary and summary.statistics
-    all_of_them = reader.iter_messages(log_time_order=False)
-    yield from _counted(map(_mcap_message, all_of_them), statistics and statistics.message_count)
+    found = map(_mcap_message, reader.iter_messages(log_time_order=False))
+    messages = _counted(found, statistics and statistics.message_count)
+    return _opened_messages(path, messages, header, how, stack)
 
 
 def _mcap_message(found: tuple[Any, Any, Any]) -> Message:
@@ -625,63 +567,20 @@ def _mcap_message(found: tuple[Any, Any, Any]) -> Message:
 # rosbag2, by the library ``rosbags`` ------------------------------------------------------------
 
 
-def write_rosbag2(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
-    """Write a ``.db3`` file and ``metadata.yaml`` into a folder that is not there yet."""
-    library = needs("rosbags.rosbag2", "writing folders of rosbag2")
-    types, kind = Types(), kind_of(header)
-    with tempfile.TemporaryDirectory() as elsewhere:
-        plain = Path(elsewhere, "recording")  # "#" and "?" in a path are parts of URLs to SQLite
-        with library.Writer(plain, version=8) as writer:
-            definition, digest = types.definition(kind), types.store.hash_rihs01(kind)
-            channel = writer.add_connection(TOPIC, kind, msgdef=definition, rihs01=digest)
-            total = 0
-            for time, message in blocks(samples, header, types):
-                writer.write(channel, time, message)
-                total = zlib.crc32(message, total)
-            custom = {HEADER: text_of(header), _CHECKSUM: checksum_text(total)}
-            for name, text in custom.items():
-                writer.set_custom_data(name, quote(text, safe=_SAFE))
-        shutil.copytree(plain, path)
-
-
 def read_rosbag2(path: Path, how: Reading, stack: ExitStack) -> Opened:
-    """A folder of ours or of others, every message looked at once; several files are one."""
-    reader = _bag_reader(path, stack)
-    custom = _custom_of(reader)
-    own = header_in(custom.get(HEADER))
-    checksum = None if own is None else custom.get(_CHECKSUM, "")
-    return opened_messages(path, _bag_messages(reader), own, how, stack, checksum)
-
-
-def _bag_reader(path: Path, stack: ExitStack) -> Any:
-    """An open bag; its files lie in the folder itself, whatever it says."""
+    """A folder, every message looked at once; several files are one recording."""
     library = needs("rosbags.rosbag2", "reading folders of rosbag2")
     for file in path.iterdir():
         if file.is_symlink() and not file.resolve().is_relative_to(path.resolve()):
             raise Refused(f"holds {file.name!r}, which leads out of the folder")
-    size = (path / _METADATA).stat().st_size
-    if size > 4 * MOST_HEADER:
-        raise Refused(f"has {_METADATA} of {size} bytes, at most {4 * MOST_HEADER} are read")
-    if re.search(rb"compression_mode:\W*file", (path / _METADATA).read_bytes(), re.IGNORECASE):
-        raise Refused("has packed files; unpack them first: ros2 bag convert")
-    if re.search(r"[?#%]", str(path)):
-        link = Path(stack.enter_context(tempfile.TemporaryDirectory()), "bag")
-        link.symlink_to(path.resolve(), target_is_directory=True)
-        path = link
-    return stack.enter_context(library.Reader(path))
-
-
-def _custom_of(reader: Any) -> dict[str, str]:
-    """What the writer of a bag added, as text."""
-    custom = reader.storage.metadata.custom
-    pairs = custom.items() if isinstance(custom, dict) else ()
-    return {name: unquote(text) for name, text in pairs if isinstance(text, str)}
-
-
-def _bag_messages(reader: Any) -> Iterator[Message]:
+    folder = path
+    if re.search(r"[?#%]", str(path)):  # parts of URLs to SQLite
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()), "bag")
+        folder.symlink_to(path.resolve(), target_is_directory=True)
+    reader = stack.enter_context(library.Reader(folder))
     topics = {}
     for one in reader.connections:
         encoding = "ros2msg" if one.msgdef.format.name == "MSG" else ""
         topics[one.id] = Topic(one.topic, one.msgtype, "cdr", encoding, one.msgdef.data)
     found = (Message(topics[one.id], time, bytes(data)) for one, time, data in reader.messages())
-    yield from _counted(found, reader.message_count)
+    return _opened_messages(path, _counted(found, reader.message_count), None, how, stack)

@@ -1,6 +1,6 @@
 """What a file gives when it is open, what a person says that it does not, and what it may cost.
 
-Of a file of ours all but the samples is its *header*: plain values that a file of any format can
+Of a package file all but the samples is its *header*: plain values that a file of any format can
 hold as one line of JSON.
 """
 
@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import os
 import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, fields
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -22,8 +23,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactslip_torch.data.formats._names import SECONDS as SECONDS
-from tactslip_torch.data.formats._names import TimeUnit, epoch_unit
+from tactslip_torch.data.clock import GapRule
+from tactslip_torch.data.formats._inference import (
+    SECONDS,
+    Refused,
+    TimeUnit,
+    epoch_unit,
+    is_time,
+    no_channels,
+    time_unit_in,
+)
 from tactslip_torch.data.recording import MOMENTS, STRETCHES, Recording
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import check_choice, check_number
@@ -38,10 +47,6 @@ MOST_MEMBERS = 10_000
 MOST_RATIO, FREE_BYTES = 100, 64 * 2**20
 """A file may hold so many times its size, and so many bytes in any case."""
 _MOST_SAID = 200
-
-
-class Refused(ValueError):
-    """A line for people that says all."""
 
 
 @contextmanager
@@ -62,7 +67,7 @@ def guarded(path: str | os.PathLike[str]) -> Iterator[None]:
         raise FileNotFoundError(f"no file at {name}") from None
     except MemoryError as error:
         raise Refused(
-            f"{name} needs more memory than there is, or than reading.isolate_gib; use .h5"
+            f"{name} needs more memory than there is; convert it to .h5, or cut it"
         ) from error
     except Exception as error:  # HDF5, Arrow, zlib, struct, SQLite and YAML raise many kinds
         said = " ".join(str(error).split())[:_MOST_SAID] or type(error).__name__
@@ -113,14 +118,14 @@ def needs(module: str, what: str, extra: str = "formats") -> ModuleType:
 
 # What a person says -----------------------------------------------------------------------------
 
-SpeedUnit = Literal["mm/s", "cm/s", "m/s", "um/s"]
-MM_S: dict[SpeedUnit, float] = {"mm/s": 1.0, "cm/s": 10.0, "m/s": 1000.0, "um/s": 1e-3}
-RowOrder = Literal["channel", "time"]
+_SpeedUnit = Literal["mm/s", "cm/s", "m/s", "um/s"]
+MM_S: dict[_SpeedUnit, float] = {"mm/s": 1.0, "cm/s": 10.0, "m/s": 1000.0, "um/s": 1e-3}
+_RowOrder = Literal["channel", "time"]
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How to read files that do not say it themselves; files of ours need none of it.
+    """How files are read; package files need none of it but what is done with their samples.
 
     Args:
         sample_rate_hz: of files without times: samples a second of each channel.
@@ -143,10 +148,11 @@ class Reading:
         row_order: of the columns of such a row. ``"channel"``: all samples of the first channel,
             then those of the second; ``"time"``: the first sample of all channels, then the second.
             ``None``: as names such as ``a_0, a_1, b_0, b_1`` tell.
-        isolate: whether to read in a process of its own, for files from strangers: a file that
-            takes too much memory or time, or ends the process, is then refused in one line.
-        isolate_gib: of memory that process may take beyond its libraries.
-        isolate_s: it may take.
+        gaps: ``"refuse"`` files in which samples are missing, let them be ``"missing"`` (bins that
+            need them are left out), or ``"bridge"`` short gaps by a straight line.
+        bridge_ms: the longest gap that is bridged; longer ones are missing.
+        resample_hz: the rate that all files of a set are brought to; ``None`` for their own.
+        tare_s: start and end of the stretch whose mean is taken off each channel.
         hand: names of channels that are wanted: a column of such a name is a channel, whatever it
             is called. Set by who knows the hand.
 
@@ -162,44 +168,60 @@ class Reading:
     time_first: bool | None = None
     delimiter: str | None = None
     speed: str | int | None = None
-    speed_unit: SpeedUnit = "mm/s"
+    speed_unit: _SpeedUnit = "mm/s"
     samples_per_row: int = 1
-    row_order: RowOrder | None = None
-    isolate: bool = False
-    isolate_gib: float = 2.0
-    isolate_s: float = 120.0
+    row_order: _RowOrder | None = None
+    gaps: GapRule = "refuse"
+    bridge_ms: float = 10.0
+    resample_hz: float | None = None
+    tare_s: tuple[float, float] | None = None
     hand: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        for name in ("sample_rate_hz", "isolate_gib", "isolate_s"):
-            if (value := getattr(self, name)) is not None or name != "sample_rate_hz":
+        for name in ("sample_rate_hz", "bridge_ms", "resample_hz"):
+            if (value := getattr(self, name)) is not None:
                 check_number(f"reading.{name}", value)
         check_number("reading.samples_per_row", self.samples_per_row, whole=True)
-        check_choice("reading.time_unit", self.time_unit, (*SECONDS, None))
-        check_choice("reading.speed_unit", self.speed_unit, MM_S)
-        check_choice("reading.row_order", self.row_order, (*get_args(RowOrder), None))
-        columns, mark = self.channels, self.delimiter
-        is_list = isinstance(columns, Sequence) and not isinstance(columns, str) and bool(columns)
-        is_mark = mark is None or (isinstance(mark, str) and len(mark) == 1)
+        for name, known in (
+            ("time_unit", (*SECONDS, None)),
+            ("speed_unit", tuple(MM_S)),
+            ("row_order", (*get_args(_RowOrder), None)),
+            ("gaps", get_args(GapRule)),
+        ):
+            check_choice(f"reading.{name}", getattr(self, name), known)
+        columns, mark, tare = (
+            _listed(getattr(self, n)) for n in ("channels", "delimiter", "tare_s")
+        )
+        is_tare = (
+            isinstance(tare, tuple) and len(tare) == 2 and set(map(type, tare)) <= {int, float}
+        )
         for name, is_right, wanted in (
             ("samples", isinstance(self.samples, str | None), "the name of an array or topic"),
             ("time_first", self.time_first in (True, False, None), "true, false or null"),
-            ("isolate", isinstance(self.isolate, bool), "true or false"),
             ("time", self.time is None or _is_column(self.time), "a name, a number or null"),
             ("speed", self.speed is None or _is_column(self.speed), "a name, a number or null"),
-            ("delimiter", is_mark, "one character"),
+            (
+                "delimiter",
+                mark is None or (isinstance(mark, str) and len(mark) == 1),
+                "a character",
+            ),
             (
                 "channels",
-                columns is None or (is_list and all(map(_is_column, columns))),
+                columns is None or (isinstance(columns, tuple) and all(map(_is_column, columns))),
                 "a list of columns, by name or number",
+            ),
+            (
+                "tare_s",
+                tare is None or (is_tare and 0 <= tare[0] < tare[1] < math.inf),
+                "[start, end] in seconds",
             ),
         ):
             if not is_right:
                 raise ValueError(f"reading.{name} must be {wanted}, got {getattr(self, name)!r}")
-        if columns is not None:
-            object.__setattr__(self, "channels", tuple(columns))
-            if len(set(columns)) < len(columns):
-                raise ValueError(f"reading.channels names a column twice: {list(columns)}")
+        if columns and len(set(columns)) < len(columns):
+            raise ValueError(f"reading.channels names a column twice: {list(columns)}")
+        object.__setattr__(self, "channels", columns)
+        object.__setattr__(self, "tare_s", tare and (float(tare[0]), float(tare[1])))
 
     @classmethod
     def of(cls, given: object) -> Reading:
@@ -214,9 +236,14 @@ class Reading:
         return cls(**dict(given or {}))
 
     def key(self) -> dict[str, Any]:
-        """What decides the samples that are read, as plain values; ``isolate`` does not."""
-        beside = ("isolate", "isolate_gib", "isolate_s", "hand")
-        return {n: value for n, value in asdict(self).items() if n not in beside}
+        """What decides the samples that are read, as plain values."""
+        return {name: value for name, value in asdict(self).items() if name != "hand"}
+
+
+def _listed(value: Any) -> Any:
+    """A list as a tuple, an empty one as it is; all else as it is."""
+    is_list = isinstance(value, Sequence) and not isinstance(value, str) and bool(value)
+    return tuple(value) if is_list else value
 
 
 def _is_column(value: object) -> bool:
@@ -236,10 +263,13 @@ class Samples:
             axes, if any, have length 1.
         time_axis: of the array.
         rows: of the array, along its other axis, that are channels; ``None`` for all.
-        dtype: ``float32`` or ``float64``; ``None``: the smaller that holds all numbers exactly
-            (whole numbers beyond 2**53 are rounded).
+
+    Attributes:
+        dtype: in which they are read: the smaller of ``float32`` and ``float64`` that holds all
+            numbers exactly (whole numbers beyond 2**53 are rounded), unless it is set.
     """
 
+    path: str | os.PathLike[str]
     num_channels: int
     num_samples: int
     dtype: torch.dtype
@@ -250,14 +280,13 @@ class Samples:
         source: Any,
         time_axis: int = 0,
         rows: Sequence[int] | None = None,
-        dtype: torch.dtype | None = None,
     ) -> None:
-        self._path, self._source, self._axis = path, source, time_axis
+        self.path, self._source, self._axis = path, source, time_axis
         self._rows = None if rows is None else list(rows)
         columns: Sequence[Any] = source if isinstance(source, list) else [source]
         stored = [column.dtype for column in columns]
         is_small = all(kind.itemsize <= (4 if kind.kind == "f" else 2) for kind in stored)
-        self.dtype = dtype or (torch.float32 if is_small else torch.float64)
+        self.dtype = torch.float32 if is_small else torch.float64
         if isinstance(source, list):
             self.num_channels, self.num_samples = len(source), max(source[0].shape)
         else:
@@ -278,7 +307,7 @@ class Samples:
         """As ``read``, in the numbers that the file has."""
         first = min(first, self.num_samples)
         part = slice(first, max(min(stop, self.num_samples), first))
-        with guarded(self._path):
+        with guarded(self.path):
             if isinstance(self._source, list):
                 return np.stack([_along(column, part) for column in self._source])
             if self._axis:
@@ -286,36 +315,6 @@ class Samples:
             else:
                 values = np.asarray(self._source[part]).T
         return values if self._rows is None else values[self._rows]
-
-
-class _RowSamples(Samples):
-    """Samples of which each row of a table holds several of every channel.
-
-    Args:
-        rows: ``[C * k, T]``, as the table has them.
-        per_row: ``k``.
-        order: of the columns of a row.
-
-    Shape:
-        - what is read: ``[C, n]`` of ``[C, T * k]``
-    """
-
-    def __init__(self, rows: Samples, per_row: int, order: RowOrder) -> None:
-        self._inner, self._per_row, self._order = rows, per_row, order
-        self.num_channels = rows.num_channels // per_row
-        self.num_samples, self.dtype = rows.num_samples * per_row, rows.dtype
-
-    def stored(self, first: int, stop: int) -> NDArray[Any]:
-        """As ``read``, in the numbers that the file has."""
-        first = min(first, self.num_samples)
-        stop = max(min(stop, self.num_samples), first)
-        begin, num, k = first // self._per_row, self.num_channels, self._per_row
-        rows = self._inner.stored(begin, -(-stop // k))  # [C * k, n]
-        if self._order == "channel":
-            cube = rows.reshape(num, k, -1).transpose(0, 2, 1)
-        else:
-            cube = rows.reshape(k, num, -1).transpose(1, 2, 0)
-        return cube.reshape(num, -1)[:, first - begin * k : stop - begin * k]
 
 
 _INDEX = re.compile(r"[\s_.\-\[(]*\d+[\])]?$")
@@ -334,23 +333,26 @@ def unfolded(opened: Opened, how: Reading) -> Opened:
             "list the columns that are channels as reading.channels"
         )
     stems = [_INDEX.sub("", name) for name in opened.names or ()]
-    groups: dict[RowOrder, list[list[str]]] = {
-        "channel": [stems[place : place + k] for place in range(0, len(stems), k)],
-        "time": [stems[place :: num // k] for place in range(num // k) if stems],
-    }
-    named: dict[RowOrder, tuple[str, ...]] = {}
-    for order, columns in groups.items():
-        names = tuple(column[0] for column in columns if len(set(column)) == 1)
-        if len(set(names)) == len(names) == num // k and all(names):
-            named[order] = names
+    named: dict[_RowOrder, tuple[str, ...]] = {}
+    starts: dict[_RowOrder, list[str]] = {"channel": stems[::k], "time": stems[: num // k]}
+    for order, names in starts.items():
+        wanted = [n for n in names for _ in range(k)] if order == "channel" else names * k
+        if names and all(names) and len(set(names)) == len(names) and stems == wanted:
+            named[order] = tuple(names)
     found = how.row_order or next(iter(named), None)
     if found is None and num != k:
         raise Refused(
             f"does not show how its rows hold {k} samples of each channel; say "
             "reading.row_order=channel (a_0, a_1, b_0, b_1) or time (a_0, b_0, a_1, b_1)"
         )
-    order = found or "channel"
-    return opened._replace(samples=_RowSamples(opened.samples, k, order), names=named.get(order))
+    order, samples = found or "channel", opened.samples
+    rows = samples.stored(0, samples.num_samples)  # [C * k, T]
+    if order == "channel":
+        cube = rows.reshape(num // k, k, -1).transpose(0, 2, 1)
+    else:
+        cube = rows.reshape(k, num // k, -1).transpose(1, 2, 0)
+    whole = Samples(samples.path, cube.reshape(num // k, -1), 1)
+    return opened._replace(samples=whole, names=named.get(order))
 
 
 def _along(column: Any, part: slice) -> NDArray[Any]:
@@ -437,7 +439,132 @@ class Spool:
         return rows.reshape(-1, self._num_columns)
 
 
-# Headers of ours --------------------------------------------------------------------------------
+# Columns of a table -----------------------------------------------------------------------------
+
+_MOST_NAMED = 8  # in a message
+
+
+class Columns(NamedTuple):
+    """What the columns of a table are, by their places.
+
+    Args:
+        time: of the times, if there is such a column.
+        channels: in the order of the samples.
+        speed: of the speed of slip, if it is wanted.
+        left_out: those taken for no channels by what they are called or hold.
+    """
+
+    time: int | None
+    channels: list[int]
+    speed: int | None = None
+    left_out: tuple[int, ...] = ()
+
+
+def chosen_columns(
+    names: Sequence[str] | None,
+    num_columns: int,
+    how: Reading,
+    others: Iterable[int] = (),
+    stamps: Iterable[int] = (),
+) -> Columns:
+    """Which columns are times, channels and speed.
+
+    If ``how`` does not say which hold samples, all do but ``others`` and those that are called as
+    times, labels or book-keeping are.
+
+    Args:
+        names: of all columns, if the file says.
+        num_columns: how many there are.
+        how: what a person says of the file.
+        others: columns that are no channels unless a person says so.
+        stamps: columns that hold times by their type.
+
+    Raises:
+        Refused: if there is no such column, or none is left for samples.
+    """
+
+    def place(wanted: str | int | None, what: str) -> int | None:
+        return None if wanted is None else position_of(names, num_columns, wanted, what)
+
+    stamps = set(stamps)
+    if how.time == "auto":
+        called = {n for n, name in enumerate(names or ()) if is_time(name)}
+        time = min(called | stamps, default=None)
+    else:
+        time = place(how.time, "time")
+    speed = place(how.speed, "speed")
+    if how.channels is not None:
+        places = [position_of(names, num_columns, one, "channels") for one in how.channels]
+        return Columns(time, places, speed)
+    beside = {time, speed, *others, *stamps, *no_channels(names or (), how.hand)}
+    channels = [n for n in range(num_columns) if n not in beside]
+    if not channels:
+        which = f"{some(list(map(repr, names)))} is" if names else "its only column is"
+        raise Refused(
+            f"has no column of samples: {which} taken for times, a label or book-keeping; if one "
+            "is a channel, list it as reading.channels and say reading.sample_rate_hz"
+        )
+    left = {*range(num_columns)} - {*channels, *stamps, time, speed}
+    return Columns(time, channels, speed, tuple(sorted(left)) if names else ())
+
+
+def opened_columns(
+    names: Sequence[str] | None,
+    num_columns: int,
+    how: Reading,
+    samples: Callable[[list[int]], Samples],
+    others: Iterable[int] = (),
+    stamps: Mapping[int, TimeUnit] = MappingProxyType({}),
+    units: Mapping[int, TimeUnit] = MappingProxyType({}),
+) -> Opened:
+    """A table as an open file; arguments and errors as of ``chosen_columns``.
+
+    Args:
+        names: of all columns, if the file says.
+        num_columns: how many there are.
+        how: what a person says of the file.
+        samples: reads columns by their places.
+        others: columns that are no channels unless a person says so.
+        stamps: units of columns that hold times by their type.
+        units: that a line of units says of columns, if they hold times.
+    """
+    chosen = chosen_columns(names, num_columns, how, others, stamps)
+    time = chosen.time
+    opened = Opened(samples(chosen.channels))
+    if chosen.speed is not None:
+        opened = opened._replace(speed=samples([chosen.speed]))
+    if names is not None:
+        of = tuple(tuple(names[n] for n in places) for places in (chosen.channels, chosen.left_out))
+        opened = opened._replace(names=of[0], left_out=of[1])
+    if time is None:
+        return opened
+    said = how.time_unit or time_unit_in(names[time] if names else None) or units.get(time)
+    return opened._replace(stamps=samples([time]), time_unit=stamps.get(time, said))
+
+
+def position_of(names: Sequence[str] | None, num_columns: int, wanted: str | int, what: str) -> int:
+    """The place of a column that ``reading.what`` says by name or number.
+
+    Raises:
+        Refused: if there is none.
+    """
+    if isinstance(wanted, int) and 0 <= wanted < num_columns:
+        return wanted
+    if isinstance(wanted, str) and names is not None and wanted in names:
+        return list(names).index(wanted)
+    there = f"{num_columns} columns{' without names' * (names is None)}, 0 to {num_columns - 1}"
+    if isinstance(wanted, str) and names is not None:
+        there = some(list(map(repr, names)))
+    raise Refused(f"has no column {wanted!r} that reading.{what} names; it has {there}")
+
+
+def some(words: Sequence[str]) -> str:
+    """The first few words, and how many more there are."""
+    more = len(words) - _MOST_NAMED
+    return ", ".join(words[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+# Headers of package files -----------------------------------------------------------------------
 
 FORM = "tactslip_torch recording 1"
 MOST_HEADER = 16 * 2**20
@@ -494,7 +621,7 @@ def text_of(header: Mapping[str, Any]) -> str:
 
 
 def header_in(kept: object) -> dict[str, Any] | None:
-    """What ``text_of`` wrote, whole or as words; ``None`` of anything that is not ours.
+    """What ``text_of`` wrote, whole or as words; ``None`` of anything else.
 
     Raises:
         Refused: if it is of another version, or too long.
@@ -505,44 +632,25 @@ def header_in(kept: object) -> dict[str, Any] | None:
         return None
     if len(text) > MOST_HEADER:
         raise Refused(f"has a header of {len(text)} characters, at most {MOST_HEADER} are read")
-    header = json.loads(text)
-    form = header.get("format") if isinstance(header, dict) else None
-    if form != FORM:
+    header: dict[str, Any] = json.loads(text)
+    if (form := header.get("format")) != FORM:
         raise Refused(f"must be of format {FORM!r}, got {str(form)[:80]!r}")
-    return dict(header)
-
-
-def shape_of(header: Mapping[str, Any]) -> tuple[int, int]:
-    """Channels and samples that a header states.
-
-    Raises:
-        ValueError: if these are no numbers that can be.
-    """
-    num_channels, num_samples = header["shape"]
-    is_count = all(type(n) is int and 0 <= n < 2**62 for n in (num_channels, num_samples))
-    if not is_count or not 0 < num_channels <= MOST_CHANNELS:
-        raise ValueError(f"a header of {str(header['shape'])[:40]} samples")
-    return num_channels, num_samples
+    return header
 
 
 def opened_from(
-    header: Mapping[str, Any],
-    path: str | os.PathLike[str],
-    source: Any,
-    time_axis: int = 0,
+    header: Mapping[str, Any], path: str | os.PathLike[str], samples: Samples
 ) -> Opened:
-    """An open file of ours: its samples, as ``Samples`` has them, and all else around none of them.
+    """An open package file: its samples, and all else around none of them.
 
     Raises:
         ValueError: if a part of the header is missing or wrong, or belongs to other samples.
     """
     try:
-        samples = Samples(path, source, time_axis, dtype=DTYPES[header["dtype"]])
-        found = samples.num_channels, samples.num_samples
-        if shape_of(header) != found:
-            raise ValueError(
-                f"{found[0]} by {found[1]} samples, where its header says {header['shape']}"
-            )
+        samples.dtype = DTYPES[header["dtype"]]
+        found = [samples.num_channels, samples.num_samples]
+        if list(header["shape"]) != found:
+            raise ValueError(f"{found} samples, where its header says {header['shape']}")
         hand = HandLayout.from_rows(header["channels"])
         if len(hand) != samples.num_channels:
             raise ValueError(f"{len(hand)} rows of channels for {samples.num_channels} channels")
