@@ -1,6 +1,7 @@
 """The hand: which tactile channels there are, in file order, and where each one sits.
 
-``HandLayout.paper24`` is the hand of He et al. 2026, arXiv:2603.18370, section III-A.
+Section III-A of the paper (REFERENCE.md section 1). Everything that depends on the number or the
+kind of channels asks a ``HandLayout``, so another hand is another layout and nothing else.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ class Channel:
         finger: the finger it sits in, such as ``"index"``.
         segment: the part of the finger, such as ``"distal"``.
         adapting: ``"slow"`` or ``"fast"``; decides the features of the channel. What the kind
-            implies if it is one of ``KNOWN_KINDS`` and nothing else is given; never ``None`` once
+            implies if it is one of ``KNOWN_KINDS`` and nothing else is said; never ``None`` once
             the channel is made.
 
     Raises:
         ValueError: if a name is no text, the kind is no single word, or how the channel adapts
-            is neither given nor known.
+            is neither said nor known.
 
     Example:
         >>> Channel("SG1", "SG", "index", "distal").adapting

@@ -1,7 +1,7 @@
 """Slow, plain references for every operator, to be read against the definitions.
 
-Written from the definitions of He et al. 2026 (sections IV-B to IV-E) alone, in NumPy, SciPy and
-PyWavelets, one 1-D float64 signal at a time; nothing of the package is imported. Below them: what
+Written from REFERENCE.md sections 2 to 5 alone, in NumPy, SciPy and PyWavelets; nothing of the
+package is imported. One 1-D float64 signal at a time, loops welcome. Below the references: what
 the tests feed in, and how they compare.
 """
 

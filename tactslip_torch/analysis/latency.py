@@ -304,7 +304,7 @@ GROUPS: Mapping[str, str] = {
     "columns": "a number that the machine takes",
 }
 """Groups of work, and what one part of each is."""
-_OF_ROW = {"slow": "gauges", "time": "branches", "freq": "spectra"}
+_OF_ROW = {"gauge": "gauges", "time": "branches", "freq": "spectra"}
 _OF_DESCRIPTOR = {
     "entropy": "histograms",
     "correlation": "correlations",
@@ -381,7 +381,7 @@ def parts_of(plan: Plan) -> list[set[Part]]:
         row = plan.rows[wanted.row]
         own = needed[wanted.place]
         own.add((_OF_ROW[row.kind], (row.channel, row.branch)))
-        if row.kind != "slow":
+        if row.kind != "gauge":
             own.add(("films", (row.channel,)))
         is_ordered = wanted.descriptor in ORDERED
         if is_ordered:

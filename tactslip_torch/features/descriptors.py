@@ -1,10 +1,18 @@
-"""The paper's descriptors (He et al. 2026, table II), each defined once.
+"""The paper's descriptors, each defined once (REFERENCE.md section 4).
 
-A descriptor is a function of ``Rows``, brought to order one by ``bank.py``, in operations that
-tensors and values of an ONNX graph share. A constant row has std, cv, skewness, correlation and
-entropy 0 and kurtosis 3; a zero row has peak factor 0; a zero spectrum has centroid, spread and
-band energy ratios 0. Gradients of constant rows and of tied values are 0 or one-sided, never NaN;
-``entropy`` is a step function and has none.
+A descriptor is a short function of ``Rows``: bins, wavelet branches or spectra that were brought to
+order one before (``bank.py``), so that no definition has to know of extremes. It is written in
+ordinary tensor operations, which ``torch.Tensor`` and the values of an ONNX graph
+(``deploy/value.py``) both offer: the same functions are the reference on any device, with
+gradients, and write the graph.
+
+Constants (our rules): a row that is constant is given as exact zeros around its mean. It then has
+std, cv, skewness, correlation and entropy 0 and kurtosis 3. A zero row has peak factor 0; a zero
+spectrum has centroid, spread and band energy ratios 0.
+
+Gradients of constant rows and of tied values are 0 or one-sided, never NaN. Those of ``median``,
+``iqr`` and ``mode`` depend on which of several nearly equal values is chosen, so two roundings of
+the same row may have different ones. ``entropy`` is a step function: no gradient flows.
 """
 
 from __future__ import annotations
@@ -39,13 +47,13 @@ class Rows:
         num: values in a row.
         scale: largest magnitude of the bin that a row comes from, in the unit of the row; ``mode``
             decides by it which values are equal. No gradient.
-        filtered: that ``correlation`` correlates with: the filtered bin less its mean.
+        film: what ``correlation`` correlates with: the filtered bin less its mean, of order one.
         amplitude: of spectra, the values with their mean.
         frequency_hz: of the lines of spectra.
         is_sorted: whether ``ascending`` is asked for, so that ``ranked`` may take it.
 
     Shape:
-        - values, filtered, amplitude: ``[*, R, n]``; mean, unit, scale: ``[*, R]``;
+        - values, film, amplitude: ``[*, R, n]``; mean, unit, scale: ``[*, R]``;
           frequency_hz: ``[n]``
     """
 
@@ -54,7 +62,7 @@ class Rows:
     unit: Tensor
     num: int
     scale: Tensor
-    filtered: Tensor | None = None
+    film: Tensor | None = None
     amplitude: Tensor | None = None
     frequency_hz: Tensor | None = None
     is_sorted: bool = False
@@ -69,7 +77,7 @@ class Rows:
             mean=taken(self.mean, index, -1),
             unit=taken(self.unit, index, -1),
             scale=taken(self.scale, index, -1),
-            filtered=None if self.filtered is None else taken(self.filtered, index, -2),
+            film=None if self.film is None else taken(self.film, index, -2),
             amplitude=None if self.amplitude is None else taken(self.amplitude, index, -2),
         )
 
@@ -226,10 +234,10 @@ def peak_factor(x: Rows) -> Tensor:
 
 def correlation(x: Rows) -> Tensor:
     """Pearson correlation of a branch with the filtered bin; 0 if either is constant."""
-    if x.filtered is None:
-        raise ValueError("correlation needs the signal that rows are branches of")
-    covariance = (x.values * x.filtered).mean(-1).double()
-    other = (x.filtered * x.filtered).mean(-1).double().clamp(min=_NEXT_TO_NOTHING)
+    if x.film is None:
+        raise ValueError("correlation needs the film that rows are branches of")
+    covariance = (x.values * x.film).mean(-1).double()
+    other = (x.film * x.film).mean(-1).double().clamp(min=_NEXT_TO_NOTHING)
     return covariance / (x.safe_variance * other).sqrt()
 
 

@@ -1,9 +1,13 @@
-"""The pool: every descriptor of every channel, branch and spectrum (paper section IV-D).
+"""The pool: every descriptor of every channel, branch and spectrum (REFERENCE.md section 4).
 
-Of the paper's hand 14 slow channels x 13 descriptors + 10 fast ones x (8 branches x (14 time + 15
-frequency) + 8 band energy ratios) = 2582 features of a 50 ms bin. Backend ``"torch"`` is the
-definitions (``bank.py``); ``"native"`` (``native/engine.cpp``) agrees to 1e-9 of the larger of a
-value and the median of its column.
+For the paper's hand 14 gauges x 13 descriptors + 10 films x (8 branches x (14 time + 15 frequency)
++ 8 band energy ratios) = 2582 features of a 50 ms bin. Of any hand, a gauge is a channel that
+adapts slowly, a film one that adapts fast.
+
+Two backends make the same features. ``"torch"`` is the definitions (``bank.py``): differentiable,
+on any device. ``"native"`` is ``native/engine.cpp``, for values on the CPU. float64 agrees to 1e-9
+of the larger of a value and the median of its column; where a value is all rounding (the sign of cv
+at a mean of 0, the mode of values equal but for rounding) they may differ.
 """
 
 from __future__ import annotations
@@ -52,7 +56,7 @@ from tactslip_torch.signals.wavelet import (
 
 Arithmetic = Literal["double", "native"]
 NATIVE_SPAN = 2.0**-10
-"""Part of a fast channel's magnitude; in float32 throughout, less may be lost in a branch."""
+"""Part of a film's magnitude; in float32 throughout, less may be lost in a branch."""
 LEAST_SPAN = {torch.float32: 2.0**-17, torch.float64: 2.0**-22}
 """Part of the largest raw sample within reach that a filtered span must exceed, by the dtype of the
 raw samples: 64 roundings of float32; of float64, what leaves seven digits to a filtered sample."""
@@ -245,8 +249,8 @@ class FeaturePool(nn.Module):
         x = self.widen(bins)
         if x.dtype not in self._banks:
             frames = [
-                Frame(tuple(sorted(own)), is_fast)
-                for is_fast, kind in ((False, self.hand.slow), (True, self.hand.fast))
+                Frame(tuple(sorted(own)), is_film)
+                for is_film, kind in ((False, self.hand.slow), (True, self.hand.fast))
                 if (own := set(kind).intersection(self.plan.channels))
             ]
             self._banks[x.dtype] = Bank(self.maps, self.plan, frames, x.dtype)
@@ -264,7 +268,7 @@ class FeaturePool(nn.Module):
         plan, steps = self.plan, wavelet_steps(self.bin_samples, self.wavelet, self.level)
         spectrum = spectrum_matrix(self.bin_samples, self.spectrum)
         num_branches = len(steps.out)
-        offset = {"slow": 1, "time": 0, "freq": num_branches}  # a slow channel has row 0 alone
+        offset = {"gauge": 1, "time": 0, "freq": num_branches}  # a gauge is row 0 of its channel
         rows = [(row.channel, offset[row.kind] + row.branch) for row in plan.rows]
         wanted = [(*rows[w.row], tuple(DESCRIPTORS).index(w.descriptor), w.place)
                   for w in plan.wanted]  # fmt: skip
@@ -315,8 +319,8 @@ class FeaturePool(nn.Module):
             span = LEAST_SPAN[given] if is_raw else 64 * torch.finfo(given).eps
             least = [span] * len(self.hand)
             if self.arithmetic == "native" and given == torch.float32:
-                for channel in self.hand.fast:
-                    least[channel] = NATIVE_SPAN
+                for film in self.hand.fast:
+                    least[film] = NATIVE_SPAN
             with torch.inference_mode(False):  # it may be needed for a gradient later
                 inverse = torch.tensor(least, dtype=torch.float64, device="cpu").reciprocal()
             self._inverses[given, is_raw] = inverse

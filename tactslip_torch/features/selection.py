@@ -1,6 +1,10 @@
-"""Ranking of features by a t-test on class moments (paper section IV-D).
+"""Which features to keep: a t-test on class moments (paper section IV-D, REFERENCE.md section 5).
 
-Moments are gathered in passes over recordings and merge.
+Moments are gathered in passes over recordings and merge, so a ranking needs one look at each bin,
+and the ranking of a validation fold is a merge of what the other groups gathered.
+
+``rank_distinct``, ``rank_weighted`` and ``rank_per_cost`` know more than each feature's own score:
+what repeats, and what costs. Any number of threads gives the same ranking.
 """
 
 from __future__ import annotations
@@ -188,7 +192,7 @@ def rank_distinct(
     chosen: list[int] = []
     skipped: list[int] = []
     for block in rank_features(scores, len(scores)).split(_BLOCK):
-        units = _unit_deviations(features[:, block], is_slip)
+        units = unit_deviations(features[:, block], is_slip)
         repeats = (_correlation(units, taken[: len(chosen)]) > most_correlation).any(-1)
         is_near = _correlation(units, units) > most_correlation
         for row, index in enumerate(block.tolist()):
@@ -233,7 +237,7 @@ def rank_weighted(scores: Tensor, features: Tensor, num: int, alpha: float = 0.7
     if features.ndim != 2 or features.shape[1:] != scores.shape:
         raise ValueError(f"expected features [n, {len(scores)}], got {tuple(features.shape)}")
     rank_features(scores, num)  # refuses a num out of range
-    units = _unit_deviations(features, torch.zeros(len(features), dtype=torch.bool))
+    units = unit_deviations(features, torch.zeros(len(features), dtype=torch.bool))
     size = units.square().sum(-1).sqrt()
     gram = units @ units.T if len(units) <= _MOST_AT_ONCE else None
     comparable = torch.where(scores.isnan(), -1.0, scores).double().cpu()
@@ -321,7 +325,7 @@ def _check_bill(scores: Tensor, needs: Tensor, prices: Tensor, power: float) -> 
         raise ValueError(f"power must not be negative, got {power}")
 
 
-def _unit_deviations(features: Tensor, is_slip: Tensor) -> Tensor:
+def unit_deviations(features: Tensor, is_slip: Tensor) -> Tensor:
     """Deviations from class means, of norm 1 or, of a constant, 0: ``[F, n]``, float64."""
     moments = ClassMoments(features.shape[1])
     moments.update(features, is_slip)

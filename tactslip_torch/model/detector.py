@@ -196,8 +196,8 @@ class SlipDetector(nn.Module):
     def look_ahead(self) -> int:
         """Samples after a bin that its score needs, by the filters of the channels in use.
 
-        What comes after them may be anything: a stream that uses fast channels alone does not
-        wait for the longer frames of slow ones.
+        What comes after them may be anything; so a stream that uses films alone waits for 5
+        samples, 2.5 ms, and fills up the rest.
         """
         return max(self.channel_filter.reaches[i][1] for i in self.extractor.plan.channels)
 

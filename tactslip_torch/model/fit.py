@@ -1,4 +1,4 @@
-"""Fitting the machine to training bins by the cheaper route (paper section IV-E).
+"""Fitting the machine to training bins by the cheaper route (REFERENCE.md section 5).
 
 On targets of +-1 the kernel extreme learning machine (paper section IV-E) is kernel ridge
 regression with ``alpha = 1 / C``. Two routes to the same machine: dual, one unknown per training

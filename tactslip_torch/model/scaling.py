@@ -1,6 +1,7 @@
 """Scaling to [-1, 1], fitted on training bins, with a signed log before it on request.
 
-The paper has the plain range; compression and ranges between quantiles are ours.
+REFERENCE.md section 5 has the plain range of the training bins. Compression and ranges between
+quantiles are ours, for features whose tails are heavy on real recordings.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
-"""Alarms against onsets, by event: slips found, how late, and how many false alarms.
+"""What a detector is evaluated by in use: slips found, how late, and how many false alarms.
 
-Intervals are by a bootstrap that draws recordings with replacement.
+Alarms of a recording against its onsets, by event and not by bin (REFERENCE.md section 7), put
+together in numbers with intervals over recordings: a bootstrap that draws as many recordings with
+replacement, since what happens within one hangs together.
 """
 
 from __future__ import annotations
@@ -181,6 +183,9 @@ def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts)
     that speaks for slip is full) and decision (from that one to the alarm). Bin fill counts from
     the onset and is negative where that bin was full before it. Where no such decision is known to
     come before the alarm, all is bin fill. Alarms outside the stretches watched are not counted.
+
+    Reference:
+        REFERENCE.md section 7.
     """
     settle_s = rules.settle_s
     if settle_s is None:

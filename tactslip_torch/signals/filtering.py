@@ -1,9 +1,18 @@
-"""Savitzky-Golay filters of a hand's channels (paper section IV-B), and bins of recordings.
+"""The Savitzky-Golay filter of a hand, the first step (paper IV-B, REFERENCE.md section 2).
 
-Order 1 is a moving average: -3 dB at 81 Hz for 11 samples, 17 Hz for 51, at 2 kHz. Centred, it
-looks half a frame ahead. Causal, the polynomial of the frame behind a sample is evaluated at its
-last sample: no look-ahead, and nearly four times the variance of white noise. Trailing, a sample
-gets what the sample half a frame before it gets if centred.
+Order 1 is a moving average: -3 dB at 81 Hz for the 11-sample frame of the PVDF channels and at
+17 Hz for the 51-sample frame of the SG channels. Where in its frame a sample lies is a choice of
+noise and delay. Centred, it looks half a frame ahead: 2.5 ms and 12.5 ms. Causal (ours), the
+polynomial of the frame behind a sample is evaluated at that sample, the frame's last: no
+look-ahead, but at order 1 nearly four times the variance of white noise comes through, some tones
+below the corner are raised by a third, and the corners move to 200 Hz and 44 Hz. Trailing (ours), a
+sample gets what the sample half a frame before it gets if centred: no look-ahead and no more noise,
+but half a frame late.
+
+``savgol_filter`` is the filter of one frame; ``ChannelFilter`` has a frame of its own for every
+channel, of whole recordings and of bins, with Savitzky-Golay's weights or others.
+
+Cutting recordings into bins, the paper's 50 ms analysis unit (REFERENCE.md section 2).
 """
 
 from __future__ import annotations
@@ -50,7 +59,7 @@ class Edges(NamedTuple):
         if len(kernel) == 1:
             return x.clone()
         first, last = x[..., : len(kernel)] @ head.T, x[..., -len(kernel) :] @ tail.T
-        return torch.cat([first, _convolve_valid(x, kernel), last], dim=-1)
+        return torch.cat([first, convolve_valid(x, kernel), last], dim=-1)
 
 
 def _check_length(x: Tensor, window_length: int) -> None:
@@ -163,7 +172,7 @@ def _edges_of_kernel(weights: Sequence[float], polyorder: int, align: Align) -> 
     past = past_matrix(len(kernel), polyorder, align)
     future = past.flip(0, 1) if align == "centred" else past[:0]
     before, after = torch.cat([past, frame[:-1]]), torch.cat([frame[1:], future])
-    return Edges(_convolve_valid(before.T, kernel).T, kernel, _convolve_valid(after.T, kernel).T)
+    return Edges(convolve_valid(before.T, kernel).T, kernel, convolve_valid(after.T, kernel).T)
 
 
 def savgol_filter(
@@ -203,7 +212,7 @@ def savgol_filter(
     return _savgol_edges(window_length, polyorder, align).filtered(x)
 
 
-def _convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
+def convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
     """Correlate ``[*, T]`` with ``[W]``, keeping the ``T - W + 1`` full overlaps.
 
     A sum of shifted copies: in float64 over ten times faster than ``conv1d``, which unfolds, and
@@ -218,7 +227,7 @@ def _convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
 
 
 def overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
-    """``_convolve_valid`` as a matrix, for short signals: ``_convolve_valid(x) = x @ matrix``.
+    """``convolve_valid`` as a matrix, for short signals: ``convolve_valid(x) = x @ matrix``.
 
     Gradients flow to the kernel.
 
@@ -464,7 +473,7 @@ class ChannelFilter(nn.Module):
         Raises:
             ValueError: if there are no axes of channels and time, or other channels.
         """
-        _check_tensor(samples)
+        check_tensor(samples)
         if samples.ndim < 2 or samples.shape[-2] != len(self.window_lengths):
             raise ValueError(
                 f"expected samples [*, {len(self.window_lengths)}, T] (channels, time), "
@@ -536,7 +545,7 @@ def past_of(
     return past
 
 
-def _check_tensor(x: Any) -> None:
+def check_tensor(x: Any) -> None:
     """Refuse what is no tensor, such as a NumPy array.
 
     Raises:
@@ -554,7 +563,7 @@ def check_samples(x: Tensor, what: str = "samples") -> None:
         TypeError: if it is no tensor.
         ValueError: for another dtype.
     """
-    _check_tensor(x)
+    check_tensor(x)
     if x.dtype not in (torch.float32, torch.float64):
         raise ValueError(
             f"expected float32 or float64 {what} in volts, got {x.dtype}; "
