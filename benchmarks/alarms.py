@@ -25,9 +25,9 @@ from tactslip_torch import AlarmSettings, SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector
 from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.onset.events import EventRules, LatencyParts, pooled_metrics, recording_events
-from tactslip_torch.onset.thresholds import Budget
+from tactslip_torch.onset.rules import Budget
 from tactslip_torch.simulation.simulate import SimulatedRecordings
-from tactslip_torch.training.alarm import JOINT, OURS, Timing, decide, score_streams, watched
+from tactslip_torch.training.alarm import JOINT, OURS, Timing, decide, event_record, score_streams
 
 LARGEST_DETAIL = "largest detail"
 ROLES = {"test": "seen", "unseen": "held out"}
@@ -48,10 +48,10 @@ QUICK = '","'.join(
         *(f"~recipe.scene_weights.{scene}" for scene in (*_OTHERS, "paper_loud", "motor_off")),
         "recipe.penalties=[0.003]",
         "recipe.sample_bins=20",
-        "onset.learn_scenes=[paper,held,arm_motion,taps]",
-        "onset.learn_cycles=1",
-        "onset.check_hours=0.002",
-        "onset.check_slip_free_hours=0.002",
+        "onset.classifier.scenes=[paper,held,arm_motion,taps]",
+        "onset.classifier.cycles=1",
+        "onset.check_hours.others=0.002",
+        "onset.check_hours.held=0.002",
         "onset.budget={held:3000,arm_motion:9000,taps_share:0.9}",
         *(f"~onset.{key}.{scene}" for key in ("budget", "hours") for scene in _BUDGETED),
         *(f"onset.hours.{scene}=0.002" for scene in _SCENES),
@@ -91,8 +91,8 @@ class Alarms(Benchmark):
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     overrides: tuple[str, ...] = (
         "baselines=false",
-        "onset.check_slip_free_hours=2",
-        "onset.check_hours=0.2",
+        "onset.check_hours.held=2",
+        "onset.check_hours.others=0.2",
     )
     pulses_v: tuple[float, ...] = (0.02, 0.05, 0.1, 0.5)
     knocks_mv: tuple[float, ...] = (10.0, 30.0, 100.0)
@@ -244,7 +244,7 @@ def _pulses(
             parts = (detector.pool.bin_samples, scorers[name].look_ahead)
             latency = LatencyParts(parts[1] / rate, parts[0] / rate)
             decided = decide(streams[name], own, Timing(rate, hops[name], *parts))
-            made = [recording_events(watched(*of), EventRules(), latency) for of in decided]
+            made = [recording_events(event_record(*of), EventRules(), latency) for of in decided]
             events = pooled_metrics(made, num_resamples=1)
             row[method] = {
                 "slips": events["num_onsets"],

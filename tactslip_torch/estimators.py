@@ -31,7 +31,7 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, most_stuck_samples
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.model.calibration import Calibration, Platt, probability
+from tactslip_torch.model.calibration import Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.model.kernels import Head
 from tactslip_torch.onset.decisions import calibration_of
@@ -387,7 +387,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         with torch.no_grad():
             x = pool(features._bins(windows), torch.float64)
             plan, head = _solved(recipe, pool, x, is_slip, *_groups(y, groups))
-        self._slope: Calibration = _UNCALIBRATED
+        self._slope: Platt = _UNCALIBRATED
         if plan.calibration is not None:
             self._slope = Platt(plan.calibration["slope"], 0.0)  # a score of 0 says nothing
         info = plan.metadata | {

@@ -9,7 +9,6 @@ import json
 import shutil
 import subprocess
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -197,10 +196,8 @@ def truth(
     """Every decision of a detector on samples ``[T, C]``, as a host is to print it."""
     detector = detector or alarming_detector(with_onset)
     settings = AlarmSettings.of(detector)
-    if threshold is not None and settings.onset:
-        settings = replace(settings, onset=replace(settings.onset, threshold=threshold))
-    elif threshold is not None:
-        settings = replace(settings, threshold=threshold)
+    if threshold is not None:
+        settings = settings.at_threshold(threshold)
     decisions = StreamingDetector(detector, settings, dtype=torch.float64).push(samples)
     fields = STREAM_OUTPUTS | {"in_range": "in_range", "onset_score": "onset_score"}
     of_onset = ["onset_score"] if settings.onset else []

@@ -32,7 +32,7 @@ from tactslip_torch.training import alarm
 from tactslip_torch.training.onset import OnsetTraining
 
 RULE = {"name": "cusum", "drift": 0.5, "evidence": 0.4}
-LEARNED = OnsetTraining(penalty=1e3)
+LEARNED = OnsetTraining(penalty=1e3, scenes=("paper", "held"), cycles=1)
 TRAINED = [RecordingId(m, 0, s) for m in ("a", "b") for s in ("paper", "held")]
 TIMING = alarm.Timing(RATE_HZ, 20, 100, 25)
 SCENES = ("paper", "held", "taps")
@@ -91,25 +91,23 @@ def loudness_detector() -> SlipDetector:
 
 def stage(streams=None, **changes) -> alarm.CalibratedAlarm:
     values = {"streams": streams or Streams(), "classifier": LEARNED, "rule": RULE, "hop_ms": 25.0}
-    values |= {"learn_scenes": ["paper", "held"], "learn_cycles": 1, "slip_free": "held"}
+    values |= {"slip_free": "held", "check_hours": {"others": 10.0}}
     values |= {"budget": {"held": 2000.0, "taps_share": 0.6}}
     values |= {"hours": {"held": 11 / 3600, "taps": 8 / 3600}}
-    values |= {"check_hours": 10.0, "check_slip_free_hours": 10.0}
     return alarm.CalibratedAlarm(**(values | changes))
 
 
 @pytest.fixture(scope="module")
 def calibrated():
     """A detector with its alarm, and the report; beside it the same score at another hop."""
-    detector, other = loudness_detector(), loudness_detector()
-    other.hop_samples = 25
-    return detector, stage()(detector, {"loud": other}, num_workers=0)
+    detector = loudness_detector()
+    return detector, stage()(detector, {"loud": loudness_detector()}, num_workers=0)
 
 
 # ------------------------------------------------------------------------------- who calibrates
 def test_fresh_recordings_learn_then_calibrate_then_test_and_held_out_ones_test_alone():
     """Of 3 s each: 4 of held make up 11 s, and 3 of taps 8 s; the first cycle was trained on."""
-    made = stage(check_hours=17 / 3600, check_slip_free_hours=8 / 3600)
+    made = stage(check_hours={"others": 17 / 3600, "held": 8 / 3600})
     found = {
         role: {scene: [(r.cycle, r.material) for r in own if r.scene == scene] for scene in SCENES}
         for role, own in made.roles(loudness_detector()).items()
@@ -137,8 +135,9 @@ def test_too_few_hours_are_told_and_a_scene_without_any_is_refused(caplog):
     assert not caplog.text
     stage(hours={"held": 1.0, "taps": 8 / 3600}).roles(loudness_detector())
     assert "0.01 h of held are left to calibrate on, onset.hours asks for 1: give" in caplog.text
+    few = stage(Streams(cycles=2), budget=BARE, classifier=replace(LEARNED, scenes=["paper"]))
     with pytest.raises(ValueError, match="no recording of scene paper that was not trained on"):
-        stage(Streams(cycles=2), budget=BARE, learn_scenes=["paper"]).roles(loudness_detector())
+        few.roles(loudness_detector())
 
 
 BEYOND_THE_HOURS = [
@@ -156,12 +155,10 @@ def test_a_budget_that_cannot_be_shown_is_refused_before_anything_is_read(budget
 
 
 REFUSED = [
-    (stage, {"calibration": "none"}, "calibration must be one of platt, isotonic, got 'none'"),
     (stage, {"hop_ms": 0.0}, "onset.hop_ms must be a positive finite number, got 0"),
     (stage, {"hop_ms": 0.3}, r"onset\.hop_ms=0\.3 is 0\.6 samples at 2000 Hz"),
-    (stage, {"learn_cycles": 0}, "onset.learn_cycles must be a positive whole number, got 0"),
+    (OnsetTraining, {"cycles": 0}, "cycles must be a positive whole number, got 0"),
     (stage, {"rule": {"name": "sum"}}, "no sequential rule is called 'sum'"),
-    (stage, {"level": 2.0}, "onset.level must lie between 0 and 1"),
     (stage, {"rearm_s": -1.0}, "onset.rearm_s must be a finite number of at least 0, got -1"),
     (stage, {"slip_free": "heldd"}, "no scene 'heldd', it has held, paper, taps; take it out"),
     (stage, {"budget": BARE | {"tap": 1.0}}, "onset.streams has no scene 'tap'"),
@@ -192,7 +189,7 @@ def recounted(detector, settings, scene):
         bins = decider.decide(scores.score, scores.is_valid)
         made = decider.join(bins, left_out[recording.material].score_recording(samples))
         stream = alarm.Stream(recording, source.timeline(recording), none, none, none)
-        found = recording_events(alarm.watched(stream, made), EventRules(), latency)
+        found = recording_events(alarm.event_record(stream, made), EventRules(), latency)
         alarms, hours = alarms + len(found.false_alarms_s), hours + found.quiet_s / 3600
     return alarms, hours
 
@@ -353,7 +350,7 @@ def test_joint_thresholds_are_the_lowest_that_keep_every_budget(rule):
         for stream in streams:
             decider = Decider(settings, RATE_HZ, 100, 25)
             bins = decider.decide(stream.score, stream.is_valid)
-            seen = alarm.watched(stream, decider.join(bins, stream.onset_score))
+            seen = alarm.event_record(stream, decider.join(bins, stream.onset_score))
             found = recording_events(seen, EventRules(), latency)
             counts[stream.recording.scene] += len(found.false_alarms_s)
         return counts
@@ -447,7 +444,7 @@ def test_the_experiment_has_ten_hours_to_set_the_alarm_and_all_scenes_to_check_i
     quiet = [r for r in roles["calibrate"] if r.scene == "held"]
     assert sum(whole.streams.timeline(r).duration_s for r in quiet) >= 36_000
     scenes = {role: {r.scene for r in own} for role, own in roles.items()}
-    assert scenes["learn"] == set(whole.learn_scenes)
+    assert scenes["learn"] == set(whole.classifier.scenes)
     assert {"taps", "machine", "mains_bursts", "dead_channel"} <= scenes["test"]
 
 
@@ -467,10 +464,11 @@ def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
     config = composed(
         *("data._target_=test_alarm.Streams", "+data.scenes=[paper]", "data.cycles=2"),
         *("split.seen=[a,b]", "split.unseen=[new]", "split.train_fraction=0.5"),
-        *("onset=alarms", "onset.learn_scenes=[paper,held]", "onset.learn_cycles=1"),
+        *("onset=alarms", "onset.classifier.scenes=[paper,held]"),
+        *("onset.classifier.cycles=1", "~onset.check_hours", "+onset.check_hours={others: 0.1}"),
         *(f"~onset.{key}" for key in replaced),
         *(f"+onset.{key}={value}" for key, value in replaced.items()),
-        *("recipe=robust", "recipe.num_features=10", "cache=off", "num_workers=0", "export=false"),
+        *("recipe=paper", "recipe.num_features=10", "cache=off", "num_workers=0", "export=false"),
     )
     train(config, tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())

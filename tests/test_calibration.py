@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.special import expit, logit
-from sklearn.isotonic import IsotonicRegression
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import brier_score_loss, log_loss
 
@@ -47,47 +46,17 @@ def test_platt_is_sklearns_logistic_regression_towards_platts_targets(scale, shi
     np.testing.assert_allclose(llr, expected, atol=1e-6, rtol=1e-6)
 
 
-def test_backward_scores_are_refused_by_the_line_and_flat_by_steps(rng):
+def test_backward_scores_are_refused(rng):
     scores, is_slip = tensors(*logistic_bins(rng, 300, -1.5, 0.0))
     with pytest.raises(ValueError, match="slip has the lower scores; change their sign"):
         calibration.fit_platt(scores, is_slip)
     assert calibration.fit_platt(-scores, is_slip).slope > 1
-    falling = torch.arange(50.0)
-    assert calibration.fit_isotonic(falling, falling < 20).llrs == (0.0,)
-
-
-# ---------------------------------------------------------------------------------- isotonic
-@pytest.mark.parametrize("levels", [None, 9])
-@pytest.mark.parametrize("weighted", [False, True])
-def test_steps_are_sklearns_isotonic_regression(levels, weighted, rng):
-    """The two ends that tell nothing are given to the oracle as bins; ties as well."""
-    scores, is_slip = logistic_bins(rng, 300, 1.0, -1.0)
-    if levels:
-        scores = np.round(scores * levels / 8) / levels
-    weights = rng.uniform(0.2, 3, 300) if weighted else np.ones(300)
-    share = (weights * is_slip).sum() / weights.sum()
-    x = np.r_[scores, np.repeat([scores.min(), scores.max()], 2)]
-    y = np.r_[is_slip, 1, 0, 1, 0].astype(float)
-    w = np.r_[weights, np.tile([2 * share, 2 * (1 - share)], 2)]
-    steps = IsotonicRegression().fit(x, y, sample_weight=w).predict(scores)
-    expected = logit(steps) - logit(share)
-
-    fitted = calibration.fit_isotonic(*tensors(scores, is_slip, weights))
-    np.testing.assert_allclose(fitted.llrs, np.unique(np.round(expected, 10)), atol=1e-9)
-    for knot, llr in zip(fitted.scores, fitted.llrs, strict=True):
-        own = np.isclose(expected, llr, atol=1e-9, rtol=0)
-        assert scores[own].min() <= knot <= scores[own].max()
-        # the knot is the median by weight of its step
-        below, above = (weights[own & side].sum() for side in (scores < knot, scores > knot))
-        assert max(below, above) <= weights[own].sum() / 2 + 1e-9
 
 
 # ----------------------------------------------------------------------------- what all share
 CALIBRATIONS = {
     "platt": calibration.Platt(1.7, -0.4),
     "flat": calibration.Platt(0.0, 0.0),
-    "isotonic": calibration.Isotonic((-1.5, 0.25, 2.0), (-4.0, 0.5, 3.0)),
-    "one knot": calibration.Isotonic((1.0,), (0.0,)),
 }
 
 
@@ -110,9 +79,6 @@ def test_huge_scores_give_finite_ratios_and_nan_stays(name, dtype):
 NO_CALIBRATIONS = [
     {"kind": "platt", "slope": -1.0, "offset": 0.0},
     {"kind": "platt", "slope": 1.0, "offset": 0.0, "more": 1.0},
-    {"kind": "isotonic", "scores": [1.0, 0.0], "llrs": [0.0, 1.0]},
-    {"kind": "isotonic", "scores": [0.0, 1.0], "llrs": [1.0, 0.0]},
-    {"kind": "isotonic", "scores": [0.0], "llrs": [math.nan]},
     {},
 ]
 
@@ -133,12 +99,11 @@ NOT_TO_BE_FITTED = [
 ]
 
 
-@pytest.mark.parametrize("fit", [calibration.fit_platt, calibration.fit_isotonic])
 @pytest.mark.parametrize(("scores", "is_slip", "weights", "message"), NOT_TO_BE_FITTED)
-def test_what_cannot_be_fitted_is_refused_in_a_line(fit, scores, is_slip, weights, message):
+def test_what_cannot_be_fitted_is_refused_in_a_line(scores, is_slip, weights, message):
     given = torch.tensor(scores), torch.tensor(is_slip, dtype=torch.bool)
     with pytest.raises(ValueError, match=message):
-        fit(*given, None if weights is None else torch.tensor(weights))
+        calibration.fit_platt(*given, None if weights is None else torch.tensor(weights))
 
 
 # -------------------------------------------------------------------------------- probability

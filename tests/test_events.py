@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tactslip_torch.onset.events import (
+    EventRecord,
     EventRules,
     LatencyParts,
-    Watched,
     pooled_metrics,
     recording_events,
 )
@@ -26,7 +26,7 @@ def watched(alarms=(), onsets=(1.0,), slides=None, speeds=None, **more):
     facts = {"recording": "a", "material": "M1", "scene": "paper", "duration_s": 10.0}
     facts |= {"alarms_s": tuple(alarms), "onset_estimates_s": (), "onsets_s": tuple(onsets)}
     facts |= {"sliding_s": slides, "speeds_mm_s": speeds or (20.0,) * len(onsets)}
-    return Watched(**(facts | more))
+    return EventRecord(**(facts | more))
 
 
 def events_of(one, rules=RULES):
@@ -81,7 +81,7 @@ def as_watched(made):
         return tuple(time / 1000 for time in times)
 
     released = zip(made.firsts, made.slides, strict=True) if made.told else ()
-    return Watched(
+    return EventRecord(
         recording=f"{made.number}",
         material=f"M{made.number % 3}",
         scene="paper",

@@ -25,7 +25,7 @@ from tactslip_torch.deploy.check import check_model, compare, runner, session_of
 from tactslip_torch.deploy.stream import onset_memory, onset_scores, stream_graph
 from tactslip_torch.deploy.value import F32, F64, I64, Graph
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.calibration import Isotonic, Platt
+from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
@@ -335,7 +335,6 @@ def watching(
     rule="k_of_n",
     hop=20,
     threshold=1.0,
-    isotonic=False,
     onset=None,
     floors=False,
 ):
@@ -348,9 +347,6 @@ def watching(
     scores = score_stream(detector, signal(900, 99), 20).score  # of no stream below
     middle, spread = float(scores.median()), float(scores.std())
     calibration = Platt(2 / spread, -2 * middle / spread)
-    if isotonic:
-        knots = tuple(middle + spread * x for x in (-2.0, -0.5, 0.0, 0.5, 1.0))
-        calibration = Isotonic(knots, (-3.0, -2.0, -0.5, 1.0, 2.5))
     times = {"rearm_s": 0.02, "refractory_s": 0.05, "lead_s": 0.03}
     more = {"target_per_hour": 1.0, "slip_share": 0.3, "onset": onset, "hold_s": 0.05, **times}
     settings = AlarmSettings(hop, calibration, RULES[rule], threshold, **more)
@@ -423,17 +419,16 @@ def with_losses(samples, losses):
     kind=st.sampled_from(KINDS),
     align=st.sampled_from(ALIGNMENTS),
     rule=st.sampled_from(list(RULES)),
-    isotonic=st.booleans(),
     hop=st.sampled_from([7, 20, 120]),
     floors=st.booleans(),
     seed=st.integers(0, 20),
     losses=st.lists(LOSSES, max_size=4),
 )
 def test_any_cut_gives_what_the_detector_gives(
-    num_samples, cuts, kind, align, rule, isotonic, hop, floors, seed, losses
+    num_samples, cuts, kind, align, rule, hop, floors, seed, losses
 ):
     samples = with_losses(signal(1200, seed), losses)
-    options = {"kind": kind, "align": align, "rule": rule, "isotonic": isotonic, "hop": hop}
+    options = {"kind": kind, "align": align, "rule": rule, "hop": hop}
     assert_same_stream(samples[:, :num_samples], cuts, floors=floors, **options)
 
 

@@ -14,9 +14,9 @@ from matplotlib.colors import to_hex
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.events import (
+    EventRecord,
     EventRules,
     LatencyParts,
-    Watched,
     pooled_metrics,
     recording_events,
 )
@@ -72,7 +72,7 @@ def events_of(quiet_s=60.0, compute_s=None):
     events = []
     for number in range(20):
         alarms_s = {0: (0.9,), 1: ()}.get(number % 10, (1 + 0.01 * number, 4.0 + 0.05 * number))
-        watched = Watched(
+        watched = EventRecord(
             *(str(number), "M1", "paper", duration_s, alarms_s, ()),
             *((1.0,), ((1.0, 2.0),), (20.0,)),
         )

@@ -16,18 +16,20 @@ from hypothesis import strategies as st
 from scipy.stats import beta, chi2
 from torch import Tensor
 
-from tactslip_torch.onset import thresholds
+from tactslip_torch.onset import rules
 from tactslip_torch.onset.rules import (
     NOTHING_YET,
     RULES,
+    Budget,
     Cusum,
     KOfN,
     Latch,
     Rule,
+    false_alarms,
     latch,
+    lowest_threshold,
     rule_from_dict,
 )
-from tactslip_torch.onset.thresholds import Budget, false_alarms, lowest_threshold
 
 LIST = (KOfN(1, 1), KOfN(2, 3), KOfN(7, 20), Cusum(), Cusum(drift=0.3, evidence=0.2, ceiling=3.0))
 LIST += (Cusum(np.float64(0.13), np.float64(0.37), 5.3),)
@@ -269,7 +271,7 @@ def test_the_lowest_threshold_is_that_of_trying_every_value(
     given_ = {**how, "is_raised": raised} if has_other else how
     ranked = np.sort(np.concatenate([row[q] for row, q in zip(scores, quiet, strict=True)]))[::-1]
     limits = {"_MOST_TRIED": most, "_LEAST_QUIET": least_quiet, "_TRIED_ONE_BY_ONE": one_by_one}
-    with patch.multiple(thresholds, **limits):
+    with patch.multiple(rules, **limits):
         if not len(ranked):
             with pytest.raises(ValueError, match="no decision to count alarms in"):
                 lowest_threshold(scores, quiet, allowed, **given_)
@@ -285,6 +287,16 @@ def test_the_lowest_threshold_is_that_of_trying_every_value(
             break
         expected = value
     assert found == expected if one_by_one == 500 else found in {above, *ranked.tolist()}
+
+
+@pytest.mark.parametrize(("num_quiet", "num_high"), [(39, 1), (40, 2), (400, 20)])
+def test_a_score_is_no_alarm_that_is_high_in_more_than_one_of_20_quiet_decisions(
+    num_quiet, num_high
+):
+    """However few alarms it raises: with a long re-arming all of these are one."""
+    scores = np.arange(float(num_quiet))
+    found = lowest_threshold([scores], [np.ones(num_quiet, bool)], 5, rearm=num_quiet, refractory=0)
+    assert int((scores >= found).sum()) == num_high
 
 
 @given(values=drawn_values, how=drawn_times, seed=st.integers(0, 2**20))

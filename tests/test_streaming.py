@@ -17,7 +17,6 @@ from test_rules import ORACLES, by_hand
 
 from tactslip_torch.features.sensing import without_stuck
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.native import reason_unavailable
 from tactslip_torch.onset.decisions import (
     AlarmSettings,
     Decider,
@@ -25,8 +24,7 @@ from tactslip_torch.onset.decisions import (
     score_stream,
     stream_statistic,
 )
-from tactslip_torch.onset.evidence import OnsetStream
-from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN
+from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.streaming import StreamingDetector
 
 HOP = 20
@@ -123,6 +121,32 @@ def test_any_cut_gives_what_the_whole_recording_gives(
     assert_same(found, offline(detector, settings, samples))
 
 
+def test_samples_behind_the_look_ahead_change_no_decision():
+    samples = signal(2000, 5)
+    whole, later = in_pieces(stream_of(), samples), samples.clone()
+    later[:, 1000:] = 7.0
+    is_before = whole.available_s * RATE <= 1000
+    changed = in_pieces(stream_of(), later)
+    assert 10 < int(is_before.sum()) < len(is_before)
+    for name in ("score", "statistic", "is_alarm", "onset_s"):
+        found, expected = (getattr(of, name) for of in (changed, whole))
+        assert torch.equal(found[is_before], expected[is_before]), name
+
+
+def test_channels_may_be_masked_while_a_stream_runs():
+    samples = signal(1800, 5)
+    stream, parts = stream_of(), []
+    for third, masked in zip(samples.T.tensor_split(3), ([], ["SG1", "PVDF2"], []), strict=True):
+        stream.masked_channels = masked
+        parts.append(stream.push(third))
+        assert parts[-1].is_valid.all()  # two of four are enough
+        assert {parts[-1].names_lost(i) for i in range(len(parts[-1].score))} == {tuple(masked)}
+    made, whole = joined_decisions(parts), stream_of().push(samples.T)
+    kept = ~made.channels_lost.any(-1)
+    torch.testing.assert_close(made.score[kept], whole.score[kept], rtol=1e-9, atol=1e-9)
+    assert (made.score[~kept] != whole.score[~kept]).all()
+
+
 # Fast evidence ---------------------------------------------------------------------------------
 
 WITH_ONSET = replace(settings_of(), onset=onset_of(signal(6000, 5), quantile=0.75))
@@ -155,27 +179,6 @@ def test_fast_evidence_leaves_out_channels_that_are_masked(masked):
     found = in_pieces(stream, samples, range(0, 6000, 130)).onset_score
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
     assert bool((found > -1e30).any()) == (len(masked) < 2)
-
-
-@pytest.mark.parametrize("backend", ["native", "torch"])
-def test_fast_evidence_that_is_lost_is_as_if_it_had_not_been(backend):
-    """Up to ``hold_s`` of samples; beyond, the next second has none, as at the beginning."""
-    if backend == "native" and reason_unavailable():
-        pytest.skip(reason_unavailable())
-    onset, hop = WITH_ONSET.onset, 10
-    samples = signal(9000, 6)
-    for num_lost, is_kept in ((1, True), (500, True), (560, False)):
-        holed = samples.clone()
-        holed[2:, 4000 : 4000 + num_lost] = torch.nan
-        lost = range(400, -(-(4000 + num_lost + onset.evidence.context) // hop))
-        found = OnsetStream(onset, backend=backend).push(holed)
-        assert (found[list(lost)] == NOTHING_YET).all()
-        expected = onset.score_recording(samples)[:400]
-        torch.testing.assert_close(found[:400], expected, rtol=0, atol=1e-8)
-        after = found[lost.stop :]
-        first = 0 if is_kept else onset.evidence.memory - 1 + 2
-        assert (after[:first] == NOTHING_YET).all()
-        assert (after[first:] > NOTHING_YET).all()
 
 
 # Times ------------------------------------------------------------------------------------------
@@ -272,6 +275,23 @@ def test_samples_may_come_in_any_form(form):
     found = joined_decisions([stream.push(FORMS[form](samples.T)), stream.flush()])
     assert_same(found, expected)
     assert not found.score.requires_grad
+
+
+@pytest.mark.parametrize(
+    ("samples", "time_s", "words"),
+    [
+        (np.zeros((3, 5)), None, r"\[n, 4\].*\(3, 5\)"),
+        (np.zeros((3, 4), np.int16), None, "floating.*int16"),
+        (np.zeros((3, 4)), [0.1, 0.2], r"time_s.*3.*\(2,\)"),
+    ],
+)
+def test_what_cannot_be_pushed_is_refused_and_changes_nothing(samples, time_s, words):
+    stream, good = stream_of(), signal(1000, 6)
+    before = stream.push(good[:, :500].T)
+    with pytest.raises(ValueError, match=words):
+        stream.push(samples, time_s)
+    found = joined_decisions([before, stream.push(good[:, 500:].T), stream.flush()])
+    assert_same(found, in_pieces(stream_of(), good))
 
 
 def test_what_cannot_be_set_is_refused():

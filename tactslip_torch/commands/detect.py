@@ -34,10 +34,10 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.prediction import masked_names
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.onset.events import (
+    EventRecord,
     EventRules,
     LatencyParts,
     RecordingEvents,
-    Watched,
     first_releases,
     pooled_metrics,
     recording_events,
@@ -187,8 +187,8 @@ def _detect_in(
                 log.decisions(decisions)
             if write:
                 lost = [" ".join(decisions.names_lost(i)) for i in range(len(times))]
-                told = of | {"channels_lost": np.array(lost, object)}
-                write(zip(*(map(_cell, values.tolist()) for values in told.values()), strict=True))
+                named = of | {"channels_lost": np.array(lost, object)}
+                write(zip(*(map(_cell, values.tolist()) for values in named.values()), strict=True))
             for event in stream.take_events():
                 events.append(event._asdict())
                 for log in logs:
@@ -230,7 +230,7 @@ def _with_truth(
     """The entry with what is true of its alarms, and the events."""
     alarms = entry["alarms"]
     ends = [alarm["end_s"] for alarm in alarms]
-    watched = Watched(
+    watched = EventRecord(
         recording=entry["file"],
         material=entry["material"],
         scene=entry["scene"],
@@ -279,7 +279,7 @@ def settings_of(config: DictConfig, detector: SlipDetector) -> AlarmSettings:
 
 
 def _num_pieces(path: Path, context: _DetectionContext) -> int:
-    """For the bar; of a file that cannot be read, as will be said, none."""
+    """For the bar; of a file that cannot be read, which is reported later, none."""
     try:
         with open_file(path, context.reading) as opened:
             return -(-opened.samples.num_samples // context.piece_samples)

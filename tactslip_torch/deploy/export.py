@@ -62,12 +62,12 @@ def export_detector(
         wanted = " or ".join(get_args(GraphKind))
         raise ValueError(f"graphs must be {wanted}, or both, got {', '.join(graphs) or 'none'}")
     if "stream" in graphs:
-        AlarmSettings.of(detector)  # says what is missing before there is anything to undo
+        AlarmSettings.of(detector)  # the error comes before there is anything to undo
     detector_sha256 = _detector_digest(detector, source)
     paths = tuple(Path(folder) / FILES[kind] for kind in graphs)
     with ExitStack() as files:
         for kind, path in zip(graphs, paths, strict=True):
-            beside = files.enter_context(whole_file(sidecar_path(path)))
+            beside = files.enter_context(whole_file(_sidecar_path(path)))
             temporary = files.enter_context(whole_file(path))
             try:
                 if kind == "bin":
@@ -107,7 +107,7 @@ def _digest(path: Path) -> str:
 # Files that are there --------------------------------------------------------------------------
 
 
-def sidecar_path(model: Path) -> Path:
+def _sidecar_path(model: Path) -> Path:
     """Where the metadata of a model stand for hosts that do not read them in its file."""
     return model.with_name(f"{model.name}.json")
 
@@ -119,22 +119,7 @@ def read_sidecar(model: Path) -> dict[str, Any]:
         FileNotFoundError: if they are not there.
         ValueError: if they are damaged.
     """
-    return read_json(sidecar_path(model), FORMAT)
-
-
-def stale_graphs(source: Path) -> tuple[Path, ...]:
-    """Graphs beside a detector's file that are of another one, or do not say of which."""
-    digest = _digest(source)
-
-    def is_stale(path: Path) -> bool:
-        try:
-            told = json.loads(sidecar_path(path).read_bytes())
-            return bool(told["detector_sha256"] != digest)
-        except (OSError, ValueError, LookupError, TypeError):
-            return True
-
-    paths = [source.with_name(name) for name in FILES.values()]
-    return tuple(path for path in paths if path.is_file() and is_stale(path))
+    return read_json(_sidecar_path(model), FORMAT)
 
 
 def summary(path: Path) -> str:

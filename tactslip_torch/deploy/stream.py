@@ -1,9 +1,8 @@
 """The detector that watches a stream, as a graph: ``StreamingDetector.push``.
 
-Samples become decisions, these a statistic (``onset.rules``), and that alarms. What one decision
-hands to the next, and no more, is walked by a ``Scan``, an iteration of which costs as much as
-several nodes do on all decisions together. While nothing speaks for slip, nothing is walked.
-With an onset classifier decisions are its hop apart; its scores are those of ``OnsetStream.push``.
+What one decision hands to the next is walked by a ``Scan``; while nothing speaks for slip, nothing
+is walked. With an onset classifier decisions are its hop apart, with the scores of
+``OnsetStream.push``.
 """
 
 from __future__ import annotations
@@ -19,18 +18,19 @@ from onnx import numpy_helper
 from torch import Tensor
 
 from tactslip_torch.deploy.bins import (
-    SAID_OF_BIN,
+    OF_LAST_BIN,
     Precision,
     RawBin,
     Scored,
     Timing,
     dtype_of,
+    machine,
     memory_shapes,
     memory_size,
     rule_start,
+    scaled,
     score_bins,
 )
-from tactslip_torch.deploy.head import machine, scaled
 from tactslip_torch.deploy.value import BOOL, END, F64, I64, Graph, Value
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
@@ -44,7 +44,7 @@ from tactslip_torch.onset.evidence import (
 from tactslip_torch.onset.rules import NOTHING_YET, Cusum, Rule, most_lost
 from tactslip_torch.signals.filtering import past_matrix
 
-LATCH_START = (0.0, 0.0, 2.0**52)
+_LATCH_START = (0.0, 0.0, 2.0**52)
 """Armed, with no alarm before; the last number counts on exactly in float64."""
 
 
@@ -67,7 +67,7 @@ def stream_graph(
 
     With an onset classifier there are ``onset_score``, float64, and ``by_onset`` too, the threshold
     is the classifier's, and behind the memory of the rule the state has decisions of the alarm in a
-    row that are not valid, what is said of the last bin (``SAID_OF_BIN``, and the channels that
+    row that are not valid, the last bin's columns (``OF_LAST_BIN``, and the channels that
     were lost) and the memory of blocks (``onset_scores``).
 
     Args:
@@ -89,17 +89,17 @@ def stream_graph(
     before = 0.0 if onset is None else math.nan  # what no stream has is no evidence
     nothing = graph.constant(np.full((timing.tail, num_channels), before), dtype)
     no_sample = [math.nan] * num_channels + [0.0] * num_channels
-    starts = [0, 0, 0, *LATCH_START, 0, *no_sample, *rule_start(settings.rule)]
+    starts = [0, 0, 0, *_LATCH_START, 0, *no_sample, *rule_start(settings.rule)]
     start = graph.constant(starts, F64)
     if onset is not None:
-        says_nothing = [0.0, *([math.nan] * 3), 0.0, 0.0, math.inf, *([0.0] * num_channels)]
-        start, given = graph.concat(start, graph.constant(says_nothing, F64), axis=0), state
+        no_bin = [0.0, *([math.nan] * 3), 0.0, 0.0, math.inf, *([0.0] * num_channels)]
+        start, given = graph.concat(start, graph.constant(no_bin, F64), axis=0), state
         small = timing.state_size - memory_size(onset.evidence)
         state = given.slice(0, small, 0)
     else:
         small = timing.state_size
     state = graph.concat(state, start, axis=0).slice(0, small, 0)
-    marked, stuck = without_stuck(
+    marked, stuck = _without_stuck(
         samples, state.slice(7, 7 + 2 * num_channels, 0), detector.sensing.stuck_samples
     )
     held = graph.concat(nothing, tail, marked, axis=0)
@@ -114,11 +114,8 @@ def stream_graph(
     if onset is not None:
         outputs |= {"onset_score": F64, "by_onset": BOOL}
     rate_hz = detector.pool.sample_rate_hz
-    rearm, refractory = (
-        settings.decisions(seconds, rate_hz)
-        for seconds in (settings.rearm_s, settings.refractory_s)
-    )
-
+    latch_times = tuple(settings.latch_times(rate_hz).values())
+    decision_samples = settings.decision_samples
     window = timing.raw.length
     hold = round(settings.hold_s * rate_hz)
 
@@ -137,6 +134,37 @@ def stream_graph(
         llr: Any = settings.calibration.llr(known)
         return number, scored, llr.clamp(-LARGEST, LARGEST)
 
+    def gathered(
+        number: Value, scored: Scored, llr: Value, run: Value, of_rule: Value, lost: Value
+    ) -> list[Value]:
+        """Statistics, where runs of positive ratios began, and what rule and ``lost`` are then."""
+
+        def simply() -> list[Value]:
+            statistic, after = _statistic_of(settings.rule, llr, of_rule)
+            return [statistic, _latest(llr <= 0.0, run, number + 1.0), after, lost]
+
+        def with_gaps() -> list[Value]:
+            gaps = _Gaps.of(scored.is_valid, number, lost, most)
+            statistic, after = gaps.statistic_of(settings.rule, llr, of_rule)
+            is_end = ((llr <= 0.0) & scored.is_valid) | gaps.is_over
+            return [statistic, _latest(is_end, run, number + 1.0), after, gaps.lost_after]
+
+        return graph.if_(_is_whole(scored.is_valid, lost), simply, with_gaps)
+
+    def raised(
+        statistic: Value, high: Value, number: Value, of_latch: Value, valid: Value, lost: Value
+    ) -> list[Value]:
+        """Alarms, whether one stands, and what latch and ``lost`` are then."""
+
+        def simply() -> list[Value]:
+            return [*_latched(statistic, high, number, of_latch, *latch_times), lost]
+
+        def with_gaps() -> list[Value]:
+            gaps = _Gaps.of(valid, number, lost, most_lost(window, hold, decision_samples))
+            return [*gaps.latched(statistic, high, number, of_latch, *latch_times), gaps.lost_after]
+
+        return graph.if_(_is_whole(valid, lost), simply, with_gaps)
+
     def only_valid(value: Any, scored: Scored) -> Value:
         return graph.where(scored.is_valid, value, math.nan)
 
@@ -147,27 +175,12 @@ def stream_graph(
     sizes_before = [1, 1, 1, 3, 1, 2 * num_channels, len(rule_start(settings.rule))]
 
     def decide() -> list[Value]:
-        sizes = graph.axes(*sizes_before)
-        parts = graph.ops("Split", state, sizes, dtypes=[F64] * 7, axis=0)
+        parts = graph.ops("Split", state, graph.axes(*sizes_before), dtypes=[F64] * 7, axis=0)
         _, made, run, of_latch, lost, _, of_rule = parts
         number, scored, llr = bins(made)
         high = level(settings.threshold, dtype)
-
-        def simply() -> list[Value]:
-            statistic, after = statistic_of(settings.rule, llr, of_rule)
-            latch = latched(statistic, high, number, of_latch, rearm=rearm, refractory=refractory)
-            runs = _latest(llr <= 0.0, run, number + 1.0)
-            return [statistic, *latch, runs, after, lost]
-
-        def with_gaps() -> list[Value]:
-            gaps = Gaps.of(scored.is_valid, number, lost, most)
-            statistic, after = gaps.statistic_of(settings.rule, llr, of_rule)
-            latch = gaps.latched(statistic, high, number, of_latch, rearm, refractory)
-            is_end = ((llr <= 0.0) & scored.is_valid) | gaps.is_over
-            return [statistic, *latch, _latest(is_end, run, number + 1.0), after, gaps.lost_after]
-
-        is_whole = _is_whole(scored.is_valid, lost)
-        statistic, alarm, on, memory, runs, after, lost = graph.if_(is_whole, simply, with_gaps)
+        statistic, runs, after, _ = gathered(number, scored, llr, run, of_rule, lost)
+        alarm, on, memory, lost = raised(statistic, high, number, of_latch, scored.is_valid, lost)
         return [
             scored.score,
             only_valid(stated(llr), scored),
@@ -193,28 +206,15 @@ def stream_graph(
 
     def join(onset: OnsetClassifier) -> list[Value]:
         """Decisions a hop of the classifier apart, from its scores and the last bin by then."""
-        num_said = len(SAID_OF_BIN) + num_channels
-        sizes = graph.axes(*sizes_before, 1, num_said)
+        num_kept = len(OF_LAST_BIN) + num_channels
+        sizes = graph.axes(*sizes_before, 1, num_kept)
         parts = graph.ops("Split", state, sizes, dtypes=[F64] * 9, axis=0)
-        before, made, run, of_latch, lost, _, of_rule, alarm_lost, said = parts
+        before, made, run, of_latch, lost, _, of_rule, alarm_lost, last_bin = parts
         memory = onset_memory(given, small, onset.evidence)
 
         def decide_bins() -> list[Value]:
             number, scored, llr = bins(made)
-
-            def simply() -> list[Value]:
-                statistic, after = statistic_of(settings.rule, llr, of_rule)
-                return [statistic, _latest(llr <= 0.0, run, number + 1.0), after, lost]
-
-            def with_gaps() -> list[Value]:
-                gaps = Gaps.of(scored.is_valid, number, lost, most)
-                statistic, after = gaps.statistic_of(settings.rule, llr, of_rule)
-                is_end = ((llr <= 0.0) & scored.is_valid) | gaps.is_over
-                runs = _latest(is_end, run, number + 1.0)
-                return [statistic, runs, after, gaps.lost_after]
-
-            is_whole = _is_whole(scored.is_valid, lost)
-            statistic, runs, after, now_lost = graph.if_(is_whole, simply, with_gaps)
+            statistic, runs, after, now_lost = gathered(number, scored, llr, run, of_rule, lost)
             unwaiting = replace(timing, frame=0)
             onset_s = _times_s(number, runs, settings, unwaiting, rate_hz)[1]
             columns = (
@@ -227,11 +227,11 @@ def stream_graph(
             )
             of_bins = [x.cast(F64).unsqueeze(1) for x in columns]
             made_rows = graph.concat(*of_bins, scored.channels_lost.cast(F64), axis=1)
-            rows = graph.concat(said.unsqueeze(0), made_rows, axis=0)
+            rows = graph.concat(last_bin.unsqueeze(0), made_rows, axis=0)
             return [rows, decided, _last(runs), after, now_lost]
 
         rows, *of_bins = graph.if_(
-            decided > made, decide_bins, lambda: [said.unsqueeze(0), made, run, of_rule, lost]
+            decided > made, decide_bins, lambda: [last_bin.unsqueeze(0), made, run, of_rule, lost]
         )
         hop, of_bin = float(onset.evidence.hop_samples), float(timing.hop)
         hops, first = (seen / hop).floor(), (before / hop).floor()
@@ -254,27 +254,17 @@ def stream_graph(
             if timing.frame > timing.first:
                 last = graph.where(samples >= float(timing.frame), last, -1.0)
             place = (last - made + 1.0).clamp(min=0.0).cast(I64)  # row 0 is what was known before
-            told = graph.op("Gather", rows, place, axis=0)
+            at_hop = graph.op("Gather", rows, place, axis=0)
             score, stated, statistic, valid, in_range, onset_s = (
-                told[..., i] for i in range(len(SAID_OF_BIN))
+                at_hop[..., i] for i in range(len(OF_LAST_BIN))
             )
             statistic, time_s = statistic.cast(dtype), samples / rate_hz
             is_valid = valid.cast(BOOL) | (onset_score > NOTHING_YET)
             is_high = (by_onset | (statistic >= settings.threshold)).cast(F64)
             one = graph.constant([1.0], F64)
-
-            def simply() -> list[Value]:
-                made = latched(is_high, one, number, of_latch, rearm=rearm, refractory=refractory)
-                return [*made, alarm_lost]
-
-            def with_gaps() -> list[Value]:
-                of_hops = most_lost(window, hold, int(hop))
-                gaps = Gaps.of(is_valid, number, alarm_lost, of_hops)
-                found = gaps.latched(is_high, one, number, of_latch, rearm, refractory)
-                return [*found, gaps.lost_after]
-
-            is_whole = _is_whole(is_valid, alarm_lost)
-            alarm, on, of_alarm, now_lost = graph.if_(is_whole, simply, with_gaps)
+            alarm, on, of_alarm, now_lost = raised(
+                is_high, one, number, of_latch, is_valid, alarm_lost
+            )
             return [
                 score.cast(dtype),
                 stated.cast(dtype),
@@ -285,7 +275,7 @@ def stream_graph(
                 on,
                 time_s,
                 graph.where(by_onset, time_s - onset.lead_s, onset_s).minimum(time_s),
-                told.slice(len(SAID_OF_BIN), END, 1).cast(BOOL),
+                at_hop.slice(len(OF_LAST_BIN), END, 1).cast(BOOL),
                 onset_score,
                 by_onset,
                 next_state(of_alarm, now_lost, after),
@@ -312,9 +302,6 @@ def _windows(
 ) -> Value:
     """The raw samples of each decision, ``[k, channels in use, RawBin.length]``.
 
-    Channels in between that are not in use go along, as columns are costly to pick and rows are
-    not.
-
     Args:
         held: samples, the last of which is number ``seen``, ``[m, C]``.
         seen: how many came so far, ``[1]``.
@@ -325,39 +312,29 @@ def _windows(
     """
     graph, raw = held.graph, timing.raw
     origin = start - seen - float(raw.before)  # negative: counted from the end
-    x = held.slice(origin.cast(I64), END, 0)
-    columns = range(raw.channels[0], raw.channels[-1] + 1)
-    if len(columns) < len(detector.pool.hand):
-        x = x.slice(columns.start, columns.stop, 1)
+    x = held.slice(origin.cast(I64), END, 0).take(raw.channels, 1)
     if raw.before:
         x = graph.if_(
             start < float(raw.before),
-            lambda: [_with_past(x, start.cast(I64), columns, detector, raw)],
+            lambda: [_with_past(x, start.cast(I64), detector, raw)],
             lambda: [x],
         )[0]
     index = (places * timing.hop).unsqueeze(1) + graph.axes(*range(raw.length))
-    windows = graph.op("Gather", x, index, axis=0).transpose(0, 2, 1)
-    if len(columns) == len(raw.channels):
-        return windows
-    return windows.take([columns.index(channel) for channel in raw.channels], 1)
+    return graph.op("Gather", x, index, axis=0).transpose(0, 2, 1)
 
 
-def _with_past(
-    x: Value, start: Value, columns: range, detector: SlipDetector, raw: RawBin
-) -> Value:
+def _with_past(x: Value, start: Value, detector: SlipDetector, raw: RawBin) -> Value:
     """The first raw bin and what follows, with a made-up past before the stream's start.
 
     Args:
-        x: ``[m, columns]``, from ``RawBin.before`` samples before ``start``.
+        x: ``[m, channels in use]``, from ``RawBin.before`` samples before ``start``.
         start: of the first bin, a sample of the stream, ``[1]``.
-        columns: channels of the hand that are there.
         detector: whose filter makes the past up.
         raw: its raw bin.
     """
     graph, layer = x.graph, detector.channel_filter
     known = x.slice(-start + raw.before, END, 0)
-    shortest = min(layer.window_lengths[channel] for channel in raw.channels)
-    lengths = [layer.window_lengths[c] if c in raw.channels else shortest for c in columns]
+    lengths = [layer.window_lengths[channel] for channel in raw.channels]
     pasts, order = list[Value](), list[int]()
     for length in dict.fromkeys(lengths):
         chosen = [i for i, own in enumerate(lengths) if own == length]
@@ -388,7 +365,7 @@ def _times_s(
     return waited_s, waited_s - (time_s - onset_s)
 
 
-def without_stuck(samples: Value, known: Value, most: int) -> tuple[Value, Value]:
+def _without_stuck(samples: Value, known: Value, most: int) -> tuple[Value, Value]:
     """Samples with NaN where a channel is stuck (``StuckChannels``), and what is kept.
 
     Args:
@@ -508,7 +485,7 @@ def onset_scores(
         moves = moves & ~(own - own.slice(0, 1, 1)).abs().amax(1).eq(0.0)
     never_silent = graph.constant(evidence.silence.isinf().all(0).numpy(), BOOL)
     alive = of_fast.sum(1).isfinite() & (moves | never_silent)
-    is_known = alive.cast(F64).sum(1) >= float(evidence.min_alive or 1)  # [k]
+    is_known = alive.cast(F64).sum(1) >= float(evidence.min_alive)  # [k]
     longest, num_floor = evidence.windows[-1], evidence.memory - evidence.windows[-1]
 
     def scores_of(made: Sequence[Value], num_rows: Value) -> list[Value]:
@@ -520,15 +497,8 @@ def onset_scores(
             rows = graph.concat(kept[of].slice(1 - num, END, 0), made[of], axis=0)
             return _rows(rows, first, range(num))
 
-        def one_floor() -> list[Value]:  # by a product, which copies nothing
-            weights = np.append(np.full(num_floor, 1 / num_floor), np.zeros(longest - 1))
-            return [graph.constant(weights[None], F64) @ kept[0]]
-
-        def floors() -> list[Value]:
-            rows = graph.concat(kept[0], made[0], axis=0)
-            return [_rows(rows, first, range(num_floor)).mean(1)]
-
-        (floor,) = graph.if_(made[0].length(0).eq(1), one_floor, floors)
+        rows = graph.concat(kept[0], made[0], axis=0)
+        floor = _rows(rows, first, range(num_floor)).mean(1)
         to_means = np.zeros((num_windows, longest))
         for row, length in zip(to_means, evidence.windows, strict=True):
             row[-length:] = 1 / length
@@ -564,7 +534,7 @@ def onset_scores(
         return [mean, lost * 0.0, *after]
 
     def some_lost() -> list[Value]:
-        gaps = Gaps.of(is_known, places.cast(F64), lost, most)
+        gaps = _Gaps.of(is_known, places.cast(F64), lost, most)
 
         def nothing_known() -> list[Value]:
             mean = graph.where(is_known, 0.0, graph.constant([NOTHING_YET], F64))
@@ -596,7 +566,7 @@ def _rows(rows: Value, start: Value, places: range) -> Value:
 # Rules and alarms ------------------------------------------------------------------------------
 
 
-def statistic_of(
+def _statistic_of(
     rule: Rule, llr: Value, memory: Value, anew: Value | None = None
 ) -> tuple[Value, Value]:
     """The statistic of each decision as the rule's ``scan`` makes it, and the memory behind.
@@ -647,7 +617,7 @@ def statistic_of(
     return largest.slice(rule.k - 1, rule.k, 1).squeeze(1), kept
 
 
-class Gaps(NamedTuple):
+class _Gaps(NamedTuple):
     """Decisions of which some are not valid: these are left out, and put back (``rules``).
 
     Attributes:
@@ -665,7 +635,7 @@ class Gaps(NamedTuple):
     lost_after: Value
 
     @classmethod
-    def of(cls, valid: Value, number: Value, lost: Value, most: int) -> Gaps:
+    def of(cls, valid: Value, number: Value, lost: Value, most: int) -> _Gaps:
         """Of decisions.
 
         Args:
@@ -693,12 +663,12 @@ class Gaps(NamedTuple):
         return graph.op("Gather", graph.concat(before, values, axis=0), place, axis=0)
 
     def statistic_of(self, rule: Rule, llr: Value, memory: Value) -> tuple[Value, Value]:
-        """As ``statistic_of``; NaN where not valid."""
+        """As ``_statistic_of``; NaN where not valid."""
         graph = llr.graph
 
         def some() -> list[Value]:
             own, anew = self.valid_of(llr), self.valid_of(self.begins_anew)
-            found, after = statistic_of(rule, own, memory, anew)
+            found, after = _statistic_of(rule, own, memory, anew)
             return [self.spread(found, graph.constant([math.nan], llr.dtype)), after]
 
         def none() -> list[Value]:
@@ -715,18 +685,18 @@ class Gaps(NamedTuple):
         memory: Value,
         rearm: int,
         refractory: int,
-    ) -> Latched:
+    ) -> _Latched:
         """As ``latched``; decisions that are not valid raise nothing, and end an alarm in time."""
         graph = statistic.graph
 
         def some() -> list[Value]:
-            found = latched(
+            found = _latched(
                 self.valid_of(statistic),
                 level,
                 self.valid_of(number),
                 memory,
-                rearm=rearm,
-                refractory=refractory,
+                rearm,
+                refractory,
                 first=number.slice(0, 1, 0),
                 anew=self.valid_of(self.begins_anew),
             )
@@ -745,10 +715,10 @@ class Gaps(NamedTuple):
         alarm, on, after = graph.if_(self.has_valid, some, none)
         is_over = _last(self.is_over)
         armed = graph.concat(*[graph.constant([0.0, 0.0], F64), after.slice(2, 3, 0)], axis=0)
-        return Latched(alarm, on & ~self.is_over, graph.where(is_over, armed, after))
+        return _Latched(alarm, on & ~self.is_over, graph.where(is_over, armed, after))
 
 
-class Latched(NamedTuple):
+class _Latched(NamedTuple):
     """Which decisions raise an alarm.
 
     Attributes:
@@ -762,17 +732,17 @@ class Latched(NamedTuple):
     memory: Value
 
 
-def latched(
+def _latched(
     statistic: Value,
     level: Value,
     number: Value,
     memory: Value,
-    *,
     rearm: int,
     refractory: int,
+    *,
     first: Value | None = None,
     anew: Value | None = None,
-) -> Latched:
+) -> _Latched:
     """Alarms as ``onset.rules.latch`` raises them.
 
     One is raised where the statistic is high, and the last alarm is no later than the last
@@ -784,7 +754,7 @@ def latched(
         level: from which on an alarm is raised.
         number: of the decisions in their stream, float64.
         memory: whether an alarm stands, for how many decisions then the statistic was low, and
-            decisions since the last alarm (``LATCH_START``); float64.
+            decisions since the last alarm (``_LATCH_START``); float64.
         rearm: decisions in a row that must be low.
         refractory: shortest distance of two alarms, in decisions.
         first: number of the first decision behind the memory, where others were left out.
@@ -826,7 +796,7 @@ def latched(
         return [is_high, is_high, memory + graph.constant([0, 0, 1], F64) * num]
 
     is_awake = (statistic.amax(0, keepdim=True) >= level) | (memory.slice(0, 1, 0) > 0.0)
-    return Latched(*graph.if_(is_awake, awake, asleep))
+    return _Latched(*graph.if_(is_awake, awake, asleep))
 
 
 def _count_up(num: Value) -> Value:

@@ -67,7 +67,7 @@ class Graph:
         return Value(self, name, dtype)
 
     def output(self, name: str, value: Value, shape: Shape | None) -> None:
-        """Hand a value out under a name; without a shape nothing is said of it."""
+        """Hand a value out under a name; without a shape any will do."""
         self._bodies[-1].nodes.append(helper.make_node("Identity", [value.name], [name]))
         self._bodies[-1].outputs.append(_info(name, value.dtype, shape))
 
@@ -101,7 +101,7 @@ class Graph:
         dtype: np.dtype[Any] | None = None,
         **attributes: Any,
     ) -> Value:
-        """The only output of a node; its dtype is that of the first input if not said."""
+        """The only output of a node; its dtype is that of the first input by default."""
         return self.ops(kind, *inputs, dtypes=(dtype,), **attributes)[0]
 
     def ops(
@@ -213,7 +213,7 @@ def _of_itself(kind: str) -> Callable[[Value], Value]:
 def _with_operand(
     kind: str, dtype: np.dtype[Any] | None = None
 ) -> Callable[[Value, Operand], Value]:
-    """A method that is an operator of two inputs of one dtype; the output has it if not said."""
+    """A method that is an operator of two inputs of one dtype; the output has it by default."""
     return lambda value, other: value.graph.op(kind, value, value.meet(other), dtype=dtype)
 
 
@@ -390,16 +390,6 @@ class Value:
         """Of a constant table of float64, at the places that are these values."""
         return self.graph.op("Gather", self.graph.constant(table, F64), self)
 
-    def places_in(self, knots: Tensor) -> Value:
-        """How many of some knots ``[n]``, ascending, are smaller."""
-        is_larger = self.unsqueeze(-1) > self.graph.constant(knots, F64)
-        return is_larger.cast(I64).sum(-1)
-
-    def interpolated(self, end: Value, weight: Value) -> Value:
-        """From this value to another, exact at both ends: ``torch.lerp``."""
-        rise = end - self
-        return self.graph.where(weight < 0.5, self + weight * rise, end - rise * (1.0 - weight))
-
     @classmethod
     def __torch_function__(
         cls,
@@ -467,8 +457,6 @@ _FUNCTIONS: dict[Callable[..., Any], Callable[..., Value]] = {
     torch.cat: lambda values, dim: values[0].graph.concat(*values, axis=dim),
     torch.minimum: Value.minimum,
     torch.maximum: Value.maximum,
-    torch.lerp: lambda start, end, weight: start.interpolated(end, weight),
-    torch.searchsorted: lambda ascending, values: values.places_in(ascending),
 }
 """Functions of torch that take values, and what they do."""
 

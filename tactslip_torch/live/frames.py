@@ -1,7 +1,7 @@
 """Samples in bytes: lines of text, or binary frames, as a device sends them.
 
 ``Frames`` describes them; a ``FrameReader`` takes bytes as they come, in any pieces, finds the
-frames again behind what is none, and tells what it had to pass over.
+frames again behind what is none, and reports what it passed over.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Frames:
 
     @classmethod
     def of(cls, given: Mapping[str, Any] | None) -> Frames:
-        """From what a configuration says.
+        """From a section of a configuration.
 
         Raises:
             ValueError: for a key or value that is none.
@@ -146,7 +146,7 @@ class Frames:
             channels: of the detector, in its order.
             sample_rate_hz: of the detector.
             begins_inside: whether the first byte may be any of a frame, as of a serial port.
-            now: seconds of a clock, for how often something is told.
+            now: seconds of a clock, for how often something is reported.
 
         Raises:
             ValueError: if the columns lack a channel, a frame has no place in its length, or one
@@ -190,7 +190,7 @@ class FrameReader:
         return [*items, *self._garbage.events(self._is_good)]
 
     def end(self) -> list[Event]:
-        """The stream ended or broke off: what is still to be told. Then as new."""
+        """The stream ended or broke off: what is still to be reported. Then as new."""
         self._buffer.clear()
         self.forget()
         return [*self._garbage.events(True, at_once=True)]
@@ -394,14 +394,14 @@ class _BinaryReader(FrameReader):
         del buffer[:at]
 
     def _no_frame(self) -> str:
-        said = f"no frame of {self._length} bytes that begins with {self._start.hex(' ')}"
-        return f"{said} (two such headers are {self._apart} apart)" if self._apart else said
+        message = f"no frame of {self._length} bytes that begins with {self._start.hex(' ')}"
+        return f"{message} (two such headers are {self._apart} apart)" if self._apart else message
 
     def _has_right_sum(self, at: int) -> bool:
         end = at + self._length - self._sum_bytes
-        told = self._buffer[end : end + self._sum_bytes]
+        sent = self._buffer[end : end + self._sum_bytes]
         content = bytes(self._buffer[at + len(self._start) : end])
-        return self._sum(content) == int.from_bytes(told, self._order)
+        return self._sum(content) == int.from_bytes(sent, self._order)
 
     def _take(self, frame: bytes) -> None:
         if self._lost and self._has_begun and not self._counter_bytes:

@@ -26,9 +26,11 @@ from __future__ import annotations
 
 import json
 import math
+import time
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -37,7 +39,7 @@ from tactslip_torch.data.formats._messages import HEADER, RECORDING, TOPIC, Type
 from tactslip_torch.data.formats._reading import header_of, needs, text_of
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.live.sinks import Block, FileSink, alarm_text, truth_changes
+from tactslip_torch.live.sinks import Array, Block, Sink, alarm_text, truth_changes
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.runtime import whole_file
@@ -55,14 +57,14 @@ _INFO, _WARN = 20, 30
 _CHUNK = 2**18  # bytes; what a killed process loses at most
 
 
-class McapLog(FileSink):
+class McapLog(Sink):
     """A sink that writes an MCAP file, and ``NAME.foxglove.json`` beside it.
 
     The file has its name once it is closed; a ``with`` block that raises leaves none. A killed
     process leaves ``.NAME.*.tmp.mcap``, of which ``mcap recover`` saves all but the last quarter of
     a MiB; copy it first, since the next file of that name removes it. A file without dropped
-    samples and without times of a sender is a recording of ours: ``data.formats`` reads the samples
-    back as they were, with channels, rate and truth.
+    samples and without times of a sender is a recording of this package: ``data.formats`` reads it
+    back with its channels, rate and truth.
 
     Args:
         path: of the file.
@@ -72,7 +74,7 @@ class McapLog(FileSink):
         recording: its truth, units and origin, whatever its samples; ``None``: nothing is known.
         units: of the samples, if there is no recording.
         dtype: in which samples are kept.
-        is_live: whether the first sample is of now, where nobody tells times; else it is at 0.
+        is_live: whether the first sample is of now, where samples have no times; else it is at 0.
 
     Raises:
         ValueError: in one line, if ``mcap`` or ``rosbags`` is not installed, or the path is no
@@ -91,7 +93,12 @@ class McapLog(FileSink):
         dtype: torch.dtype = torch.float32,
         is_live: bool = False,
     ) -> None:
-        super().__init__(path, ".mcap", sample_rate_hz, is_live=is_live)
+        if path.suffix != ".mcap":
+            raise ValueError(f"{path} must end in .mcap")
+        self._rate, self._is_live = sample_rate_hz, is_live
+        self._start_s: float | None = None  # since 1970, of the time 0 of a live stream
+        self._last_s = 0.0  # of the last sample
+        self._stack = ExitStack()
         library = needs("mcap.writer", "writing .mcap")
         none = torch.empty(len(hand), 0, dtype=dtype)
         known = recording or Recording(none, sample_rate_hz, "unknown", (), (), (), units=units)
@@ -113,11 +120,32 @@ class McapLog(FileSink):
             text = self._types.definition(kind).encode()
             schema = self._writer.register_schema(kind, "ros2msg", text)
             self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
-        layout = foxglove_layout(hand, settings, known.units)
+        layout = _foxglove_layout(hand, settings, known.units)
         with whole_file(path.with_suffix(".foxglove.json")) as beside:
             beside.write_text(json.dumps(layout, indent=1) + "\n", encoding="utf-8")
         for time_s, is_slip in truth_changes(recording):
             self._write("truth", time_s, data=is_slip)
+
+    def _times_of(self, first: int, block: Block) -> Array:
+        """When the samples of a block were taken, ``[n]``, on the clock of the stream."""
+        times_s = block.time_s
+        if times_s is None:
+            times_s = (first + np.arange(len(block.samples))) / self._rate
+            if self._is_live and self._start_s is None:
+                self._start_s = time.time()
+        self._last_s = float(times_s[-1]) if len(times_s) else self._last_s
+        return times_s
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: Any
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self._stack.__exit__(kind, error, trace)
 
     def samples(self, first: int, block: Block) -> None:
         """Write a message for each sample."""
@@ -131,7 +159,7 @@ class McapLog(FileSink):
             self._writer.add_message(channel, at, self._prefix + row.tobytes(), at)
 
     def decisions(self, decisions: Decisions) -> None:
-        """Write what each of them says, and alarms as events."""
+        """Write a message of each topic for each, and alarms as events."""
         columns: dict[str, Any] = {
             "probability": decisions.probability,
             "statistic": decisions.statistic,
@@ -205,7 +233,7 @@ class McapLog(FileSink):
 # The layout --------------------------------------------------------------------------------------
 
 
-def foxglove_layout(hand: HandLayout, settings: AlarmSettings, units: str = "V") -> dict[str, Any]:
+def _foxglove_layout(hand: HandLayout, settings: AlarmSettings, units: str = "V") -> dict[str, Any]:
     """Panels for such a file, as Foxglove imports them (Layouts, Import from file).
 
     A plot of the channels of each kind, the probability, the statistic and, with an onset

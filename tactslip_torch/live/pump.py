@@ -6,20 +6,22 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack
 from queue import SimpleQueue
 
 import numpy as np
 
-from tactslip_torch.live.losses import Losses
-from tactslip_torch.live.sinks import Block, Counts, Event, Placed, Sink, Source, merged
+from tactslip_torch.live.sinks import Block, Counts, Event, Placed, Sink, Source, counted, merged
 from tactslip_torch.onset.decisions import Decisions
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.runtime import one_thread
 
 _LONGER_S = 0.01  # than what StreamingDetector fills: begins a stream anew
 _PATIENCE_S = 10.0  # for sinks, when all is to end
+_LONG_S = 1.0  # a stretch of lost samples that lasts longer is reported before it ends
+_AT_ONCE, _EACH_S = 10, 6.0  # stretches that are reported one by one, and when there is one more
+_MOST_NAMES = 24
 _BREAKS = ("lost", "waiting", "gap", "dropped")
 """Events behind which samples are lacking."""
 
@@ -33,17 +35,17 @@ def watch(
     counts: Counts | None = None,
     events: SimpleQueue[Event] | None = None,
 ) -> Counts:
-    """Watch a source until it ends: each sample through the detector, what it says to all sinks.
+    """Watch a source until it ends: each sample through the detector, decisions to all sinks.
 
     One thread reads, one decides and calls the sinks; this one waits. Where the source is live and
-    ``queue_s`` of samples wait to be decided on, all of them are dropped, counted and told
+    ``queue_s`` of samples wait to be decided on, all of them are dropped, counted and reported
     (``"dropped"``): decisions are late by no more than that. Behind samples that are lacking
     (dropped, or a connection that was lost) times go on as the clock of this machine did, and a new
     stream of decisions begins, if it is more than ``AlarmSettings.hold_s``.
 
-    What is lost is told (``"missing"``): for each stretch of samples that the same channels lack an
-    event with time, number and channels when it ends, and one before if it lasts over 1 s. Of many
-    stretches some are told together.
+    What is lost is reported (``"missing"``): for each stretch of samples that the same channels
+    lack an event with time, number and channels when it ends, and one before if it lasts over 1 s.
+    Of many stretches some are reported together.
 
     However it ends (a signal, or an exception of a sink), the last decisions are flushed and
     all sinks are closed.
@@ -100,9 +102,9 @@ class _State:
         self._changed = threading.Condition()
         self._is_over = False
         self._next: int | None = None  # index of the sample that would go on
-        self._is_break_told = False
+        self._is_break_reported = False
         pool = stream.detector.pool
-        self._losses = Losses(pool.hand.names, pool.sample_rate_hz)
+        self._losses = _Losses(pool.hand.names, pool.sample_rate_hz)
         self.error: BaseException | None = None
         self.is_done = threading.Event()
 
@@ -182,13 +184,13 @@ class _State:
                 while items := self._get():
                     for item in merged(items):
                         if isinstance(item, Event):
-                            self._tell(*(self._losses.end() if item.kind == "gap" else ()), item)
+                            self._report(*(self._losses.end() if item.kind == "gap" else ()), item)
                         else:
                             self._push(*item)
                 self._hand_on(self._stream.flush())
-                self._tell(*self._losses.end())
+                self._report(*self._losses.end())
                 if self.error is None:
-                    self._tell(Event("ended", f"{self._source.name}: ended"))
+                    self._report(Event("ended", f"{self._source.name}: ended"))
             except BaseException as error:
                 self.error = error
                 self.stop()
@@ -215,15 +217,15 @@ class _State:
         except ValueError as error:
             if block.time_s is None:
                 raise
-            self._tell(Event("garbage", f"{len(block.samples)} samples passed over: {error}"))
+            self._report(Event("garbage", f"{len(block.samples)} samples passed over: {error}"))
             return
         self._next = first + len(block.samples)
-        if self._stream.num_gaps > gaps and not self._is_break_told:
-            self._tell(Event("gap", f"a gap at {first / self._rate:.3f} s: decisions begin anew"))
-        self._is_break_told = False
-        self._tell(*self._losses.take(first, block))
+        if self._stream.num_gaps > gaps and not self._is_break_reported:
+            self._report(Event("gap", f"a gap at {first / self._rate:.3f} s: decisions begin anew"))
+        self._is_break_reported = False
+        self._report(*self._losses.take(first, block))
         of_hand = self._stream.take_events()
-        self._tell(*(Event("hand", f"{event.time_s:.3f} s: {event.text}") for event in of_hand))
+        self._report(*(Event("hand", f"{event.time_s:.3f} s: {event.text}") for event in of_hand))
         for sink in self._sinks:
             sink.samples(first, block)
         self._hand_on(decisions)
@@ -234,9 +236,9 @@ class _State:
             for sink in self._sinks:
                 sink.decisions(decisions)
 
-    def _tell(self, *events: Event) -> None:
+    def _report(self, *events: Event) -> None:
         for event in events:
-            self._is_break_told |= event.kind in _BREAKS
+            self._is_break_reported |= event.kind in _BREAKS
             for sink in self._sinks:
                 sink.event(*event)
 
@@ -245,3 +247,96 @@ class _State:
             sink.close()
         except Exception as error:
             self.error = self.error or error
+
+
+class _Losses:
+    """Finds the stretches in samples as they come.
+
+    Times are those of the decisions: of the sender's clock, or from the first sample on.
+
+    Args:
+        names: of the channels.
+        sample_rate_hz: of the stream.
+    """
+
+    def __init__(self, names: Sequence[str], sample_rate_hz: float) -> None:
+        self._names, self._rate = names, sample_rate_hz
+        self._start = np.full(len(names), -1)  # where the stretch begins that a channel is in
+        self._is_reported = np.zeros(len(names), bool)
+        self._next = 0
+        self._shift_s = 0.0  # from the sender's clock to that of the stream
+        self._ended: dict[tuple[int, int], list[int]] = {}  # unreported: start, stop, channels
+        self._room, self._since = float(_AT_ONCE), 0
+
+    def take(self, first: int, block: Block) -> Iterator[Event]:
+        """Events that come with these samples.
+
+        Args:
+            first: index of the first since the stream's start; what lies before it and behind the
+                last block, all channels lack.
+            block: the samples.
+        """
+        is_lost = ~np.isfinite(block.samples)
+        if block.time_s is not None:
+            self._shift_s = float(block.time_s[0]) - first / self._rate
+        if first > self._next > 0:
+            self._start[self._start < 0] = self._next
+        is_in = self._start >= 0
+        self._next = first + len(is_lost)
+        if is_in.any() or is_lost.any():
+            changes = np.diff(np.vstack([is_in, is_lost]), axis=0)
+            for row, channel in np.argwhere(changes).tolist():
+                self._change(first + row, channel)
+            yield from self._long()
+        if self._ended:
+            yield from self._reported()
+
+    def end(self) -> Iterator[Event]:
+        """What is left at the end of the stream; another may begin."""
+        for channel in np.flatnonzero(self._start >= 0).tolist():
+            self._change(self._next, channel)
+        self._room += 1
+        yield from self._reported()
+        self._next = 0  # and nothing lies between
+
+    def _change(self, place: int, channel: int) -> None:
+        start, self._is_reported[channel] = int(self._start[channel]), False
+        self._start[channel] = -1 if start >= 0 else place
+        if start >= 0:
+            self._ended.setdefault((start, place), []).append(channel)
+
+    def _long(self) -> Iterator[Event]:
+        is_long = (self._start >= 0) & (self._next - self._start > _LONG_S * self._rate)
+        for start in np.unique(self._start[is_long & ~self._is_reported]).tolist():
+            mine = self._start == start
+            self._is_reported |= mine
+            channels = self._named(np.flatnonzero(mine).tolist())
+            yield Event("missing", f"samples of {channels} since {self._time(start)}")
+
+    def _reported(self) -> Iterator[Event]:
+        """Each stretch that has ended, or all at once where there are many."""
+        gained = (self._next - self._since) / self._rate / _EACH_S
+        self._room, self._since = min(self._room + gained, _AT_ONCE), self._next
+        while self._ended and self._room >= 1:
+            self._room -= 1
+            several = list(self._ended.items())[: None if self._room < 1 else 1]
+            (start, _), _ = several[0]
+            stop = max(stop for (_, stop), _ in several)
+            num = sum(stop - start for (start, stop), _ in several)
+            channels = self._named(sorted({one for _, each in several for one in each}))
+            where, num_parts = f"from {self._time(start)} on", len(several)
+            if num_parts > 1:
+                where = f"in {num_parts} stretches from {self._time(start)} to {self._time(stop)}"
+            yield Event("missing", f"{counted(num, 'sample')} of {channels} {where}")
+            for key, _ in several:
+                del self._ended[key]
+
+    def _time(self, place: int) -> str:
+        return f"{place / self._rate + self._shift_s:.4f} s"
+
+    def _named(self, channels: Sequence[int]) -> str:
+        if len(channels) == len(self._names) > 1:
+            return f"all {len(channels)} channels"
+        more = len(channels) - _MOST_NAMES
+        named = ", ".join(self._names[channel] for channel in channels[:_MOST_NAMES])
+        return named + (f" and {more} more" if more > 0 else "")

@@ -26,12 +26,14 @@ import importlib.util
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from tactslip_torch.data.formats import Reading, Refused
-from tactslip_torch.data.formats._inference import SECONDS, time_unit_in
+from tactslip_torch.data.formats._inference import SECONDS, epoch_unit, time_unit_in
 from tactslip_torch.data.formats._messages import Message, Topic, TopicColumns, Types
 from tactslip_torch.live.sinks import Block, Event, Sink
 from tactslip_torch.model.detector import SlipDetector
@@ -86,23 +88,21 @@ class TopicMessages:
             rows, stamp, named = self._columns.rows(content)
             samples = rows[:, self._order].astype(np.float64)
         except Exception as error:  # rosbags raises many kinds
-            said = " ".join(str(error).split())[:200] or type(error).__name__
-            return Event("garbage", f"a message on {self._topic.name} was passed over: {said}")
+            message = " ".join(str(error).split())[:200] or type(error).__name__
+            return Event("garbage", f"a message on {self._topic.name} was passed over: {message}")
         time_s = stamp / 1e9 if stamp else None
         if named is not None:
-            time_s = (
-                float(named)
-                * SECONDS[self._how.time_unit or time_unit_in(self._columns.time_name) or "s"]
-            )
+            unit = self._how.time_unit or time_unit_in(self._columns.time_name)
+            time_s = float(named) * SECONDS[unit or epoch_unit(float(named)) or "s"]
         if time_s is None:
             return Block(samples)
         begin_s = self._followed(time_s)
         if begin_s is None:
-            is_told, self._is_back = self._is_back, True
+            is_reported, self._is_back = self._is_back, True
             text = (
                 f"stamps on {self._topic.name} go back to {time_s:.3f} s; start again if they may"
             )
-            return None if is_told else Event("garbage", text)
+            return None if is_reported else Event("garbage", text)
         self._is_back, self._due_s = False, begin_s + len(samples) / self._rate
         return Block(samples, begin_s + np.arange(len(samples)) / self._rate)
 
@@ -117,7 +117,7 @@ class TopicMessages:
     def _first(self, content: bytes) -> TopicColumns:
         name = self._topic.name
         try:
-            columns = TopicColumns(Message(self._topic, 0, content), Types(), self._how)
+            columns = self._columns_of(Message(self._topic, 0, content))
             num = columns.num_channels
         except Refused as error:
             raise ValueError(f"topic {name} of {self._topic.kind}: {error}") from None
@@ -136,6 +136,14 @@ class TopicMessages:
             )
         self._order = [own.index(each) for each in self._hand]
         return columns
+
+    def _columns_of(self, first: Message) -> TopicColumns:
+        """The hand's channels, whatever they are called, unless the reading names them."""
+        if self._how.channels is None:
+            with suppress(Refused):
+                of_hand = replace(self._how, channels=self._hand)
+                return TopicColumns(first, Types(), of_hand)
+        return TopicColumns(first, Types(), self._how)
 
 
 def decision_messages(decisions: Decisions) -> list[tuple[str, dict[str, Any]]]:
@@ -197,9 +205,9 @@ class RosTopic:
         self._node = self._rclpy.create_node("tactslip")
         self._topic = self._node.resolve_topic_name(topic)
 
-    def publisher(self) -> RosPublisher:
+    def publisher(self) -> _Publisher:
         """The sink that publishes decisions; closing it ends the node."""
-        return RosPublisher(self._node)
+        return _Publisher(self._node)
 
     def close(self) -> None:
         """End the iteration."""
@@ -236,7 +244,7 @@ class RosTopic:
             executor.remove_node(self._node)
 
 
-class RosPublisher(Sink):
+class _Publisher(Sink):
     """A sink: decisions as messages of the topics above, published by a node."""
 
     def __init__(self, node: Any) -> None:

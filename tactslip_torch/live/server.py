@@ -17,9 +17,10 @@ import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
 from tactslip_torch.data.formats._reading import needs
@@ -55,6 +56,7 @@ _TICK_S, _STATUS_S = 0.02, 1.0
 _WAITING_S = 2.0  # of samples that may wait for one page
 _MOST_TEXTS = 2000  # that may wait for one page; one that is further behind is sent away
 _MOST_PAGES = 16
+_MOST_OTHERS = 16  # connections that are no open page
 _BACKLOG = 8  # connections that are taken at once, so that files for them do not run out
 _IDLE_S = 10.0  # in which a request must have come and been answered
 _LEAST_TOKEN = 8
@@ -62,7 +64,7 @@ _WRONG_TOKEN_S = 0.5
 _LAST_WORDS_S = 1.0
 
 
-def is_loopback(host: str) -> bool:
+def _is_loopback_name(host: str) -> bool:
     """Whether an address is of this machine alone."""
     try:
         return ipaddress.ip_address(host).is_loopback
@@ -71,7 +73,7 @@ def is_loopback(host: str) -> bool:
 
 
 def page_metadata(detector: SlipDetector, settings: AlarmSettings) -> dict[str, Any]:
-    """What the page is told of a detector: the metadata of its ``stream.onnx``, and more."""
+    """What the page shows of a detector: the metadata of its ``stream.onnx``, and more."""
     from tactslip_torch.deploy.bins import host_metadata  # brings onnx
 
     names = detector.pool.hand.names
@@ -93,7 +95,7 @@ class PageServer(Sink):
     event. Samples are binary, little-endian: uint32 1, uint32 rows, float64 index of the first
     since the stream's start, float32 rows by channels. Times count from the stream's start.
 
-    A page that is too slow misses samples, and is told how many; nothing waits for it.
+    A page that is too slow misses samples, and gets their number; nothing waits for it.
 
     A request is refused if it comes from another site's page, or, on loopback, by another name;
     the socket also without the token, where there is one: of all wrong tokens one in half a second
@@ -135,7 +137,7 @@ class PageServer(Sink):
         tell: Callable[[Event], object] = lambda event: None,
     ) -> None:
         needs("websockets", "serve=true", "live")
-        self._is_loopback = is_loopback(host)
+        self._is_loopback = _is_loopback_name(host)
         if token is None and not self._is_loopback:
             token = secrets.token_urlsafe(16)
         if token is not None and len(token) < _LEAST_TOKEN:
@@ -200,7 +202,7 @@ class PageServer(Sink):
         self._state = kind if kind in _STATES else self._state
         self._text = text
         if not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._tell_state)
+            self._loop.call_soon_threadsafe(self._send_state)
 
     def close(self) -> None:
         """Send what is left, and end."""
@@ -220,9 +222,7 @@ class PageServer(Sink):
     async def _serve(self, port: int) -> None:
         from websockets.asyncio.server import serve
 
-        from tactslip_torch.live._callers import callers
-
-        caller = callers()
+        caller = _caller_class()
         quiet = logging.Logger("page", logging.CRITICAL)  # what strangers send is no news
         try:
             server: Server = await serve(
@@ -251,9 +251,9 @@ class PageServer(Sink):
                 self._send_pending()
                 ticks += 1
                 if ticks % round(_STATUS_S / _TICK_S) == 0:
-                    self._tell_state()
+                    self._send_state()
             self._send_pending()
-            self._tell_state()
+            self._send_state()
             if waits := [asyncio.ensure_future(page.empty.wait()) for page in self._pages]:
                 await asyncio.wait(waits, timeout=_LAST_WORDS_S)
             caller.drop(0)  # else their requests are waited for
@@ -272,7 +272,7 @@ class PageServer(Sink):
         for page in self._pages:
             page.offer(messages)
 
-    def _tell_state(self) -> None:
+    def _send_state(self) -> None:
         self._send_pending()
         for page in self._pages:
             page.offer([(self._status(page.dropped), 0)])
@@ -280,8 +280,8 @@ class PageServer(Sink):
     def _status(self, dropped_to_page: int) -> str:
         status = {"type": "status", "state": self._state}
         counts = {"received": self._counts.received, "dropped": self._counts.dropped}
-        told = {"dropped_to_page": dropped_to_page, "text": self._text}
-        return json.dumps(status | counts | told)
+        of_page = {"dropped_to_page": dropped_to_page, "text": self._text}
+        return json.dumps(status | counts | of_page)
 
     async def _page(self, connection: ServerConnection) -> None:
         page = _Page(connection.send, round(_WAITING_S * self._rate))
@@ -309,7 +309,7 @@ class PageServer(Sink):
         """Files of the page, or a refusal; ``None`` for a socket that may open."""
         path, _, query = request.path.partition("?")
         host = request.headers.get("Host", "")
-        if self._is_loopback and not is_loopback(urlsplit(f"//{host}").hostname or ""):
+        if self._is_loopback and not _is_loopback_name(urlsplit(f"//{host}").hostname or ""):
             return _response(HTTPStatus.FORBIDDEN, b"another name than this machine's\n")
         if (method := getattr(request, "method", "GET")) not in ("GET", "HEAD"):
             return _response(HTTPStatus.METHOD_NOT_ALLOWED, b"GET or HEAD\n")
@@ -382,6 +382,46 @@ class _Page:
             pass
         finally:
             self.empty.set()
+
+
+def _caller_class() -> Any:
+    """Connections of one server: of those that are no open page the oldest make room for others."""
+    from websockets.asyncio.server import ServerConnection
+    from websockets.protocol import State
+
+    class Caller(ServerConnection):
+        made: ClassVar[list[Caller]] = []  # the oldest first
+
+        @classmethod
+        def drop(cls, most: int) -> None:
+            """Close the oldest of those that are no page, until there are no more than ``most``."""
+            others = [each for each in cls.made if each.state is not State.OPEN]
+            for each in others[: max(0, len(others) - most)]:
+                cls.made.remove(each)
+                each.transport.abort()
+
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            super().connection_made(transport)
+            self.made.append(self)
+            self.drop(_MOST_OTHERS)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            if self in self.made:
+                self.made.remove(self)
+            super().connection_lost(exc)
+
+        def send_data(self) -> None:
+            """All at once, and nothing to who is gone: asyncio would log a line for each."""
+            parts = self.protocol.data_to_send()
+            if self.transport.is_closing():
+                return
+            if content := b"".join(parts):
+                self.transport.write(content)
+            if b"" in parts:  # the end
+                with suppress(OSError, RuntimeError):
+                    self.transport.write_eof()
+
+    return Caller
 
 
 def _files_of(folders: Mapping[str, Path]) -> dict[str, tuple[Path, Path]]:

@@ -10,10 +10,8 @@ import math
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self, TextIO, TypeVar
+from typing import Any, NamedTuple, Protocol, TextIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +26,7 @@ Array = NDArray[Any]
 _MOST_WAITING = 1 << 20
 """Bytes that a program which reads lines may be behind."""
 _MOST_READERS, _MOST_TAKEN, _IDLE_S = 16, 256, 10.0
-_TOLD_EVERY_S, _TOLD_AT_LEAST_S = 1.0, 60.0
+_REPORT_EVERY_S, _REPORT_AT_LEAST_S = 1.0, 60.0
 
 
 class Block(NamedTuple):
@@ -36,7 +34,7 @@ class Block(NamedTuple):
 
     Attributes:
         samples: ``[n, C]``, float64; NaN for missing ones.
-        time_s: when each was taken, by the sender's clock, ``[n]``, float64; ``None``: not told.
+        time_s: when each was taken, by the sender's clock, ``[n]``, float64; ``None``: not known.
     """
 
     samples: Array
@@ -64,7 +62,7 @@ class Event(NamedTuple):
 
 
 class Notices:
-    """Counts something, to be told in one line, again only after longer and longer times.
+    """Counts something and reports it in one line, again only after longer and longer times.
 
     Args:
         kind: of the event.
@@ -75,10 +73,10 @@ class Notices:
     def __init__(self, kind: str, word: str, now: Callable[[], float] = time.monotonic) -> None:
         self._kind, self._word, self._now = kind, word, now
         self._num, self._why, self._since_s = 0, "", 0.0
-        self._told_s, self._every_s = -np.inf, _TOLD_EVERY_S
+        self._reported_s, self._every_s = -np.inf, _REPORT_EVERY_S
 
     def add(self, num: int, why: str) -> None:
-        """So many more; the first reason is told."""
+        """So many more; the first reason is reported."""
         if not self._num:
             self._why, self._since_s = why, self._now()
         self._num += num
@@ -86,13 +84,13 @@ class Notices:
     def events(self, is_over: bool = True, *, at_once: bool = False) -> Iterator[Event]:
         """The line, if it is due: it is over, or has lasted."""
         now = self._now()
-        is_due = now - self._told_s >= self._every_s
-        is_due &= is_over or now - self._since_s >= _TOLD_EVERY_S
+        is_due = now - self._reported_s >= self._every_s
+        is_due &= is_over or now - self._since_s >= _REPORT_EVERY_S
         if not self._num or not (is_due or at_once):
             return
-        is_new = now - self._told_s > 4 * self._every_s
-        self._every_s = _TOLD_EVERY_S if is_new else min(2 * self._every_s, _TOLD_AT_LEAST_S)
-        self._told_s = now
+        is_new = now - self._reported_s > 4 * self._every_s
+        self._every_s = _REPORT_EVERY_S if is_new else min(2 * self._every_s, _REPORT_AT_LEAST_S)
+        self._reported_s = now
         yield Event(self._kind, f"{counted(self._num, self._word)} {self._why}")
         self._num = 0
 
@@ -417,51 +415,8 @@ class _Reader:
     content: bytearray = field(default_factory=bytearray)
 
 
-class FileSink(Sink):
-    """A sink whose file gets its name when it is closed; a ``with`` that raises leaves none.
-
-    Args:
-        path: of the file.
-        ending: that it must have.
-        sample_rate_hz: of the stream.
-        is_live: whether the first sample is of now, where nobody tells times; else it is at 0.
-
-    Raises:
-        ValueError: if the path has another ending.
-    """
-
-    def __init__(self, path: Path, ending: str, sample_rate_hz: float, *, is_live: bool) -> None:
-        if path.suffix != ending:
-            raise ValueError(f"{path} must end in {ending}")
-        self._rate, self._is_live = sample_rate_hz, is_live
-        self._start_s: float | None = None  # since 1970, of the time 0 of a live stream
-        self._last_s = 0.0  # of the last sample
-        self._stack = ExitStack()
-
-    def _times_of(self, first: int, block: Block) -> Array:
-        """When the samples of a block were taken, ``[n]``, on the clock of the stream."""
-        times_s = block.time_s
-        if times_s is None:
-            times_s = (first + np.arange(len(block.samples))) / self._rate
-            if self._is_live and self._start_s is None:
-                self._start_s = time.time()
-        self._last_s = float(times_s[-1]) if len(times_s) else self._last_s
-        return times_s
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: Any
-    ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self._stack.__exit__(kind, error, trace)
-
-
 def truth_changes(recording: Recording | None) -> list[tuple[float, bool]]:
-    """Whether a recording slips from 0 s on, and from each change on; empty if nobody said."""
+    """Whether a recording slips from 0 s on, and from each change on; empty if it is not known."""
     if recording is None or not recording.has_truth:
         return []
     slides = sorted((*recording.sliding_s, *recording.slip_s))

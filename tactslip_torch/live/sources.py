@@ -30,7 +30,7 @@ from tactslip_torch.runtime import check_number
 RETRY_S = 0.5
 """Between two tries to connect."""
 SILENT_S = 2.0
-"""Without a byte, and a source is said to be waiting."""
+"""Without a byte, after which a source is reported as waiting."""
 _POLL_S = 0.1  # in which a source notices that it is closed
 _MOST_BYTES = 1 << 16  # of a read
 _PIECE_S, _BLOCK_S = 1.0, 0.005  # of a file: what is read at once, and what is handed on at once
@@ -98,21 +98,21 @@ class _ByteSource(ABC):
 
     def __iter__(self) -> Iterator[Block | Event]:
         """Connect, read, and again."""
-        is_told, is_first = False, True
+        is_reported, is_first = False, True
         while not self._stopped.is_set():
             try:
                 connection = self._connect()
             except OSError as error:
                 if is_first and self._is_mistake:
                     raise
-                if not is_told:
+                if not is_reported:
                     yield Event("waiting", f"{self.name}: {_reason(error)}; {_AGAIN}")
-                is_told = True
+                is_reported = True
                 self._stopped.wait(RETRY_S)
                 continue
             if connection is None:
                 continue
-            is_told = is_first = False
+            is_reported = is_first = False
             yield Event("connected", self._connected())
             reason = yield from self._read(connection)
             yield from self._reader.end()
@@ -120,7 +120,7 @@ class _ByteSource(ABC):
                 break
             if not self._stopped.is_set():
                 yield Event("lost", f"{self.name}: {reason}; {_AGAIN}")
-                is_told = True
+                is_reported = True
 
     def _read(self, connection: _Connection) -> Generator[Block | Event, None, str]:
         came_s, is_silent = time.monotonic(), False
@@ -190,7 +190,7 @@ class SerialPort(_ByteSource):
         try:
             port = self._serial.Serial(self._port, self._baud, timeout=_POLL_S, exclusive=True)
         except self._serial.SerialException as error:
-            raise OSError(self._said(error)) from None
+            raise OSError(self._message(error)) from None
         with suppress(Exception):  # only where the driver has it
             port.set_low_latency_mode(True)
 
@@ -204,7 +204,7 @@ class SerialPort(_ByteSource):
 
         return _Connection(read, port.close)
 
-    def _said(self, error: OSError) -> str:
+    def _message(self, error: OSError) -> str:
         there = needs("serial.tools.list_ports", "a serial port", "live").comports()
         names = ", ".join(sorted(each.device for each in there)) or "none"
         if error.errno == 2 or not Path(self._port).exists():
@@ -296,7 +296,7 @@ class TcpListener(_ByteSource):
         self._listener = listener_at(host, port)
         self.port = self._listener.getsockname()[1]
         super().__init__(f"listen:{host}:{self.port}", frames, detector)
-        self._peer, self._is_told = "", False
+        self._peer, self._is_reported = "", False
 
     def __iter__(self) -> Iterator[Block | Event]:
         """As of all, after a word that it waits."""

@@ -9,36 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, softplus
 
-from tactslip_torch.features.ops import like, looked_up
-
 LARGEST_LLR = 1e30  # where llrs saturate, so that what adds them up stays finite in float32
 LARGEST_SCORE = 1e300  # beyond it the difference of two scores may leave float64
-_END_WEIGHT = 2.0  # of what tells nothing, at either end of an isotonic fit
-
-
-class Calibration(Protocol):
-    """From scores to log likelihood ratios: never falling, differentiable, saturating.
-
-    Written in operations that values of an ONNX graph have too, as is what is below on ratios.
-    """
-
-    def llr(self, score: Tensor) -> Tensor:
-        """Log likelihood ratios: ``[*] -> [*]``, dtype of ``score``; NaN stays NaN."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values; ``calibration_from_dict`` reads them."""
 
 
 @dataclass(frozen=True)
 class Platt:
     """``llr = slope * score + offset``, in float64, rounded once, at most ``LARGEST_LLR``.
+
+    Written in operations that values of an ONNX graph have too.
 
     Raises:
         ValueError: if a number is not finite or the slope negative.
@@ -64,45 +49,7 @@ class Platt:
         return {"kind": "platt", **asdict(self)}
 
 
-@dataclass(frozen=True)
-class Isotonic:
-    """Linear between knots, scores rising and llrs never falling; flat outside (gradient 0).
-
-    Raises:
-        ValueError: if they are no such knots, or not finite.
-    """
-
-    scores: tuple[float, ...]
-    llrs: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        x, y = _row(self.scores), _row(self.llrs)
-        is_finite = (x.abs() <= LARGEST_SCORE).all() and (y.abs() <= LARGEST_LLR).all()
-        is_rising = (x.diff() > 0).all() and (y.diff() >= 0).all()
-        if not 1 <= len(x) == len(y) or not is_finite or not is_rising:
-            raise ValueError(
-                "expected finite knots, as many rising scores as llrs that never fall, got "
-                f"{len(x)} scores and {len(y)} llrs; fit again"
-            )
-
-    def llr(self, score: Tensor) -> Tensor:
-        """Log likelihood ratios: ``[*] -> [*]``, dtype of ``score``; NaN stays NaN."""
-        x, y = _row(self.scores), _row(self.llrs)
-        inside = score.double().clamp(self.scores[0], self.scores[-1])
-        if len(x) == 1:
-            return (inside * 0.0 + self.llrs[0]).type_as(score)
-        place = torch.searchsorted(like(x, inside), inside.detach().contiguous())
-        left = (place - 1).clamp(0, len(x) - 2)
-        tables = x[:-1], x.diff(), y[:-1], y[1:]
-        start, width, low, high = (looked_up(table, left) for table in tables)
-        return torch.lerp(low, high, (inside - start) / width).type_as(score)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values; ``calibration_from_dict`` reads them."""
-        return {"kind": "isotonic", "scores": list(self.scores), "llrs": list(self.llrs)}
-
-
-def calibration_from_dict(plain: Mapping[str, Any]) -> Calibration:
+def calibration_from_dict(plain: Mapping[str, Any]) -> Platt:
     """The calibration that ``to_dict`` wrote.
 
     Raises:
@@ -112,9 +59,7 @@ def calibration_from_dict(plain: Mapping[str, Any]) -> Calibration:
         match dict(plain):
             case {"kind": "platt", **rest}:
                 return Platt(**{name: float(value) for name, value in rest.items()})
-            case {"kind": "isotonic", **rest}:
-                return Isotonic(**{name: tuple(map(float, row)) for name, row in rest.items()})
-        raise ValueError("kind must be platt or isotonic")
+        raise ValueError("kind must be platt")
     except (TypeError, ValueError) as error:
         raise ValueError(f"no calibration of this version: {error}") from error
 
@@ -124,8 +69,7 @@ def fit_platt(scores: Tensor, is_slip: Tensor, weights: Tensor | None = None) ->
 
     Newton's method on the log loss towards Platt's targets, ``(n + 1) / (n + 2)`` for the ``n``
     bins of slip and ``1 / (m + 2)`` for the ``m`` others: separable scores get a finite slope.
-    Equal scores tell nothing, ``llr = 0``. A score far out weighs as much as it is far;
-    ``fit_isotonic`` minds the order alone.
+    Equal scores tell nothing, ``llr = 0``.
 
     Args:
         scores: of held-out bins.
@@ -157,40 +101,6 @@ def fit_platt(scores: Tensor, is_slip: Tensor, weights: Tensor | None = None) ->
         raise ValueError("slip has the lower scores; change their sign or look at the labels")
     slope = max(slope, 0.0) / spread
     return Platt(slope / size, offset - prior - slope * centre)
-
-
-def fit_isotonic(scores: Tensor, is_slip: Tensor, weights: Tensor | None = None) -> Isotonic:
-    """The rising steps of highest likelihood, with lines between the steps' median scores.
-
-    Adjacent violators are pooled. Below and above all scores stands a weight of 2 that tells
-    nothing (as much of it slip as of all bins), so no step is infinite. Scores that tell nothing,
-    or whose order is backwards, get ``llr = 0``.
-
-    Args, Shape and Raises: as ``fit_platt``, but that the order of scores is not asked for.
-
-    Reference:
-        Ayer et al. (1955), Ann. Math. Statist. 26, 641-647; Brummer and du Preez (2006), Computer
-        Speech and Language 20, 230-275.
-    """
-    x, slip, w = _checked("scores", scores, is_slip, weights)
-    share = w[slip].sum() / w.sum()
-    values, place = torch.unique(x, return_inverse=True)
-    mass = values.new_zeros(len(values), 2)  # of slip and of others
-    mass.index_add_(0, place, torch.stack([w * slip, w * ~slip], dim=-1))
-    below = mass.sum(-1).cumsum(0)
-    for end in (0, -1):
-        mass[end] += _END_WEIGHT * torch.stack([share, 1 - share])
-    weight = mass.sum(-1).cpu().numpy()
-    from scipy.optimize import isotonic_regression  # a tenth of what torch takes to import
-
-    rates = isotonic_regression(mass[:, 0].cpu().numpy() / weight, weights=weight).x
-    is_rise = np.diff(rates) > 1e-12 * rates[1:]  # equal but for rounding is one step
-    steps = np.flatnonzero([True, *is_rise, True])
-    odds = torch.from_numpy(np.add.reduceat(mass.cpu().numpy(), steps[:-1])).log()
-    llrs = (odds[:, 0] - odds[:, 1] - torch.logit(share).cpu()).cummax(0).values
-    edges = torch.cat([below.new_zeros(1), below])[torch.from_numpy(steps)]
-    medians = values[torch.searchsorted(below, (edges[:-1] + edges[1:]) / 2)]
-    return Isotonic(tuple(medians.tolist()), tuple(llrs.tolist()) if len(llrs) > 1 else (0.0,))
 
 
 def probability(llr: Tensor, slip_share: float) -> Tensor:
@@ -271,10 +181,6 @@ def _logistic(x: Tensor, target: Tensor, w: Tensor, offset: float) -> tuple[floa
         if move < 1e-9:  # what is left is its square
             break
     return float(at[0]), float(at[1])
-
-
-def _row(values: tuple[float, ...]) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def _checked(

@@ -34,7 +34,7 @@ from tactslip_torch.features.sensing import (
     is_enough,
 )
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.calibration import Calibration, calibration_from_dict
+from tactslip_torch.model.calibration import Platt, calibration_from_dict
 from tactslip_torch.model.calibration import probability as stated
 from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_from_dict
 from tactslip_torch.model.prediction import (
@@ -165,7 +165,7 @@ class SlipDetector(nn.Module):
         )
 
     @property
-    def calibration(self) -> tuple[Calibration, float] | None:
+    def calibration(self) -> tuple[Platt, float] | None:
         """What makes a probability of a score, and the share of slip that it is stated for.
 
         That of the alarm in ``info``; else that of the held-out scores its training chose by, at

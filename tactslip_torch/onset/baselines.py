@@ -1,10 +1,9 @@
-"""The methods that the paper argues against, as scores of a bin.
+"""Scores of a bin by the methods that the paper argues against.
 
-What is thresholded: "filtered vibration amplitudes" (paper II-B, after Romeo and Zollo 2020), here
-the power of the films' band; and "the maximal discrete wavelet transform (DWT) detail coefficient"
-(after Liu et al. 2024), here of the films' detail branches. In both a sensor above the threshold
-suffices, so the largest film counts. A score is the natural log of an amplitude in volts: a
-threshold on it is one on the amplitude, and calibration and sequential rules take it like ours.
+Thresholds lie on "filtered vibration amplitudes" (paper II-B, after Romeo and Zollo 2020), here the
+power of the fast channels' band, and on "the maximal discrete wavelet transform (DWT) detail
+coefficient" (after Liu et al. 2024). The largest fast channel counts. A score is the natural log of
+an amplitude in volts.
 """
 
 from __future__ import annotations
@@ -32,25 +31,24 @@ from tactslip_torch.signals.wavelet import (
     spectrum_matrix,
 )
 
-BaselineName = Literal["film_band_power", "largest_detail"]
+BaselineName = Literal["fast_band_power", "largest_detail"]
 VIBRATION_HZ = (5.0, 400.0)
 """Where the fast-adapting afferents of a hand answer, FA-I 5 to 50 Hz and FA-II 40 to 400 Hz.
 
-The films are the paper's fast-adapting elements. Johansson and Flanagan (2009), Nature Reviews
-Neuroscience 10, 345-359.
+Johansson and Flanagan (2009), Nature Reviews Neuroscience 10, 345-359.
 """
 FLOOR_V = 1e-6
 """Amplitudes below it count as it, so that a dead hand has a score (ours; 16 bits at +-5 V resolve
 150 times as much)."""
-_NO_FILM = "a film's score needs a film; give positions of fast adapting channels"
+_NO_FAST = "a score of fast channels needs one; give their positions"
 
 
-def film_band_power(
+def fast_band_power(
     bins: Tensor,
-    films: Sequence[int] | Tensor,
+    fast: Sequence[int] | Tensor,
     sample_rate_hz: float = 2000.0,
 ) -> Tensor:
-    """Log of the root of the power in the band of touch (``VIBRATION_HZ``), of the strongest film.
+    """Log of the root of the power in the band of touch (``VIBRATION_HZ``), largest channel.
 
     The power is the mean square of the bin's part in the band: its lines by ``rfft``, without a
     window, the constant never among them. Filtering leaves little of it above 182 Hz, the first
@@ -58,42 +56,42 @@ def film_band_power(
 
     Args:
         bins: filtered, in volts.
-        films: positions of the films, the fast adapting channels, or a mask of them.
+        fast: positions of the fast channels, or a mask of them.
         sample_rate_hz: of the bins.
 
     Shape:
         - bins: ``[*, C, n]``
-        - output: ``[*]``, log volts of at least ``FLOOR_V``; NaN where a film is not finite
+        - output: ``[*]``, log volts of at least ``FLOOR_V``; NaN where a fast channel is not finite
 
     Raises:
-        ValueError: if there is no film, or no line of a bin's spectrum lies in the band.
+        ValueError: if there is no fast channel, or no line of a bin's spectrum lies in the band.
     """
-    return _log_of_largest(bins, films, _band_lines(bins.shape[-1], float(sample_rate_hz)), 2)
+    return _log_of_largest(bins, fast, _band_lines(bins.shape[-1], float(sample_rate_hz)), 2)
 
 
 def largest_detail(
     bins: Tensor,
-    films: Sequence[int] | Tensor,
+    fast: Sequence[int] | Tensor,
     wavelet: Wavelet = "rbio2.2",
     level: int = 4,
 ) -> Tensor:
-    """Log of the largest magnitude that a film's detail branches reach within the bin.
+    """Log of the largest magnitude that a fast channel's detail branches reach within the bin.
 
     Args:
         bins: filtered, in volts.
-        films: positions of the films, the fast adapting channels, or a mask of them.
+        fast: positions of the fast channels, or a mask of them.
         wavelet: of the branches, as features have it; a name or filters.
         level: number of levels.
 
     Shape:
         - bins: ``[*, C, n]``
-        - output: ``[*]``, log volts of at least ``FLOOR_V``; NaN where a film is not finite
+        - output: ``[*]``, log volts of at least ``FLOOR_V``; NaN where a fast channel is not finite
 
     Raises:
-        ValueError: if there is no film, or bins are too short for so many levels.
+        ValueError: if there is no fast channel, or bins are too short for so many levels.
     """
     details = branch_matrix(bins.shape[-1], wavelet, level)[1::2].flatten(0, 1)  # D1, D2, ..
-    return _log_of_largest(bins, films, details, math.inf)
+    return _log_of_largest(bins, fast, details, math.inf)
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ class BaselineDetector:
         channel_filter: of that detector.
 
     Raises:
-        ValueError: if there is no such baseline, or the hand has no film.
+        ValueError: if there is no such baseline, or the hand has no fast channel.
     """
 
     name: BaselineName
@@ -116,24 +114,24 @@ class BaselineDetector:
     def __post_init__(self) -> None:
         check_choice("baseline", self.name, get_args(BaselineName))
         if not self.pool.hand.fast:
-            raise ValueError(_NO_FILM)
+            raise ValueError(_NO_FAST)
 
     @property
     def needed_index(self) -> Tensor:
-        """Channels in use, ``[films]``."""
+        """Channels in use, ``[F]``."""
         return torch.tensor(self.pool.hand.fast, dtype=torch.int64)
 
     @property
     def look_ahead(self) -> int:
-        """Samples behind a bin that the filter of the films takes in."""
+        """Samples behind a bin that the fast channels' filter takes in."""
         reaches = self.channel_filter.reaches
-        return max(reaches[film][1] for film in self.pool.hand.fast)
+        return max(reaches[place][1] for place in self.pool.hand.fast)
 
     def predict_raw(self, samples: Tensor, *, given: torch.dtype | None = None) -> Prediction:
         """Filter and score raw bins that come with their context.
 
-        A film that is missing counts as silent. With fewer than half of the films alive the score
-        is NaN and not valid. Other channels are not looked at, and never lost.
+        A fast channel that is missing counts as silent. With fewer than half of them alive the
+        score is NaN and not valid. Other channels are not looked at, and never lost.
 
         Args:
             samples: in volts.
@@ -145,43 +143,43 @@ class BaselineDetector:
         Raises:
             ValueError: if the number of channels or samples is another.
         """
-        given, films, (pool, own) = given or samples.dtype, self.needed_index, self._of_films
+        given, fast, (pool, own) = given or samples.dtype, self.needed_index, self._of_fast
         self.channel_filter.check(samples)
         first = self.channel_filter.context_before - own.context_before
         rest = samples.shape[-1] - 2 * self.channel_filter.context + 2 * own.context
-        raw = samples[..., films, first : first + rest]
+        raw = samples[..., fast, first : first + rest]
         bins = own.valid(raw)
         pool.check(bins)
         high, low = bins.detach().amax(-1).double(), bins.detach().amin(-1).double()
         is_known = torch.maximum(high, -low) <= min(LARGEST_SAMPLE, torch.finfo(bins.dtype).max)
         inverse = pool.inverse_span(given, is_raw=True).to(high.device)
-        none = torch.zeros(len(films), dtype=torch.float64, device=high.device)
+        none = torch.zeros(len(fast), dtype=torch.float64, device=high.device)
         alive = is_alive(high - low, own.raw_magnitude(raw), is_known, inverse, none)
         bins = torch.where(is_known[..., None], bins.to(given), 0.0)
-        if self.name == "film_band_power":
-            score = film_band_power(bins, pool.hand.fast, pool.sample_rate_hz)
+        if self.name == "fast_band_power":
+            score = fast_band_power(bins, pool.hand.fast, pool.sample_rate_hz)
         else:
             score = largest_detail(bins, pool.hand.fast, pool.wavelet, pool.level)
         is_valid = alive.sum(-1) >= self.sensing.min_alive
         is_lost = is_known.new_zeros(samples.shape[:-1])
-        is_lost[..., films] = ~alive
+        is_lost[..., fast] = ~alive
         span = torch.full_like(is_lost, torch.nan, dtype=torch.float64)
-        span[..., films] = torch.where(is_known, high - low, torch.nan)
+        span[..., fast] = torch.where(is_known, high - low, torch.nan)
         score = torch.where(is_valid, score, torch.nan)
         return Prediction(score, is_valid, is_valid, is_lost, span)
 
     @cached_property
     def sensing(self) -> Sensing:
-        """Without training: half of the films must be alive."""
+        """Without training: half of the fast channels must be alive."""
         pool = self.pool
         return Sensing.unknown(len(pool.hand), len(pool.hand.fast), pool.sample_rate_hz)
 
     @cached_property
-    def _of_films(self) -> tuple[FeaturePool, ChannelFilter]:
-        """Pool and filter of the films alone."""
+    def _of_fast(self) -> tuple[FeaturePool, ChannelFilter]:
+        """Pool and filter of the fast channels alone."""
         channels, lengths = self.pool.hand.channels, self.channel_filter.window_lengths
-        hand = HandLayout(tuple(channels[film] for film in self.pool.hand.fast))
-        frames = [lengths[film] for film in self.pool.hand.fast]
+        hand = HandLayout(tuple(channels[place] for place in self.pool.hand.fast))
+        frames = [lengths[place] for place in self.pool.hand.fast]
         settings: dict[str, Any] = self.channel_filter.config() | {
             "window_lengths": frames,
             "kernels": {k: v for k, v in self.channel_filter.kernels.items() if k in frames},
@@ -190,15 +188,15 @@ class BaselineDetector:
 
 
 def _log_of_largest(
-    bins: Tensor, films: Sequence[int] | Tensor, rows: Tensor, order: float
+    bins: Tensor, fast: Sequence[int] | Tensor, rows: Tensor, order: float
 ) -> Tensor:
-    """Log of the largest amplitude among films: the norm of an order of rows times the signal.
+    """Log of the largest amplitude among channels: the norm of an order of rows times the signal.
 
     Rows pass over a constant; the signal is brought to where squares neither overflow nor vanish.
     """
-    x = bins[..., torch.as_tensor(films, device=bins.device), :] if len(films) else bins[..., :0, :]
+    x = bins[..., torch.as_tensor(fast, device=bins.device), :] if len(fast) else bins[..., :0, :]
     if not x.shape[-2]:
-        raise ValueError(_NO_FILM)
+        raise ValueError(_NO_FAST)
     magnitude = torch.maximum(x.amax(-1), -x.amin(-1)).detach()
     unit = power_of_two_below(magnitude)
     x = x / unit[..., None]

@@ -21,7 +21,7 @@ from torch import Tensor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import Sensing, without_stuck
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.calibration import Calibration, calibration_from_dict, probability
+from tactslip_torch.model.calibration import Platt, calibration_from_dict, probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.onset.evidence import OnsetClassifier
@@ -55,8 +55,8 @@ class AlarmSettings:
         calibration: from a score to a log likelihood ratio.
         rule: from these to a statistic.
         threshold: at which the statistic raises an alarm.
-        target_per_hour: false alarms an hour that the threshold was set for; ``None``: for no rate,
-            of false alarms.
+        target_per_hour: false alarms an hour that the threshold was set for; ``None``: no
+            rate was set.
         slip_share: how much of a stream is slip; the balance that probabilities are stated for.
         rearm_s: how long the statistic must stay low before the next alarm.
         refractory_s: shortest time between two alarms.
@@ -73,7 +73,7 @@ class AlarmSettings:
     """
 
     hop_samples: int
-    calibration: Calibration
+    calibration: Platt
     rule: Rule
     threshold: float
     target_per_hour: float | None
@@ -130,15 +130,12 @@ class AlarmSettings:
         of_onset = {} if self.onset is None else {"onset_score": self.onset.threshold}
         return {"statistic": self.threshold} | of_onset
 
-    def decisions(self, seconds: float, sample_rate_hz: float) -> int:
-        """A length of time in decisions, rounded up."""
-        return -(-round(seconds * sample_rate_hz) // self.decision_samples)
-
     def latch_times(self, sample_rate_hz: float) -> dict[str, int]:
-        """What a latch is told, in decisions."""
+        """Times of a latch, in decisions, rounded up."""
+        seconds = {"rearm": self.rearm_s, "refractory": self.refractory_s}
         return {
-            "rearm": self.decisions(self.rearm_s, sample_rate_hz),
-            "refractory": self.decisions(self.refractory_s, sample_rate_hz),
+            name: -(-round(time_s * sample_rate_hz) // self.decision_samples)
+            for name, time_s in seconds.items()
         }
 
     def to_dict(self) -> dict[str, Any]:
@@ -184,7 +181,7 @@ class AlarmSettings:
         return cls.from_dict(detector.info[KEY], detector.pool.hand, detector.pool.sample_rate_hz)
 
 
-def calibration_of(detector: SlipDetector) -> tuple[Calibration, float] | None:
+def calibration_of(detector: SlipDetector) -> tuple[Platt, float] | None:
     """What makes a probability of a detector's score, and the share of slip it is stated for.
 
     As ``SlipDetector.calibration``, whose alarm settings are checked.
@@ -294,28 +291,28 @@ class Alarm:
 
 
 class Decisions(NamedTuple):
-    """One entry per decision, in order; of several streams at once, one row each.
+    """One entry per decision of a stream, in order.
 
-    With an onset classifier there is one every hop of its own, and what is said of bins is that of
+    With an onset classifier there is one every hop of its own, and the columns of bins are those of
     the last bin known by then; before the first bin none is valid. Such a decision is valid where
     the bin is, or where there is fast evidence.
 
     Attributes:
         number: of the decision in its stream, from 0, ``[m]``, int64.
         available_s: when it could be made: the end of its bin and the look-ahead, ``[m]``, float64.
-        onset_s: when the slip is thought to have begun, if this is one, ``[*, m]``, float64.
-        score: at least 0 is slip, NaN where the bin is not valid, ``[*, m]``.
-        llr: log likelihood ratio, NaN likewise, ``[*, m]``.
-        probability: of slip, by the bin alone, NaN likewise, ``[*, m]``.
-        statistic: of the rule, NaN likewise, ``[*, m]``.
-        is_valid: whether the decision counts, ``[*, m]``; one that does not raises no alarm.
-        in_range: whether the channels move about as much as in training, ``[*, m]``.
-        channels_lost: channels in use that were left out, ``[*, m, C]``.
-        is_alarm: whether it raises an alarm, ``[*, m]``.
-        is_on: whether an alarm stands after it: the contact's status, ``[*, m]``.
-        onset_score: of fast evidence, ``NOTHING_YET`` where there is none, ``[*, m]``, float64.
-        by_onset: whether fast evidence reaches its threshold, ``[*, m]``.
-        channels: names of ``C`` channels, empty where they are not told.
+        onset_s: when the slip is thought to have begun, if this is one, ``[m]``, float64.
+        score: at least 0 is slip, NaN where the bin is not valid, ``[m]``.
+        llr: log likelihood ratio, NaN likewise, ``[m]``.
+        probability: of slip, by the bin alone, NaN likewise, ``[m]``.
+        statistic: of the rule, NaN likewise, ``[m]``.
+        is_valid: whether the decision counts, ``[m]``; one that does not raises no alarm.
+        in_range: whether the channels move about as much as in training, ``[m]``.
+        channels_lost: channels in use that were left out, ``[m, C]``.
+        is_alarm: whether it raises an alarm, ``[m]``.
+        is_on: whether an alarm stands after it: the contact's status, ``[m]``.
+        onset_score: of fast evidence, ``NOTHING_YET`` where there is none, ``[m]``, float64.
+        by_onset: whether fast evidence reaches its threshold, ``[m]``.
+        channels: names of ``C`` channels, empty where they are not known.
     """
 
     number: Tensor
@@ -336,7 +333,7 @@ class Decisions(NamedTuple):
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
-        """The alarms that were raised, in order; of one stream."""
+        """The alarms that were raised, in order."""
         return tuple(
             Alarm(
                 alarm_s=float(self.available_s[i]),
@@ -353,14 +350,9 @@ class Decisions(NamedTuple):
         )
 
     def names_lost(self, index: int) -> tuple[str, ...]:
-        """Names of the channels that a decision of one stream was made without."""
+        """Names of the channels that a decision was made without."""
         flags = self.channels_lost[index].tolist()
         return tuple(name for name, lost in zip(self.channels, flags, strict=True) if lost)
-
-    def row(self, index: int) -> Decisions:
-        """Those of one of several streams."""
-        parts: Any = [x[index] if x.ndim > 1 else x for x in self[:-1]]
-        return Decisions._make([*parts, self.channels])
 
 
 def joined_decisions(parts: Sequence[Decisions]) -> Decisions:
@@ -374,22 +366,6 @@ def joined_decisions(parts: Sequence[Decisions]) -> Decisions:
 _OF_BINS = ("onset_s", "score", "llr", "probability", "statistic", "is_valid", "in_range")
 """What decisions with an onset classifier say of the last bin; float64 holds all of it exactly.
 Channels that are lost come behind."""
-
-
-class _Walked(NamedTuple):
-    """What a rule makes of decisions of one stream; a list each.
-
-    Attributes:
-        statistic: NaN where not valid.
-        alarms: which raise one.
-        standing: whether one stands after each.
-        runs: number of the decision with which the unbroken run of positive ratios began.
-    """
-
-    statistic: list[float]
-    alarms: list[bool]
-    standing: list[bool]
-    runs: list[int]
 
 
 class _StreamRule:
@@ -410,57 +386,63 @@ class _StreamRule:
         self._run, self._lost, self._memory = 0, 0, list[float]()
         self._begin()
 
-    def walk(self, ratios: Array, number: int) -> _Walked:
-        """The next decisions ``[m]``, NaN where not valid; the number of the first of them."""
-        lost, found = np.isnan(ratios), _Walked([], [], [], [])
-        places = np.arange(len(ratios))
+    def walk(self, ratios: Array, number: int) -> tuple[Array, Array, Array, Array]:
+        """The next decisions ``[m]``, NaN where not valid; the first of them has this number.
+
+        Returns:
+            The statistic, which decisions raise an alarm, whether one stands after each, and the
+            number of the decision with which its unbroken run of positive ratios began.
+        """
+        statistics, alarms, standing = list[float](), list[bool](), list[bool]()
+        runs = np.empty(len(ratios), np.int64)
+        threshold = float(ratios.dtype.type(self._threshold))
+
+        def latched(statistic: list[float]) -> None:
+            raised, stands, self._latch = latch(
+                statistic, threshold, **self._latch_times, state=self._latch
+            )
+            alarms.extend(raised)
+            standing.extend(stands)
+
+        lost, places = np.isnan(ratios), np.arange(len(ratios))
         edges = np.flatnonzero(lost[1:] != lost[:-1]) + 1
         for part in np.split(places, edges) if len(edges) else [places][: len(ratios)]:
+            statistic = ratios[part].tolist()
             if lost[part[0]]:
                 kept = max(self._most - self._lost, 0)  # decisions that change nothing
                 self._lost += len(part)
-                runs = np.full(len(part), self._run)
-                parts = [self._latched(ratios[part[:kept]].tolist())]
+                runs[part] = self._run
+                latched(statistic[:kept])
                 if len(part) > kept:
                     self._latch = self._latch._replace(is_on=False, below=0)
-                    parts.append(self._latched(ratios[part[kept:]].tolist()))
-                    runs[kept:] = number + part[kept:] + 1
-                statistic = ratios[part].tolist()
+                    latched(statistic[kept:])
+                    runs[part[kept:]] = number + part[kept:] + 1
             else:
                 if self._lost > self._most:
                     self._begin()
-                self._lost, statistic = 0, ratios[part].tolist()
+                self._lost = 0
                 if self._rule is not None:
                     statistic, self._memory = self._rule.scan_row(
                         statistic, self._memory, ratios.dtype.type
                     )
-                parts = [self._latched(statistic)]
+                latched(statistic)
                 began = np.where(ratios[part] > 0, self._run, number + part + 1)
-                runs = np.maximum.accumulate(began)
-            self._run = int(runs[-1])
-            found.statistic.extend(statistic)
-            found.runs.extend(runs.tolist())
-            for alarms, standing in parts:
-                found.alarms.extend(alarms)
-                found.standing.extend(standing)
-        return found
+                runs[part] = np.maximum.accumulate(began)
+            self._run = int(runs[part[-1]])
+            statistics.extend(statistic)
+        flags = np.array(alarms, bool), np.array(standing, bool)
+        return np.array(statistics, ratios.dtype), *flags, runs
 
     def _begin(self) -> None:
         """Forget all that the rule gathered."""
         if self._rule is not None:
             self._memory = self._rule.start(torch.zeros(()).double()).tolist()
 
-    def _latched(self, statistic: list[float]) -> tuple[list[bool], list[bool]]:
-        alarms, standing, self._latch = latch(
-            statistic, self._threshold, **self._latch_times, state=self._latch
-        )
-        return alarms, standing
-
 
 class Decider:
     """Scores in, decisions out; its memory has a fixed size.
 
-    ``decide`` is told of bins alone. With an onset classifier ``join`` makes of these decisions and
+    ``decide`` takes bins alone. With an onset classifier ``join`` makes of these decisions and
     of onset scores those of the alarm: it is raised by whichever reaches its threshold first, and
     stands until both have been low for ``rearm_s``. So bins confirm what fast evidence raised, or
     clear it.
@@ -475,7 +457,7 @@ class Decider:
         look_ahead: samples behind its bin that a decision waits for.
         frame_samples: that must have come before any decision on a bin.
         context_before: samples before its bin that a decision rests on; default: ``look_ahead``.
-        channels: names of the channels, if ``decide`` is told which are lost.
+        channels: names of the channels, if ``decide`` gets which are lost.
         end_s: when so many samples had come, ``[m]``; by default by the sample rate.
 
     Example:
@@ -511,12 +493,15 @@ class Decider:
 
     def reset(self) -> None:
         """Forget everything; the next decision is number 0 of a stream that begins at 0."""
+        settings, onset = self.settings, self.settings.onset
         self._number = 0  # Python's integers do not end
-        self._rules: list[_StreamRule] | None = None
+        self._rule = self._rule_of(settings.rule, settings.threshold, settings.hop_samples)
         self._hop = 0  # of the next onset score
-        self._known: Array | None = None  # of bins, those that count from the next hop on
-        self._first_known = -1  # number of the first of them
-        self._alarm_rules: list[_StreamRule] = []
+        if onset is not None:
+            self._alarm_rule = self._rule_of(None, 1.0, onset.evidence.hop_samples)
+        no_bin = [math.inf, *[math.nan] * 4, 0.0, 0.0, *[0.0] * len(self._channels)]
+        self._known = np.array(no_bin)[:, None]  # of bins that count from the next hop on
+        self._first_known = -1  # number of the first of them: before all bins
 
     def decide(
         self,
@@ -534,38 +519,22 @@ class Decider:
             channels_lost: handed on; default: of no channel.
 
         Shape:
-            - score, is_valid, in_range: ``[*, m]``; m may be 0, the streams ``*`` are always the
-              same; channels_lost: ``[*, m, C]``
+            - score, is_valid, in_range: ``[m]``, m from 0; channels_lost: ``[m, C]``
         """
         settings = self.settings
         valid = is_valid & score.isfinite()
         llr = settings.calibration.llr(torch.where(valid, score, 0.0)).clamp(-LARGEST, LARGEST)
         score, llr = (x.masked_fill(~valid, torch.nan) for x in (score.detach(), llr.detach()))
-        num = score.shape[-1]
-        ratios = llr.numpy().reshape(math.prod(score.shape[:-1]), num)
-        one = ratios.dtype.type
-        if self._rules is None:
-            threshold = float(one(settings.threshold))
-            self._rules = self._rules_of(
-                settings.rule, threshold, settings.hop_samples, len(ratios)
-            )
-        walked = [
-            rule.walk(row, self._number) for row, rule in zip(ratios, self._rules, strict=True)
-        ]
-        columns: list[Array] = [
-            np.array([of[part] for of in walked], kind).reshape(score.shape)
-            for part, kind in enumerate((one, bool, bool, np.int64))
-        ]
-        statistic, alarms, standing, runs = columns
-        number = np.arange(self._number, self._number + num)
-        self._number += num
+        statistic, alarms, standing, runs = self._rule.walk(llr.numpy(), self._number)
+        number = np.arange(self._number, self._number + len(score))
+        self._number += len(score)
         samples = number * settings.hop_samples + self._first
         if settings.onset is None:  # else ``join`` says when
             samples = samples.clip(min=self._frame)
         available_s = self._end_s(samples)
         lasted_s = (number - np.minimum(runs, number)) * settings.hop_samples / self._rate
         if channels_lost is None:
-            channels_lost = valid.new_zeros((*valid.shape, len(self._channels)))
+            channels_lost = valid.new_zeros(len(valid), len(self._channels))
         return Decisions(
             torch.from_numpy(number),
             torch.from_numpy(available_s),
@@ -592,42 +561,30 @@ class Decider:
             onset_score: of the hops that came next.
 
         Shape:
-            - onset_score, output: ``[*, k]``; the streams ``*`` are always the same
+            - onset_score, output: ``[k]``
         """
         onset, settings = self.settings.onset, self.settings
         assert onset is not None
         scores, known = onset_score.numpy(), self._known
-        if known is None:  # before all bins, number -1
-            says_nothing = [math.inf, *[math.nan] * 4, 0.0, 0.0, *[0.0] * len(self._channels)]
-            known = np.multiply.outer(says_nothing, np.ones((*scores.shape[:-1], 1)))
-            num_streams, hop = math.prod(scores.shape[:-1]), onset.evidence.hop_samples
-            self._first_known = -1
-            self._alarm_rules = self._rules_of(None, 1.0, hop, num_streams)
-        if bins.score.shape[-1]:
-            lost = bins.channels_lost.movedim(-1, 0).numpy()
-            made = [*(getattr(bins, name).numpy() for name in _OF_BINS), *lost]
-            known = np.concatenate([known, np.stack(made)], -1)
-        number = np.arange(self._hop, self._hop + scores.shape[-1])
+        if len(bins.score):
+            made = [getattr(bins, name).numpy() for name in _OF_BINS]
+            known = np.concatenate([known, np.stack([*made, *bins.channels_lost.T.numpy()])], -1)
+        number = np.arange(self._hop, self._hop + len(scores))
         samples = (number + 1) * onset.evidence.hop_samples
         last = (samples - self._first) // settings.hop_samples
         last[samples < max(self._frame, self._first)] = -1
         at = last - self._first_known
-        said = known.take(at, -1)
+        latest = known.take(at, -1)
         if len(at) and at[-1]:
-            known, self._first_known = known[..., at[-1] :].copy(), int(last[-1])
+            known, self._first_known = known[:, at[-1] :].copy(), int(last[-1])
         self._known, self._hop = known, self._hop + len(number)
-        began_s, of_bin = said[0], said[1:5].astype(bins.score.numpy().dtype)
+        began_s, of_bin = latest[0], latest[1:5].astype(bins.score.numpy().dtype)
         score, llr, stated, statistic = torch.from_numpy(of_bin).unbind()
         by_onset = scores >= onset.threshold
         with np.errstate(invalid="ignore"):  # NaN is not high
             is_high = by_onset | (of_bin[3] >= of_bin.dtype.type(settings.threshold))
-        is_valid = (said[5] > 0) | (scores > NOTHING_YET)
-        rows = np.where(is_valid, is_high * 1.0, np.nan)
-        rows = rows.reshape(len(self._alarm_rules), len(number))
-        walked = [rule.walk(row, 0) for row, rule in zip(rows, self._alarm_rules, strict=True)]
-        alarms, standing = (
-            np.array([of[part] for of in walked], bool).reshape(scores.shape) for part in (1, 2)
-        )
+        is_valid = (latest[5] > 0) | (scores > NOTHING_YET)
+        _, alarms, standing, _ = self._alarm_rule.walk(np.where(is_valid, is_high * 1.0, np.nan), 0)
         available_s = self._end_s(samples)
         onset_s = np.where(by_onset, available_s - onset.lead_s, began_s)
         return Decisions(
@@ -639,8 +596,8 @@ class Decider:
             stated,
             statistic,
             torch.from_numpy(is_valid),
-            torch.from_numpy(said[6] > 0),
-            torch.from_numpy(said[7:] > 0).movedim(0, -1),
+            torch.from_numpy(latest[6] > 0),
+            torch.from_numpy(latest[7:].T > 0),
             torch.from_numpy(alarms),
             torch.from_numpy(standing),
             onset_score,
@@ -648,12 +605,10 @@ class Decider:
             self._channels,
         )
 
-    def _rules_of(
-        self, rule: Rule | None, threshold: float, hop_samples: int, num: int
-    ) -> list[_StreamRule]:
-        """As many as there are streams, of decisions a hop apart."""
+    def _rule_of(self, rule: Rule | None, threshold: float, hop_samples: int) -> _StreamRule:
+        """Of decisions a hop apart."""
         most = most_lost(self._window, round(self.settings.hold_s * self._rate), hop_samples)
-        return [_StreamRule(rule, threshold, self._latch_times, most) for _ in range(num)]
+        return _StreamRule(rule, threshold, self._latch_times, most)
 
 
 class StreamStatistic(NamedTuple):

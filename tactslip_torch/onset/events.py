@@ -1,8 +1,7 @@
-"""What a detector is evaluated by in use: slips found, how late, and how many false alarms.
+"""Slips found, how late, and false alarms: alarms of recordings matched with their onsets.
 
-Alarms of a recording against its onsets, by event and not by bin (REFERENCE.md section 7), put
-together in numbers with intervals over recordings: a bootstrap that draws as many recordings with
-replacement, since what happens within one hangs together.
+Numbers over recordings have intervals by a bootstrap over recordings, since what happens within
+one is correlated.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ PAPER_SCENE = "paper"
 
 Number = dict[str, float | None]
 """A ``value`` and the ends of its interval, ``low`` and ``high``; these are None where one
-recording alone says nothing of them."""
+recording alone does not determine them."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class EventRules:
 
 
 @dataclass(frozen=True)
-class Watched:
+class EventRecord:
     """One recording as a detector saw it. Decisions and alarms are at the time they are available.
 
     Args:
@@ -164,7 +163,9 @@ class RecordingEvents(NamedTuple):
     latency: LatencyParts
 
 
-def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts) -> RecordingEvents:
+def recording_events(
+    record: EventRecord, rules: EventRules, latency: LatencyParts
+) -> RecordingEvents:
     """What became of each onset that was watched, and which alarms were false.
 
     A slip has three instants: its first element lets go, half of the load has let go (the onset),
@@ -183,22 +184,19 @@ def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts)
     that speaks for slip is full) and decision (from that one to the alarm). Bin fill counts from
     the onset and is negative where that bin was full before it. Where no such decision is known to
     come before the alarm, all is bin fill. Alarms outside the stretches watched are not counted.
-
-    Reference:
-        REFERENCE.md section 7.
     """
     settle_s = rules.settle_s
     if settle_s is None:
         settle_s = latency.bin_s + latency.look_ahead_s + 0.05
     look_ahead, settle, early = (_ns(x) for x in (latency.look_ahead_s, settle_s, rules.early_s))
-    onsets = [_ns(time) for time in watched.onsets_s]
-    releases_s = first_releases(watched.onsets_s, watched.released_s)
+    onsets = [_ns(time) for time in record.onsets_s]
+    releases_s = first_releases(record.onsets_s, record.released_s)
     releases = [_ns(time) for time in releases_s]
     windows = [
         (release - early, max(onset, _ns(end)) + settle)
-        for release, onset, (_, end) in zip(releases, onsets, watched.sliding_s, strict=True)
+        for release, onset, (_, end) in zip(releases, onsets, record.sliding_s, strict=True)
     ]
-    spans = [(_ns(start), _ns(end)) for start, end in watched.watched_s]
+    spans = [(_ns(start), _ns(end)) for start, end in record.watched_s]
 
     def is_watched(time: int) -> bool:
         return not spans or any(start <= time <= end for start, end in spans)
@@ -207,10 +205,10 @@ def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts)
         held = [place for place, (first, last) in enumerate(windows) if first <= time <= last]
         return held[-1] if held else None
 
-    ends = watched.alarm_ends_s or (math.inf,) * len(watched.alarms_s)
+    ends = record.alarm_ends_s or (math.inf,) * len(record.alarms_s)
     raised = [
         _Alarm(at, _ns(end), number, window_of(at))
-        for number, (at, end) in enumerate(zip(map(_ns, watched.alarms_s), ends, strict=True))
+        for number, (at, end) in enumerate(zip(map(_ns, record.alarms_s), ends, strict=True))
         if is_watched(at)
     ]
     events = []
@@ -218,9 +216,9 @@ def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts)
         if not is_watched(onset):
             continue
         num_alarms = sum(alarm.window == place for alarm in raised)
-        speed, release = watched.speeds_mm_s[place], releases[place]
-        known_s = releases_s[place] if watched.released_s else math.nan
-        event = OnsetEvent(watched.onsets_s[place], known_s, speed, "missed", num_alarms)
+        speed, release = record.speeds_mm_s[place], releases[place]
+        known_s = releases_s[place] if record.released_s else math.nan
+        event = OnsetEvent(record.onsets_s[place], known_s, speed, "missed", num_alarms)
         before = [alarm for alarm in raised if alarm.at < release]
         after = [alarm for alarm in raised if alarm.at >= release]
         first, last = windows[place]
@@ -230,13 +228,13 @@ def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts)
             event = event._replace(outcome="early")
         elif after and after[0].at <= until:
             alarm = after[0]
-            positive = watched.first_positive_s[place] if watched.first_positive_s else math.nan
+            positive = record.first_positive_s[place] if record.first_positive_s else math.nan
             spoke = alarm.at if math.isnan(positive) else min(_ns(positive), alarm.at)
-            estimates, delay_s = watched.onset_estimates_s, (alarm.at - onset) / 1e9
+            estimates, delay_s = record.onset_estimates_s, (alarm.at - onset) / 1e9
             event = event._replace(
                 outcome="found",
                 delay_s=delay_s,
-                delay_first_s=(alarm.at - release) / 1e9 if watched.released_s else math.nan,
+                delay_first_s=(alarm.at - release) / 1e9 if record.released_s else math.nan,
                 slid_mm=speed * max(delay_s, 0.0) if speed > 0 else math.nan,
                 bin_fill_s=(spoke - onset - look_ahead) / 1e9,
                 decision_s=(alarm.at - spoke) / 1e9,
@@ -244,17 +242,17 @@ def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts)
             )
         events.append(event)
     quiet = 0
-    for start, end in spans or [(0, _ns(watched.duration_s))]:
+    for start, end in spans or [(0, _ns(record.duration_s))]:
         for first, last in windows:
             quiet += max(0, min(first, end) - start)
             start = max(start, last)
         quiet += max(0, end - start)
     return RecordingEvents(
-        watched.recording,
-        watched.material,
-        watched.scene,
+        record.recording,
+        record.material,
+        record.scene,
         tuple(events),
-        tuple(watched.alarms_s[alarm.number] for alarm in raised if alarm.window is None),
+        tuple(record.alarms_s[alarm.number] for alarm in raised if alarm.window is None),
         quiet / 1e9,
         latency,
     )
@@ -377,7 +375,7 @@ class Bootstrap:
     def _interval(
         self, value: float, drawn: Tensor, recording: Tensor
     ) -> tuple[float | None, float | None]:
-        known = drawn[~drawn.isnan()]  # NaN where a draw says nothing
+        known = drawn[~drawn.isnan()]  # NaN where a draw has none
         if len(recording.unique()) < 2 or not len(known):
             return None, None
         low, high = known.quantile(self._ends).tolist()

@@ -1,19 +1,14 @@
-"""Fast evidence of a slip's beginning, every few milliseconds, and the classifier on it.
-
-When skin lets go, fast channels ring and the shear that slow channels carry falls. Both are told
-from taps, motors and mains by how they spread over channels and by what was there a moment before:
+"""Fast evidence of a slip's beginning, a column vector every few milliseconds, and its classifier.
 
 - *fast channels*: power of four band filters over 10, 25 and 50 ms, as a log ratio to the channel's
-  own floor, the mean of the log power over the last second;
+  noise floor, the mean of the log power over the last second;
 - *slow channels*: steps between means of neighbouring stretches of 10 to 100 ms, their size and,
-  with their sign, how far they stand out of silence: a grip presses, a slip relieves;
+  with their sign, how far they exceed the usual step;
 - each as mean, largest and smallest over the channels of its kind.
 
 Three filters are differences of neighbouring means (Haar wavelets); the fourth first takes away the
-mean of the last periods of the mains, a comb that no harmonic passes. The classifier is the kernel
-machine of degree 2, as for bins; its score is averaged over three hops. All is causal, and of a
-block of samples nothing but its powers and means is kept. The first second of a stream has no
-floor, and so no evidence.
+mean of the last periods of the mains (a comb). The classifier is a kernel machine of degree 2 whose
+score is averaged over three hops. All is causal; the first second of a stream has no evidence.
 """
 
 from __future__ import annotations
@@ -90,7 +85,7 @@ class OnsetEvidence:
         comb_periods: over how many it takes the mean.
         least_rms: root mean square of each fast channel and filter, ``[F, B]``, below which the
             channel is silent; empty: below rounding.
-        min_alive: fast channels that must be alive for evidence; ``None``: half of them.
+        min_alive: fast channels that must be alive for evidence; 0: half of them.
 
     Raises:
         ValueError: if the hand has no fast channel, a hop is longer than 5 ms, or a scale is not
@@ -105,7 +100,7 @@ class OnsetEvidence:
     mains_hz: float = 50.0
     comb_periods: int = 1
     least_rms: tuple[tuple[float, ...], ...] = ()
-    min_alive: int | None = None
+    min_alive: int = 0
 
     def __post_init__(self) -> None:
         if not self.hand.fast:
@@ -126,7 +121,7 @@ class OnsetEvidence:
         least = np.array(self.least_rms or np.zeros(shape), np.float64)
         if least.shape != shape or not (np.isfinite(least) & (least >= 0)).all():
             raise ValueError(f"least_rms must be finite, at least 0 and {list(shape)}")
-        if self.min_alive is None:
+        if not self.min_alive:
             object.__setattr__(self, "min_alive", least_alive(shape[0]))
 
     def blocks_in(self, seconds: float) -> int:
@@ -303,7 +298,7 @@ class OnsetEvidence:
             pools = _over_channels(both, size.sum(1).isfinite() & slow, num_slow)
             columns.append(torch.cat(pools, -1).flatten(-2))
         num_alive = in_use.type_as(level).sum(-1)
-        return torch.cat(columns, -1), num_alive >= float(self.min_alive or 1)
+        return torch.cat(columns, -1), num_alive >= float(self.min_alive)
 
     def to_dict(self) -> dict[str, Any]:
         """All but the hand and the sample rate, which are the detector's."""
@@ -317,7 +312,7 @@ class OnsetClassifier:
     """Whether a slip begins, by the evidence of each hop: at least the threshold says yes.
 
     Args:
-        evidence: what is told of a hop.
+        evidence: what a hop is described by.
         scaler: of its columns.
         head: the machine on scaled columns.
         threshold: of its score.
@@ -496,7 +491,7 @@ class OnsetStream:
         rises = (logs - evidence.silence.T[:, None]).amax(-1)
         assert made.moves is not None  # of blocks that were just made
         alive = logs.sum(-1).isfinite() & ((rises > 0.0) & made.moves | rises.isinf())  # [F, k]
-        is_lost = alive.numpy()[fast].sum(0) < (evidence.min_alive or 1)
+        is_lost = alive.numpy()[fast].sum(0) < evidence.min_alive
         made_rows = torch.cat([logs.transpose(1, 2).flatten(0, 1), made.mean]).T.numpy()
         score, segments = np.full(len(made_rows), math.nan), list[tuple[bool, list[int]]]()
         for hop in range(len(made_rows)):
@@ -539,7 +534,7 @@ def _engine_of(classifier: OnsetClassifier, most_lost: int) -> OnsetEngine:
         scaling=(slope, offset),
         head=(quadratic, head.linear.numpy(), float(head.constant)),
         silence=evidence.silence.T.numpy(),
-        min_alive=evidence.min_alive or 1,
+        min_alive=evidence.min_alive,
         most_lost=most_lost,
     )
 

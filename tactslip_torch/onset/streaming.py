@@ -100,7 +100,7 @@ class StreamingDetector:
         self.num_gaps = 0
         self._events = deque[StreamEvent](maxlen=_MOST_EVENTS)
         self.masked_channels = masked_names(masked_channels, pool.hand.names)
-        self._clock = SampleClock(pool.sample_rate_hz)
+        self._clock = _SampleClock(pool.sample_rate_hz)
         self._max_gap = round(self.settings.hold_s * pool.sample_rate_hz)
         self._wide = pool.widen(torch.empty(0, dtype=dtype)).dtype
         lengths = detector.channel_filter.window_lengths
@@ -335,7 +335,7 @@ class StreamingDetector:
         return decisions
 
 
-class SampleClock:
+class _SampleClock:
     """When the samples of a stream were taken, and how many never came.
 
     Times are those of the last sample that had one and the samples counted since: nothing adds up,

@@ -26,10 +26,10 @@ SCENE = Scene(
     "wood", seed=7, session="sample", strokes=(Stroke(40.0, 40.0, pause_s=1.2),), tail_s=0.4
 )
 _LEFT_OUT = ("validation", "train_recordings", "solve")
-"""What a detector says of its training that is long, and is made again by training again."""
+"""Metadata of the training that are long, and made again by training again."""
 
 
-def make_detector(run: Path) -> None:
+def _make_detector(run: Path) -> None:
     """Keep the detector of a finished run, without what is long, with what its test found."""
     detector = SlipDetector.load(run / "detector.pt")
     splits = json.loads((run / "metrics.json").read_text())["splits"]
@@ -43,7 +43,7 @@ def make_detector(run: Path) -> None:
     detector.save(RECORDING.with_suffix(".pt"))
 
 
-def make_recording() -> None:
+def _make_recording() -> None:
     """Simulate and keep the recording, packed."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.npz"
@@ -63,8 +63,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         train = [sys.executable, "-m", "tactslip_torch", "train", *TRAIN]
         subprocess.run([*train, f"hydra.run.dir={folder}"], check=True)
-        make_detector(Path(folder))
-    make_recording()
+        _make_detector(Path(folder))
+    _make_recording()
     for path in (RECORDING.with_suffix(".pt"), RECORDING):
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 

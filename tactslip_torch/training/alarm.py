@@ -1,12 +1,9 @@
 """The alarm of a fitted detector, set on recordings that it was not trained on.
 
 ``CalibratedAlarm`` fits the onset classifier and sets its threshold and that of bins within a
-budget of false alarms. The recordings that learn, those that calibrate and those that test are
-apart; held-out materials set nothing.
-
-``DebouncedAlarm`` is for sets with too little recorded without slip to count false alarms on: k of
-the last n decisions say slip, by the calibration of the held-out scores that training chose by.
-How often it is false is not known.
+budget of false alarms; recordings that learn, calibrate and test are apart. ``DebouncedAlarm`` is
+for sets with too little recorded without slip to count false alarms: k of the last n decisions
+speak for slip, and the rate of false alarms is not known.
 """
 
 from __future__ import annotations
@@ -16,10 +13,10 @@ import math
 import statistics
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import groupby, product
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,9 +29,7 @@ from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.calibration import (
-    Calibration,
     Platt,
-    fit_isotonic,
     fit_platt,
     probability,
     reliability,
@@ -51,21 +46,25 @@ from tactslip_torch.onset.decisions import (
 )
 from tactslip_torch.onset.events import (
     Bootstrap,
+    EventRecord,
     EventRules,
     LatencyParts,
-    Watched,
     first_releases,
     pooled_metrics,
     recording_events,
 )
 from tactslip_torch.onset.evidence import OnsetClassifier
-from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN, Rule, rule_from_dict
-from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.onset.thresholds import (
+from tactslip_torch.onset.rules import (
+    NOTHING_YET,
     Budget,
+    Cusum,
+    KOfN,
+    Rule,
     false_alarms,
     lowest_threshold,
+    rule_from_dict,
 )
+from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.report.metrics import weights_at_share
 from tactslip_torch.runtime import bar, check_number, in_processes, one_thread
 from tactslip_torch.training.onset import OnsetTraining
@@ -81,12 +80,6 @@ JOINT = "onset and status"
 FIRST_TRANSITION = "first transition"
 """The name of the paper's rule."""
 
-FITS: Mapping[str, Callable[[Tensor, Tensor], Calibration]] = {
-    "platt": fit_platt,
-    "isotonic": fit_isotonic,
-}
-"""From scores to log likelihood ratios."""
-
 _SHARE = "_share"  # behind a scene: a budget of its knocks
 
 LEAST, MOST = 0.1, 1000.0
@@ -97,11 +90,13 @@ _STEP = 1.01  # by which a threshold is raised that a capped sum does not keep
 _LEAST_THRESHOLD = 1e-30  # at 0 a sum would stand for ever
 _NUM_POINTS = 25  # of a threshold curve, at most
 _NUM_TRIED = 100
-_TOGETHER = 256  # streams decided at once
 _PUSHES = 200  # timed
 _FULL_S = 2.0  # of stream, until memories are full
 _OF_BINS = 0.5  # of what a budget allows, at most, that bins alone raise
 _SETTLE_S = 0.05  # behind what a decision rests on, as EventRules.settle_s
+_FOUND = 0.95  # share of slips below which a warning names the budgets that cost them
+_LEVEL = 0.95  # of intervals
+_OTHERS = "others"  # scenes without hours of their own
 
 
 # Streams, and what a detector decides in them ----------------------------------------------------
@@ -219,36 +214,20 @@ def labelled(streams: Sequence[Stream], timing: Timing) -> tuple[Tensor, Tensor]
 def decide(
     streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
 ) -> Iterator[tuple[Stream, Decisions]]:
-    """What a detector decides in each stream; those of one length are decided together.
+    """What a detector decides in each stream; the shortest streams first.
 
     ``settings.hop_samples`` may be a multiple of the timing's: so many decisions are left out.
-
-    Yields:
-        Every stream with its decisions, in order of length.
     """
     step = settings.hop_samples // timing.hop_samples
-    for _, group in groupby(sorted(streams, key=_length), key=_length):
-        alike = list(group)
-        for first in range(0, len(alike), _TOGETHER):
-            part = alike[first : first + _TOGETHER]
-            decider = Decider(
-                settings, timing.sample_rate_hz, timing.bin_samples, timing.look_ahead
-            )
-            made = decider.decide(
-                torch.stack([stream.score[::step] for stream in part]),
-                torch.stack([stream.is_valid[::step] for stream in part]),
-            )
-            if settings.onset is not None:
-                made = decider.join(made, torch.stack([stream.onset_score for stream in part]))
-            for row, stream in enumerate(part):
-                yield stream, made.row(row)
+    for stream in sorted(streams, key=lambda own: (len(own.score), len(own.onset_score))):
+        decider = Decider(settings, timing.sample_rate_hz, timing.bin_samples, timing.look_ahead)
+        made = decider.decide(stream.score[::step], stream.is_valid[::step])
+        if settings.onset is not None:
+            made = decider.join(made, stream.onset_score)
+        yield stream, made
 
 
-def _length(stream: Stream) -> tuple[int, int]:
-    return len(stream.score), len(stream.onset_score)
-
-
-def watched(stream: Stream, decisions: Decisions) -> Watched:
+def event_record(stream: Stream, decisions: Decisions) -> EventRecord:
     """The alarms of a stream beside what is true of it."""
     times, available_s = stream.times, decisions.available_s.numpy()
     raised = np.flatnonzero(decisions.is_alarm.numpy())
@@ -257,7 +236,7 @@ def watched(stream: Stream, decisions: Decisions) -> Watched:
     says_slip = available_s[np.flatnonzero(decisions.llr.numpy() > 0)]
     releases_s = first_releases(times.onsets_s, times.released_s)
     first = np.append(says_slip, math.nan)[np.searchsorted(says_slip, releases_s)]
-    return Watched(
+    return EventRecord(
         recording=str(stream.recording),
         material=stream.recording.material,
         scene=stream.recording.scene,
@@ -273,7 +252,7 @@ def watched(stream: Stream, decisions: Decisions) -> Watched:
     )
 
 
-# What is told of an alarm ------------------------------------------------------------------------
+# What is reported of an alarm ------------------------------------------------------------------
 
 
 def threshold_curve(
@@ -394,66 +373,48 @@ class CalibratedAlarm:
         streams: recordings, those trained on included or not; of the paper's scene, without
             slip, and of confounding scenes.
         classifier: how the onset classifier is fitted.
-        learn_scenes: what it is fitted on.
-        learn_cycles: recordings of each material and scene that it is fitted on.
         budget: false alarms an hour of each scene; of ``SCENE_share``, alarms a knock.
         confidence: with which budgets are to hold.
         hours: to calibrate on, by scene; ``None``: half of the recordings.
-        check_hours: of each scene, at most, to check on, for seen and for held-out materials.
-        check_slip_free_hours: of the scene without slip.
-        found: share of slips below which a budget is said to cost too many.
+        check_hours: to check on, at most, by scene, ``"others"`` for those that are not named; for
+            seen and for held-out materials.
         hop_ms: distance of two bins.
         slip_free: the scene without slip.
         rule: what gathers evidence of bins; ``evidence: null`` is hop / bin.
-        calibration: ``"platt"`` or ``"isotonic"``.
         slip_share: how much of a stream is slip, for probabilities.
         rearm_s: how long both must stay low before the next alarm.
         refractory_s: shortest time between two alarms.
-        level: of intervals.
 
     Raises:
-        ValueError: for a rule, calibration or scene that is not there, a hop that is no whole
+        ValueError: for a rule or scene that is not there, a hop that is no whole
             number of samples, or a number out of range.
     """
 
     streams: RecordingSource
     classifier: OnsetTraining
-    learn_scenes: Sequence[str]
     budget: Mapping[str, float]
     hours: Mapping[str, float]
-    check_hours: float
-    check_slip_free_hours: float
+    check_hours: Mapping[str, float]
     hop_ms: float
     slip_free: str
     rule: Mapping[str, Any]
-    learn_cycles: int = 4
     confidence: float = 0.95
-    found: float = 0.95
-    calibration: str = "platt"
     slip_share: float = 0.5
     rearm_s: float = 0.2
     refractory_s: float = 0.2
-    level: float = 0.95
 
     def __post_init__(self) -> None:
         scenes = sorted({recording.scene for recording in self.streams.ids})
-        if self.calibration not in FITS:
-            known = ", ".join(FITS)
-            raise ValueError(f"onset.calibration must be one of {known}, got {self.calibration!r}")
-        budgeted = [budget.scene for budget in self.budgets]
-        for name in (self.slip_free, *budgeted, *self.learn_scenes, *self.hours):
-            if name not in scenes:
+        named = [*(budget.scene for budget in self.budgets), *self.hours, *self.check_hours]
+        for name in (self.slip_free, *self.classifier.scenes, *named):
+            if name not in (*scenes, _OTHERS):
                 raise ValueError(
                     f"onset.streams has no scene {name!r}, it has {', '.join(scenes)}; take it out "
-                    "of onset.budget, onset.hours and onset.learn_scenes"
+                    "of onset.budget, onset.hours and onset.classifier.scenes"
                 )
         if self.slip_free not in self.budget:
             raise ValueError(f"onset.budget must say what {self.slip_free} may have, an hour")
-        _check_numbers(self, positive=("hop_ms", "check_hours", "check_slip_free_hours"))
-        check_number("onset.learn_cycles", self.learn_cycles, whole=True)
-        for name in ("level", "found"):
-            if not 0 < getattr(self, name) < 1:
-                raise ValueError(f"onset.{name} must lie between 0 and 1")
+        _check_numbers(self, positive=("hop_ms",))
         self.made_rule(self.hop_samples)  # bad numbers are refused now
 
     @property
@@ -494,14 +455,15 @@ class CalibratedAlarm:
             role = "test" if recording.material in seen else "unseen"
             if role == "test":
                 places[of] += 1
-                if scene in self.learn_scenes and places[of] <= self.learn_cycles:
+                learns = scene in self.classifier.scenes
+                if learns and places[of] <= self.classifier.cycles:
                     roles["learn"].append(recording)
                     continue
                 most = self.hours.get(scene, math.inf if scene == PAPER_SCENE else 0.0)
                 is_even = scene != PAPER_SCENE or places[of] % 2 == 0
                 if hours["calibrate", scene] < most and is_even:
                     role = "calibrate"
-            most = self.check_slip_free_hours if scene == self.slip_free else self.check_hours
+            most = self.check_hours.get(scene, self.check_hours.get(_OTHERS, 0.0))
             if role != "calibrate" and hours[role, scene] >= most:
                 continue
             hours[role, scene] += self.streams.timeline(recording).duration_s / 3600
@@ -537,8 +499,7 @@ class CalibratedAlarm:
 
         Args:
             detector: fitted.
-            baselines: by name; each is a threshold on its score. One with ``hop_samples`` of its
-                own scores bins that far apart.
+            baselines: by name; each is a threshold on its score.
             num_workers: processes that score streams.
 
         Returns:
@@ -558,8 +519,7 @@ class CalibratedAlarm:
         onset, left_out, chosen = self.classifier(self.streams, learn, num_workers)
         scorers: dict[str, Scorer] = {OURS: detector, **(baselines or {})}
         hop, rate = onset.evidence.hop_samples, self.streams.sample_rate_hz
-        hops = {name: getattr(own, "hop_samples", hop) for name, own in scorers.items()}
-        hops[OURS] = self.hop_samples
+        hops = dict.fromkeys(scorers, hop) | {OURS: self.hop_samples}
         others = {one.material: left_out.get(one.material, onset) for one in roles["calibrate"]}
         score = partial(score_streams, self.streams, scorers=scorers, hops=hops)
         scored = {
@@ -589,7 +549,7 @@ class CalibratedAlarm:
         detector.info[KEY] = settings.to_dict()
         compute_s = {OURS: _push_seconds(detector, settings)}
         events = defaultdict[str, dict[str, dict[str, Any]]](lambda: defaultdict(dict))
-        told = {}
+        calibrations = {}
         checked = [role for role in roles if role != "calibrate" and roles[role]]
         for role, name in bar(list(product(checked, methods)), "events", "table row"):
             scorer, made = methods[name]
@@ -601,9 +561,9 @@ class CalibratedAlarm:
                 found = self._events(own, made, timings[scorer], compute_s.get(scorer))
                 events[scene][role][name] = found
             if name == JOINT and (found := _reliability(by_scene[""], settings, timings[OURS])):
-                told[f"{role} stream"] = found
+                calibrations[f"{role} stream"] = found
         of_paper = self._events(calibrating[PAPER_SCENE], settings, timings[OURS], None)
-        self._say_what_costs(of_paper, settings)
+        self._warn_of_costs(of_paper, settings)
         budget_rows = self._budget_rows(events, methods, roles)
         usual = events.pop("", {})
         return {
@@ -622,10 +582,10 @@ class CalibratedAlarm:
                 for name, (scorer, made) in methods.items()
             },
             "budget": budget_rows,
-            "reliability": told,
+            "reliability": calibrations,
             "events": {f"{role} stream": found for role, found in usual.items()},
             "scenes": {
-                scene: {"trained": scene in self.learn_scenes} | by_role
+                scene: {"trained": scene in self.classifier.scenes} | by_role
                 for scene, by_role in events.items()
             },
         }
@@ -654,7 +614,7 @@ class CalibratedAlarm:
             ValueError: if our scores cannot be calibrated, or a budget not be shown.
         """
         ours, timing = streams[OURS], timings[OURS]
-        calibration = FITS[self.calibration](*labelled(ours, timing))
+        calibration = fit_platt(*labelled(ours, timing))
         rule = self.made_rule(timing.bin_samples)
         methods = {JOINT: (OURS, self.calibrated(rule, calibration, ours, timing, onset))}
         alone = self.calibrated(rule, calibration, ours, timing)
@@ -668,13 +628,13 @@ class CalibratedAlarm:
                 settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timings[name].hop_samples)
                 scored = self._scored(streams[name], settings, timings[name], self.budgets)
                 settings = replace(settings, threshold=self._lowest(scored, settings, "statistic"))
-                methods[name] = name, self._told(settings, scored)
+                methods[name] = name, self._with_counts(settings, scored)
         return methods
 
     def calibrated(
         self,
         rule: Rule,
-        calibration: Calibration,
+        calibration: Platt,
         streams: Sequence[Stream],
         timing: Timing,
         onset: OnsetClassifier | None = None,
@@ -702,7 +662,7 @@ class CalibratedAlarm:
             if onset:
                 threshold = self._lowest(scored, settings, "onset_score")
                 settings = replace(settings, onset=replace(onset, threshold=threshold))
-            settings = self._told(settings, scored)
+            settings = self._with_counts(settings, scored)
             rows = settings.metadata["budget"]
             if all(row["alarms"] <= row["allowed"] for row in rows):
                 break
@@ -714,7 +674,7 @@ class CalibratedAlarm:
         lead_s = _lead_s(streams, settings, timing, by_onset=True)
         return replace(settings, onset=replace(settings.onset, lead_s=lead_s))
 
-    def _settings(self, rule: Rule, calibration: Calibration, hop_samples: int) -> AlarmSettings:
+    def _settings(self, rule: Rule, calibration: Platt, hop_samples: int) -> AlarmSettings:
         """Without a threshold yet."""
         return AlarmSettings(
             hop_samples,
@@ -775,7 +735,7 @@ class CalibratedAlarm:
             for scores in scored
         )
 
-    def _told(self, settings: AlarmSettings, scored: Sequence[_Scores]) -> AlarmSettings:
+    def _with_counts(self, settings: AlarmSettings, scored: Sequence[_Scores]) -> AlarmSettings:
         """The settings, with what their thresholds gave on the recordings that they were set on."""
         rows = list[dict[str, Any]]()
         times = settings.latch_times(self.streams.sample_rate_hz)
@@ -794,7 +754,7 @@ class CalibratedAlarm:
             )
             if budget.scene == self.slip_free and not budget.is_share:
                 hours = [len(own) / self._decisions_h(settings) for own in scores.is_quiet]
-                rate = Bootstrap(len(hours), self.level).rate(alarms, hours)
+                rate = Bootstrap(len(hours), _LEVEL).rate(alarms, hours)
                 onset = settings.onset
                 calibrated = {
                     "value": settings.threshold if onset is None else onset.threshold,
@@ -808,17 +768,17 @@ class CalibratedAlarm:
         """Decisions of an hour."""
         return 3600 * self.streams.sample_rate_hz / settings.decision_samples
 
-    def _say_what_costs(self, numbers: Mapping[str, Any], settings: AlarmSettings) -> None:
+    def _warn_of_costs(self, numbers: Mapping[str, Any], settings: AlarmSettings) -> None:
         """Warn where budgets leave fewer slips found than wanted, and name what costs them."""
         share = numbers["found"] and numbers["found"]["value"]
-        if share is None or share >= self.found:
+        if share is None or share >= _FOUND:
             return
         full = [row for row in settings.metadata["budget"] if row["alarms"] == row["allowed"]]
         log.warning(
-            "%.1f %% of the slips that calibrate are found, onset.found asks for %.1f: the budget "
+            "%.1f %% of the slips that calibrate are found, fewer than %.0f: the budget "
             "of %s leaves no more; allow it more alarms, or give it more hours to show its rate on",
             100 * share,
-            100 * self.found,
+            100 * _FOUND,
             ", ".join(row["scene"] for row in full) or "every scene",
         )
 
@@ -844,7 +804,7 @@ class CalibratedAlarm:
                 amount = sum(len(self.streams.timeline(one).non_slip_s) for one in own)
             if not amount:
                 continue
-            low, high = budget.interval(alarms, amount, self.level)
+            low, high = budget.interval(alarms, amount, _LEVEL)
             rows.append(
                 {
                     "role": role,
@@ -871,10 +831,10 @@ class CalibratedAlarm:
         rate = timing.sample_rate_hz
         latency = LatencyParts(timing.look_ahead / rate, timing.bin_samples / rate, compute_s)
         seen = [
-            recording_events(watched(*made), EventRules(), latency)
+            recording_events(event_record(*made), EventRules(), latency)
             for made in decide(streams, settings, timing)
         ]
-        return pooled_metrics(seen, level=self.level)
+        return pooled_metrics(seen, level=_LEVEL)
 
     def _amounts(
         self, roles: Mapping[str, Sequence[RecordingId]]
@@ -926,7 +886,7 @@ class DebouncedAlarm:
         hop_ms: distance of two decisions; ``None`` for half a bin.
         k: so many decisions must say slip,
         n: of so many.
-        probability: at which a decision says slip.
+        probability: from which a decision speaks for slip.
         slip_share: how much of a stream is slip, for probabilities.
         rearm_s: how long the statistic must stay low before the next alarm.
         refractory_s: shortest time between two alarms.

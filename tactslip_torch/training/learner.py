@@ -46,10 +46,10 @@ from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.events import (
+    EventRecord,
     EventRules,
     LatencyParts,
     RecordingEvents,
-    Watched,
     first_releases,
     pooled_metrics,
     recording_events,
@@ -170,7 +170,7 @@ def event_numbers(
     }
 
 
-def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Watched:
+def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> EventRecord:
     """A recording as the detector saw it through an alarm of k of the last n decisions.
 
     It starts anew with every stroke and every unbroken stretch of bins of no stroke, whatever order
@@ -199,7 +199,7 @@ def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Watc
     for number, release_s in enumerate(first_releases(times.onsets_s, times.released_s)):
         is_later = says_slip & (stroke == number) & (available_s >= release_s)
         first.append(next(iter(available_s[is_later].tolist()), math.nan))
-    return Watched(
+    return EventRecord(
         recording=str(bins.recording),
         material=bins.recording.material,
         scene=bins.recording.scene,

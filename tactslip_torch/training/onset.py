@@ -1,13 +1,8 @@
 """Fits the onset classifier: hops in which a slip begins against all that is no beginning.
 
-Negatives are what robots hear: holding, handling (taps, grips, the carrying arm), machines, mains,
-the moment before an onset, and steady sliding, which is the business of the classifier of bins.
-Each of these, of each scene, weighs alike, and so do onsets of each scene. The hops of each kind
-that are most like a slip are a kind of their own: a knock while a grip is changed is rare, and what
-sets the threshold. A first machine, fitted on some recordings, tells which they are.
-
-The penalty, the comb and the columns were chosen by leaving out each seen material: slips of it
-that are found at thresholds set on the others.
+Negatives are holding, handling (taps, grips, the carrying arm), machines, mains, the moment before
+an onset, and steady sliding. Each of these, of each scene, weighs alike, and so do onsets of each
+scene. Hard negatives of a first pass, fitted on some recordings, get their own class weight.
 """
 
 from __future__ import annotations
@@ -28,7 +23,7 @@ from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.events import first_releases
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
-from tactslip_torch.runtime import in_processes
+from tactslip_torch.runtime import check_number, in_processes
 
 ONSET_S = (0.002, 0.030)
 """Behind an onset, in which hops are positive."""
@@ -54,12 +49,22 @@ class OnsetTraining:
         penalty: the paper's ``C``, of hops whose weights sum to 1.
         comb_periods: of the mains, over which the comb takes the mean.
         mains_hz: nominal.
+        scenes: kinds of recordings that it is fitted on, where others are there too.
+        cycles: recordings of each material and scene, at most, that it is fitted on then.
+
+    Raises:
+        ValueError: if the number of cycles is not positive.
     """
 
     hop_ms: float = 5.0
     penalty: float = 2e4
     comb_periods: int = 1
     mains_hz: float = 50.0
+    scenes: Sequence[str] = ()
+    cycles: int = 4
+
+    def __post_init__(self) -> None:
+        check_number("onset.classifier.cycles", self.cycles, whole=True)
 
     def __call__(
         self,
