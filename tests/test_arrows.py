@@ -19,7 +19,7 @@ ARROWS = {
     "deploy": ("features", "model", "onset", "signals", "hand"),
     "live": ("hand", "data", "signals", "model", "onset", "deploy"),
     "training": (*_LOWER, "onset", "deploy", "report"),
-    "analysis": (*_LOWER, "onset", "deploy", "training"),
+    "pareto": ("model", "features", "report"),
     "report": (),
 }
 """Importer: what it may import beside itself, ``runtime`` and ``package_files``; others may all."""

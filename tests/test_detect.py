@@ -217,7 +217,7 @@ def test_a_damaged_file_in_a_folder_costs_the_others_nothing(model, tmp_path, ca
     save(place / "b.npz", recording())
     save(place / "e.npz", quiet(sample_rate_hz=1000.0))
     said = (
-        r"2 of 5 recordings failed, first: .*c\.npz is damaged or no recording of ours \(Bad CRC-32"
+        r"2 of 5 recordings failed, first: .*c\.npz is damaged or no recording \(Bad CRC-32"
         ".*; the others are in"
     )
     with pytest.raises(ValueError, match=said):

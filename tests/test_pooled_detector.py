@@ -11,7 +11,6 @@ from hydra.utils import instantiate
 from test_commands import TINY, composed, run_train
 
 from tactslip_torch import SlipDetector
-from tactslip_torch.commands.importance import sensors
 from tactslip_torch.onset.decisions import score_stream
 
 HOP = 50
@@ -124,43 +123,3 @@ def test_an_order_statistic_and_both_kinds_of_column_are_exported(tmp_path):
     made = SlipDetector.load(folder / "detector.pt")
     assert (folder / "model.onnx").exists()
     assert {name.is_pooled for name in made.selected_names} == {True, False}
-
-
-@pytest.fixture(scope="module")
-def pooled_run(tmp_path_factory):
-    """On four channels; its columns are of those of films and gauges, in pairs."""
-    folder = tmp_path_factory.mktemp("tiny")
-    run_train(folder, *TINY, "recipe.use=pooled", "recipe.num_features=null", "cache=off")
-    return folder
-
-
-def sensors_of(run, folder, *overrides):
-    small = ("bins=20", "scored_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
-    given = (*small, f"model={run / 'detector.pt'}", "cache=off", *overrides)
-    return sensors(composed(*given, name="importance"), folder)
-
-
-@pytest.mark.slow
-def test_sensors_are_left_out_of_the_pools(pooled_run, tmp_path):
-    found = sensors_of(pooled_run, tmp_path)
-    detector = SlipDetector.load(pooled_run / "detector.pt")
-    own = dict.fromkeys(detector.pool.hand.names, 0)
-    for name in detector.extractor.names:
-        own[name.channel] += 1
-    rows = {row["name"]: row for row in found["units"] if row["unit"] == "channel"}
-    assert {name: row["features_in_use"] for name, row in rows.items()} == own
-    whole = found["with_all"]
-    assert whole["as_selected"] == whole["reselected"]
-    assert whole["as_selected"]["balanced_accuracy"]["test"] > 0.9
-    assert all(row["lost"] == row["lost_reselected"] for row in rows.values())
-    assert found["best"]["channel"][-1]["num_features"] == len(detector.selected)
-    assert found["best"]["channel"][-1]["lost"]["test"]["lost"] == 0.0
-    assert rows["PVDF1"]["gradient"]["slip"] > 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("override", ["num_features=3", "reselect=shared"])
-def test_sensors_select_nothing_anew_where_all_is_pooled(override, pooled_run, tmp_path):
-    said = "leave out num_features and reselect, or train with"
-    with pytest.raises(ValueError, match=said):
-        sensors_of(pooled_run, tmp_path, override)

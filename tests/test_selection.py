@@ -14,8 +14,6 @@ from tactslip_torch.features.selection import (
     ClassMoments,
     rank_distinct,
     rank_features,
-    rank_per_cost,
-    rank_weighted,
     t_scores,
 )
 
@@ -176,15 +174,6 @@ def weighted(scores, features, num, alpha):
     return taken
 
 
-@pytest.mark.parametrize("alpha", [0.0, 0.3, 0.7, 1.0])
-def test_weighted_is_matlabs_rule(alpha, rng):
-    scores, features = rng.uniform(0, 9, 30), related(rng)
-    found = rank_weighted(torch.from_numpy(scores), torch.from_numpy(features), 30, alpha)
-    assert found.tolist() == weighted(scores, features, 30, alpha)
-    if alpha == 0:
-        assert torch.equal(found, rank_features(torch.from_numpy(scores), 30))
-
-
 def per_cost(scores, needs, prices, num, power):
     taken, paid = [], set()
     for _ in range(num):
@@ -203,17 +192,6 @@ def per_cost(scores, needs, prices, num, power):
     return taken
 
 
-@pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 2.0])
-def test_per_cost_is_the_greedy_rule(power, rng):
-    scores = rng.uniform(0.1, 9, 40)
-    needs = rng.random((40, 12)) < 0.3
-    needs[5] = False  # needs nothing: free
-    prices = rng.integers(1, 10_000, 12)
-    found = rank_per_cost(*map(torch.from_numpy, (scores, needs, prices)), 40, power)
-    assert found.tolist() == per_cost(scores, needs, prices, 40, power)
-    assert sorted(found.tolist()) == list(range(40))
-
-
 def labelled(*labels):
     return moments_of(torch.randn(len(labels), 3), torch.tensor(labels))
 
@@ -224,7 +202,6 @@ def updated(features, labels=5):
 
 ONES = torch.ones(3)
 BINS = torch.ones(5, 3)
-NEEDS, PRICES = torch.ones(3, 2, dtype=torch.bool), torch.tensor([1, 2])
 BROKEN = torch.zeros(5, 3).index_put((torch.tensor(4), torch.tensor(2)), torch.tensor(math.nan))
 
 
@@ -245,15 +222,6 @@ REFUSED = [
         for most in (-0.1, 1.1, math.nan)
     ),
     (rank_distinct, [ONES, BINS, torch.zeros(6), 2, 0.9], r"\[6, 3\], got \(5, 3\)"),
-    (rank_weighted, [ONES, BINS, 2, 1.5], r"alpha must lie in 0\.\.1, got 1\.5"),
-    (rank_weighted, [ONES, torch.ones(5, 4), 2], r"features \[n, 3\], got \(5, 4\)"),
-    (rank_weighted, [ONES, BINS, 4], r"num must lie in 1\.\.3, got 4"),
-    (rank_per_cost, [ONES, NEEDS, PRICES, 0], r"num must lie in 1\.\.3, got 0"),
-    (rank_per_cost, [ONES, NEEDS.float(), PRICES, 2], r"needs \[3, 2\] of bool, got \(3, 2\)"),
-    (rank_per_cost, [ONES, NEEDS, -PRICES, 2], "prices must be whole numbers"),
-    (rank_per_cost, [ONES, NEEDS, PRICES.double(), 2], "prices must be whole numbers"),
-    (rank_per_cost, [ONES, NEEDS, PRICES * 2**50, 2], r"more than 2\^50"),
-    (rank_per_cost, [ONES, NEEDS, PRICES, 2, -1], "power must not be negative, got -1"),
 ]
 
 

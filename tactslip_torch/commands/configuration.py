@@ -109,14 +109,15 @@ def compose_config(
 
 def options_of(group: str) -> list[str]:
     """The options of a group."""
-    files = (conf_dir() / group).glob("*.yaml")
+    group = group.partition("@")[0]
+    files = (conf_dir() / group).glob("*.yaml") if group else ()
     return sorted([*(path.stem for path in files), *presets().get(group, ())])
 
 
 def _groups(hydra: Any) -> dict[str, str]:
-    """The groups with the options that are chosen, from Hydra's own section."""
+    """The groups, such as ``GROUP@PACKAGE``, with their options, from Hydra's own section."""
     chosen = hydra.runtime.choices.items()
-    return {group: str(option) for group, option in chosen if re.fullmatch(r"\w+", group)}
+    return {group: str(option) for group, option in chosen if re.fullmatch(r"[\w.@]+", group)}
 
 
 # Keys and help ------------------------------------------------------------------------------------
@@ -144,7 +145,7 @@ def _comments(path: Path) -> dict[str, str]:
 @cache
 def _described(group: str, option: str) -> dict[str, str]:
     """Comments of the file of an option, and of its bases, which come first."""
-    path = conf_dir() / group / f"{option}.yaml"
+    path = conf_dir() / group.partition("@")[0] / f"{option}.yaml"
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
     bases = re.findall(r"(?m)^  - (\w+)$", text.partition("defaults:\n")[2])
     own = _comments(path)
@@ -164,11 +165,11 @@ def keys_of(command: str, config: DictConfig, hydra: Any = None) -> list[Key]:
         hydra: Hydra's own section, if it is not in ``config``.
     """
     said = {
-        f"{group}.{key}": text
+        f"{group.partition('@')[2] or group}.{key}": text
         for group, option in _groups(hydra or config.hydra).items()
         for key, text in _described(group, option).items()
     }
-    for key, text in _comments(conf_dir() / f"{command}.yaml").items():
+    for key, text in _described("", command).items():
         said.setdefault(key, text)
     sections = {key.rpartition(".")[0] for key in said}
 
@@ -191,7 +192,7 @@ def help_text(summary: str, line: CommandLine) -> str:
     command, config = line.command, line.config
     path = conf_dir() / f"{command}.yaml"
     head = [row[2:] for row in path.read_text().partition("defaults:")[0].splitlines()]
-    keys, about = keys_of(command, config), _comments(path)
+    keys, about = keys_of(command, config), _described("", command)
     groups = {
         name: at
         for name, at in reversed(_groups(config.hydra).items())

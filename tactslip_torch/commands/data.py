@@ -41,9 +41,9 @@ from tactslip_torch.runtime import __version__, in_processes
 _FIGURE = Path("outputs/data.png")
 _SHOWN = 5  # rows of a template
 _LEVELS_S = 30.0  # of a recording, from which levels are taken
-_BEFORE_ONSET_S = 1.01  # that the labels of train take as non-slip, unless it is told
+_BEFORE_ONSET_S = 1.01  # that the labels of train take as non-slip, by default
 _CONTEXT = 25  # samples that the longest filter reads on either side of a bin
-_BIN_MS, _FEWEST = 50.0, 8  # the bin that train takes unless it is told, and samples it should have
+_BIN_MS, _FEWEST = 50.0, 8  # the bin that train takes by default, and samples it should have
 
 
 def check(config: DictConfig) -> int:
@@ -80,7 +80,7 @@ def check(config: DictConfig) -> int:
 
 
 def summary(config: DictConfig) -> list[dict[str, Any]]:
-    """Print what a set holds, and draw it; what is told of each recording.
+    """Print what a set holds, and draw it; what is known of each recording.
 
     Raises:
         ValueError: if no recording can be read.
@@ -157,13 +157,13 @@ def convert(config: DictConfig) -> list[Written]:
 def label_template(config: DictConfig) -> Path:
     """Write a manifest of all that can be read in a folder, to be filled in."""
     output = None if config.output is None else Path(str(config.output))
-    path, told = write_template(Path(str(config.root)), str(config.pattern), output)
+    path, guesses = write_template(Path(str(config.root)), str(config.pattern), output)
     print(f"file, and what pattern={config.pattern} tells of it:")
-    for file, fields in list(told.items())[:_SHOWN]:
+    for file, fields in list(guesses.items())[:_SHOWN]:
         print(f"  {file}: {', '.join(f'{n}={v}' for n, v in fields.items() if v) or 'nothing'}")
     print(
-        f"{path} lists {len(told)} recordings, {sum(map(bool, told.values()))} of them with what "
-        "the pattern tells; fill in onsets_s, sliding_s, slip_s and non_slip_s "
+        f"{path} lists {len(guesses)} recordings, {sum(map(bool, guesses.values()))} of them with "
+        "what the pattern tells; fill in onsets_s, sliding_s, slip_s and non_slip_s "
         "(as 2.0; 9.0 and 2-7; 9-11.5) or label (slip, non-slip), then action=check"
     )
     return path
@@ -263,10 +263,10 @@ def _levels(config: DictConfig, source: FileRecordings) -> list[Problem]:
         found = score_stream(detector, samples, pool.bin_samples)
         return level_message(level_ratio(found.span, detector.sensing), source.units)
 
-    told = in_processes(one, source.ids, "comparing levels", "recording", config.num_workers)
+    messages = in_processes(one, source.ids, "comparing levels", "recording", config.num_workers)
     return [
         source.entry(recording).problem(text)
-        for recording, text in zip(source.ids, told, strict=True)
+        for recording, text in zip(source.ids, messages, strict=True)
         if text
     ]
 
@@ -280,9 +280,9 @@ def _headline(
         return f"no recording can be read: {counts}"
     seconds = sum(source.timeline(recording).duration_s for recording in source.ids)
     materials = list(dict.fromkeys(recording.material for recording in source.ids))
-    said = f"{SIMULATED_LINE}\n" if source.is_simulated else ""
+    head = f"{SIMULATED_LINE}\n" if source.is_simulated else ""
     return (
-        f"{said}{_number(source.ids, 'recording')} of {_number(materials, 'material')}, "
+        f"{head}{_number(source.ids, 'recording')} of {_number(materials, 'material')}, "
         f"{seconds:.1f} s, {_number(source.hand.channels, 'channel')} at "
         f"{source.sample_rate_hz:g} Hz in {source.units}: {counts}"
     )
@@ -305,13 +305,13 @@ def _trial(source: FileRecordings, recording: RecordingId) -> dict[str, Any]:
 
 
 def _example(source: FileRecordings) -> tuple[str, Recording]:
-    """The first recording of which most is told, and what it is called."""
+    """The first recording of which most is known, and what it is called."""
 
-    def told(recording: RecordingId) -> int:
+    def known(recording: RecordingId) -> int:
         times = source.timeline(recording)
         return bool(times.onsets_s or times.slip_s) + bool(times.non_slip_s)
 
-    recording = max(source.ids, key=told)
+    recording = max(source.ids, key=known)
     return f"{recording} ({source.entry(recording).file})", source.load(recording)
 
 

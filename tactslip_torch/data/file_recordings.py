@@ -44,12 +44,12 @@ from tactslip_torch.signals.resampling import resample
 log = logging.getLogger(__name__)
 
 _NOWHERE = "unknown"
-"""The finger and segment of a channel of which nobody said them."""
+"""The finger and segment of a channel that nobody stated."""
 _RATES_HZ = 1.0, 1e6
 """Sample rates that are believed; beyond, times are in another unit than they are taken for."""
 _RATE_ERROR = 0.01
 """By so much a rate that time stamps tell may differ from that of the set."""
-_WANTED_RATE_ERROR = 0.001  # and from that of a detector, as what is told in seconds errs
+_WANTED_RATE_ERROR = 0.001  # and from that of a detector, as times in seconds err
 _ROUNDING = 1e-9
 _BEFORE_ONSET_S = 1.01
 """What ``labels=whole_slide`` takes as non-slip before an onset."""
@@ -157,7 +157,7 @@ def _head_of(opened: Opened, path: Path, given: _Given, stated_hz: float | None 
         opened: the file.
         path: of it.
         given: what it does not say.
-        stated_hz: its rate, if it was said of this file.
+        stated_hz: its rate, if it is stated of this file.
 
     Raises:
         ValueError: if its times are none of an even clock, nobody says its rate, or it has other
@@ -214,7 +214,7 @@ def _hand_of(opened: Opened, given: _Given) -> tuple[HandLayout, Sequence[int]]:
     """The channels of a file, and in which row of it each of them is.
 
     Channels that a person gave are found by the names the file has, whatever their case and the
-    unit in brackets behind them. If it has no names, or a person said which columns they are, they
+    unit in brackets behind them. If it has no names, or ``reading.channels`` lists them, they
     stand in that order.
 
     Raises:
@@ -418,7 +418,7 @@ class FileRecordings:
     """A ``RecordingSource`` of the files of a folder.
 
     Times are seconds from a file's first sample. The first file decides channels, rate and unit.
-    Rates that time stamps tell are taken as one, as round as it can be, and the truth follows each
+    Rates that time stamps show are taken as one, as round as it can be, and the truth follows each
     file's own clock.
 
     Args:
@@ -638,7 +638,7 @@ class FileRecordings:
         return any(own.recording.provenance.get("simulated") for own in owns if own)
 
     def entry(self, recording: RecordingId) -> Entry:
-        """Where a recording is, and what was said of it."""
+        """Where a recording is, and what is listed of it."""
         return self._files[recording].entry
 
     def timeline(self, recording: RecordingId) -> Timeline:

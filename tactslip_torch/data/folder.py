@@ -131,13 +131,13 @@ class RecordingFolder:
 
     def key(self, recording: RecordingId) -> dict[str, Any]:
         """What determines the recording's file, as JSON gives it back."""
-        facts: dict[str, Any] = {
+        content: dict[str, Any] = {
             "recording": {"name": recording.scene, **self.source.key(recording)},
             "material": recording.material,
             **self.made_by,
             "truth": self._truth(recording),
         }
-        plain: dict[str, Any] = json.loads(json.dumps(facts, allow_nan=False))
+        plain: dict[str, Any] = json.loads(json.dumps(content, allow_nan=False))
         return plain
 
     def _truth(self, recording: RecordingId) -> dict[str, Any]:
@@ -145,7 +145,7 @@ class RecordingFolder:
         return {name: getattr(times, name) for name in TIMES}
 
     def check(self) -> None:
-        """Refuse names that files cannot have, and to replace a file that is not ours.
+        """Refuse names that files cannot have, and to replace a file that is none of this package.
 
         Raises:
             ValueError: if there is such a name or file.
@@ -162,9 +162,9 @@ class RecordingFolder:
                 raise ValueError(
                     f"{other} and {recording} would both become {path.name}; rename one"
                 )
-            if path.exists() and not self.format.is_ours(path):
+            if path.exists() and not self.format.is_native(path):
                 what = f"move it away, or give another {self.given}"
-                raise ValueError(f"{path} is no recording of ours; {what}")
+                raise ValueError(f"{path} is no recording of this package; {what}")
 
     def load(self, recording: RecordingId) -> Archived:
         """What the recording's file holds.
@@ -185,7 +185,7 @@ class RecordingFolder:
         try:
             archived = self.load(recording)
             content = archived.recording if archived.key == key else None
-        except (FileNotFoundError, ValueError):  # not there, or ours but damaged: see check
+        except (FileNotFoundError, ValueError):  # not there, or damaged: see check
             content = None
         made = content is None
         if content is None:
@@ -291,7 +291,7 @@ def write_template(
     """Write a manifest of all recordings of a folder, its label columns empty.
 
     Returns:
-        Its path, and what the pattern told of each file.
+        Its path, and what the pattern gives of each file.
 
     Args:
         root: the folder.

@@ -412,9 +412,9 @@ def twice(entries: Iterable[Entry]) -> list[Problem]:
     return found
 
 
-def better_told(listing: Listing, told: Listing) -> Listing:
-    """A listing in which files that another tells of have its truth; the others keep theirs."""
-    by_file = {entry.file: entry for entry in told.entries}
+def with_manifest(listing: Listing, manifest: Listing) -> Listing:
+    """A listing in which files that a manifest annotates have its truth; the others keep theirs."""
+    by_file = {entry.file: entry for entry in manifest.entries}
     entries = []
     for entry in listing.entries:
         other = by_file.pop(entry.file, None)
@@ -427,8 +427,8 @@ def better_told(listing: Listing, told: Listing) -> Listing:
     ]
     return Listing(
         tuple(entries),
-        (*listing.problems, *told.problems, *strangers),
-        (*listing.warnings, *told.warnings),
+        (*listing.problems, *manifest.problems, *strangers),
+        (*listing.warnings, *manifest.warnings),
     )
 
 

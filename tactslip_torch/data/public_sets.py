@@ -19,10 +19,10 @@ from tactslip_torch.data.manifest import (
     Entry,
     Listing,
     Problem,
-    better_told,
     manifest_of,
     read_manifest,
     twice,
+    with_manifest,
 )
 from tactslip_torch.data.recording import Label, RecordingId, Timeline
 from tactslip_torch.hand import HandLayout
@@ -167,7 +167,7 @@ def _listed(
         raise ValueError(f"data.labels must be of slip and non-slip, got {wrong[0]!r}")
     if not root.is_dir():
         raise FileNotFoundError(f"no folder at {root}")
-    told = next((name for name in ("label", "scene") if name in expression.groupindex), None)
+    group = next((name for name in ("label", "scene") if name in expression.groupindex), None)
     entries: list[Entry] = []
     problems: list[Problem] = []
     counts: Counter[tuple[str, str]] = Counter()
@@ -181,7 +181,7 @@ def _listed(
         scene = groups.get("scene") or RecordingId.scene
         trial = groups.get("trial") or str(counts[material, scene])
         counts[material, scene] += 1
-        word = groups.get(told) if told else None
+        word = groups.get(group) if group else None
         label = _LABELS.get((labels or _LABELS).get(word or "", ""))
         if not path.resolve().is_relative_to(root.resolve()):
             problems.append(Problem(file, "is a link out of the folder; copy it there"))
@@ -189,7 +189,7 @@ def _listed(
             problems.append(Problem(file, f"trial {trial!r} is no number"))
         elif labels is not None and label is None:
             known = ", ".join(labels)
-            problems.append(Problem(file, f"{told} {word!r} is none of data.labels: {known}"))
+            problems.append(Problem(file, f"{group} {word!r} is none of data.labels: {known}"))
         else:
             truth = Timeline(label=label) if label else None
             entries.append(Entry(file, file, RecordingId(material, int(trial), scene), truth))
@@ -199,11 +199,12 @@ def _listed(
 def _set_of(
     listing: Listing, root: str | Path, manifest: str | None, options: Mapping[str, Any]
 ) -> FileRecordings:
-    """The recordings of a listing, better told by a manifest if there is one."""
+    """The recordings of a listing, with what a manifest says if there is one."""
     listing = listing._replace(problems=(*listing.problems, *twice(listing.entries)))
     if manifest is not None:
-        told = read_manifest(manifest_of(Path(root), manifest), Path(root))
-        listing = better_told(listing, told)
+        listing = with_manifest(
+            listing, read_manifest(manifest_of(Path(root), manifest), Path(root))
+        )
     return FileRecordings(root, manifest=listing, **options)
 
 

@@ -19,7 +19,7 @@ class RecordingId:
     Args:
         material: what the hand slid on.
         cycle: number of the cycle on that material, from 0.
-        scene: what was done with the hand; the paper's protocol unless said otherwise.
+        scene: what was done with the hand; the paper's protocol unless stated otherwise.
         session: the mounting it was recorded in, where a material has several; ``""`` for its
             first or only one. Each session counts its cycles from 0.
 
@@ -52,7 +52,7 @@ TIMES = (*MOMENTS, *SPANS)
 
 @dataclass(frozen=True)
 class Timeline:
-    """When things happen in a recording, known before any sample is, as far as somebody said.
+    """When things happen in a recording, known before any sample is, as far as it is annotated.
 
     Args:
         onsets_s: when a slide begins, exact where known; those of ``sliding_s`` where only they
@@ -66,7 +66,7 @@ class Timeline:
             that needs one of them.
         released_s: of each onset, when the first and the last element of the skin let go; empty
             where that is not known.
-        label: of all of the recording; none is left where a ``RecordingSource`` tells of it.
+        label: of all of the recording; none is left in what a ``RecordingSource`` gives.
         duration_s: length of the recording; 0 before it is opened.
     """
 
@@ -160,7 +160,7 @@ class Recording:
         onsets_s: when the *contact* begins to slide, one per stroke, exact where known.
         sliding_s: ``(start, end)`` of every stretch in which the contact slides.
         annotated_onsets_s: the onsets as a person marked them, if that differs; labels use
-            these unless told otherwise. Defaults to ``onsets_s``.
+            these unless stated otherwise. Defaults to ``onsets_s``.
         non_slip_s: ``(start, end)`` of stretches without slip that are as telling as the second
             before an onset: the hand is carried, tapped, gripped.
         provenance: where it comes from; simulated recordings say ``{"simulated": True, ...}``.
@@ -230,8 +230,8 @@ class Recording:
     @property
     def has_truth(self) -> bool:
         """Whether it says where slip is and where not; one that nobody annotated does not."""
-        is_told = self.onsets_s or self.non_slip_s or self.slip_s
-        return bool(is_told or self.provenance.get("simulated"))
+        is_annotated = self.onsets_s or self.non_slip_s or self.slip_s
+        return bool(is_annotated or self.provenance.get("simulated"))
 
     @property
     def duration_s(self) -> float:

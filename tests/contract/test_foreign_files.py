@@ -201,6 +201,21 @@ TRAPS = {
 }
 
 
+@pytest.mark.parametrize("ending", endings())
+def test_what_is_no_such_file_is_one_line(tmp_path, ending):
+    path = tmp_path / f"a.{ending}"
+    for content in (b"", bytes(5000), b"to be or not to be\n" * 50, b"PK\x05\x06" + bytes(18)):
+        path.write_bytes(content)
+        assert not is_read(path)
+        assert not named_format(ending).is_native(path)
+    path.unlink()
+    path.mkdir()
+    assert not is_read(path)
+    path.rmdir()
+    os.mkfifo(path)  # reading it would wait for ever
+    assert not is_read(path)
+
+
 @pytest.mark.parametrize("name", TRAPS)
 def test_nothing_in_a_file_runs_and_no_claim_is_believed(name, tmp_path):
     path, canary = tmp_path / "inside" / name, tmp_path / "canary"

@@ -24,16 +24,11 @@ from tactslip_torch.package_files import (
     DETECTOR,
     SUMS,
     load_table,
-    read_checkpoint,
     save_table,
 )
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.learner import SlipLearner
-from tactslip_torch.training.recipe import Recipe
 
 from . import names
-from .names import FeaturePool, HandLayout, SlipDetector, StreamingDetector
-from .recordings import CHANNELS
+from .names import SlipDetector, StreamingDetector
 
 FORM = "tactslip_torch recording 1"
 MOST_BYTES = 2**33
@@ -182,20 +177,6 @@ def forged_json(path, draw):
     path.write_text(json.dumps(forged(json.loads(path.read_text()), draw)))
 
 
-def forged_checkpoint(path, draw):
-    content = torch.load(path, weights_only=True)
-    if draw.random() < 0.3:
-        where = content["plan"]["scaler"]
-        name = draw.choice(sorted(where))
-        where[name] = forged_tensor(where[name], draw)
-    else:
-        content = forged(content, draw)
-    torch.save(content, path)
-
-
-# What is done with a file that was read: all that a program does with it
-
-
 def detect(path):
     detector = SlipDetector.load(path)
     num = detector.context_before + detector.pool.bin_samples + detector.context_after
@@ -210,16 +191,6 @@ def solve(path):
     SufficientStats.load(path).solve(1.0)
 
 
-def resume(path):
-    read_checkpoint(path)
-    checkpoint = torch.load(path, weights_only=True)
-    pool = FeaturePool(HandLayout.from_rows(CHANNELS))
-    learner = SlipLearner(pool, ChannelFilter([51, 51, 11, 11]), Recipe(num_features=12))
-    learner._fingerprint = lambda: checkpoint.get("fingerprint")
-    learner.on_load_checkpoint(checkpoint)
-    assert learner.plan.selection.size
-
-
 def told(path):
     read_sidecar(path.with_suffix(""))
     summary(path.with_suffix(""))
@@ -228,7 +199,6 @@ def told(path):
 OWN = {  # what is forged, and what is done with it
     "detector.pt": (forged_table(DETECTOR), detect),
     "sums.pt": (forged_table(SUMS), solve),
-    "last.ckpt": (forged_checkpoint, resume),
     "model.onnx.json": (forged_json, told),
 }
 
@@ -237,7 +207,7 @@ OWN = {  # what is forged, and what is done with it
 def own_files(paper, tmp_path_factory):
     """A whole file of each kind."""
     folder = tmp_path_factory.mktemp("own")
-    for name in (names.DETECTOR, names.CHECKPOINT):
+    for name in (names.DETECTOR,):
         shutil.copy(paper.folder / name, folder)
     z = torch.linspace(-1, 1, 480, dtype=torch.float64).view(40, 12)
     sums = SufficientStats(12)

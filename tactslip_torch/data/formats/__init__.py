@@ -101,12 +101,12 @@ class Format:
         """
         with self.open(path) as opened:
             if opened.archived is None:
-                raise Refused(f"{path} is no recording of ours")
+                raise Refused(f"{path} is no recording of this package")
             samples = opened.samples.read(0, opened.samples.num_samples)
             recording = replace(opened.archived.recording, samples=samples)
             return opened.archived._replace(recording=recording)
 
-    def is_ours(self, path: Path) -> bool:
+    def is_native(self, path: Path) -> bool:
         """Whether a file is a package file, even one that is damaged: only such may be replaced."""
         try:
             with self.open(path) as opened:

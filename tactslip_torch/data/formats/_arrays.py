@@ -100,7 +100,7 @@ def _choose(
     found: Mapping[str, Any],
     how: Reading,
     separator: str = "/",
-    said: Callable[[Any], tuple[_Labels, float | None]] = lambda _: ([], None),
+    attributes: Callable[[Any], tuple[_Labels, float | None]] = lambda _: ([], None),
 ) -> Opened:
     """The samples of a file: its only array of two dimensions, or all columns of one length.
 
@@ -113,13 +113,13 @@ def _choose(
             is neither.
         how: what a person says of the file.
         separator: between the parts of a name.
-        said: what attributes say of an array: words that may name its channels, and its rate.
+        attributes: what they say of an array: words that may name its channels, and its rate.
 
     Raises:
         Refused: in one line that names what could be meant, if that is none or several.
     """
     refused = {name: kept for name, kept in found.items() if isinstance(kept, str)}
-    arrays = _arrays_of(found, separator, said)
+    arrays = _arrays_of(found, separator, attributes)
     several = [array for array in arrays if math.prod(array.values.shape) > 1]
     within = several if how.samples is None else _named(how.samples, several, refused)
     columns = [array for array in several if array.is_column]  # which numbers count
@@ -188,7 +188,7 @@ def _choose(
 def _arrays_of(
     found: Mapping[str, Any],
     separator: str,
-    said: Callable[[Any], tuple[_Labels, float | None]],
+    attributes: Callable[[Any], tuple[_Labels, float | None]],
 ) -> list[_Array]:
     """The arrays of a file, with the words that may name their channels, the nearest first."""
     lists = {
@@ -200,7 +200,7 @@ def _arrays_of(
     for name, kept in found.items():
         if not isinstance(kept, tuple | str):
             group, _, leaf = name.rpartition(separator)
-            labels, rate = said(kept)
+            labels, rate = attributes(kept)
             near = sorted(lists, key=lambda at: at.rpartition(separator)[0] != group)
             arrays.append(_Array(name, kept, leaf, [*labels, *(lists[at] for at in near)], rate))
     return arrays
@@ -410,7 +410,7 @@ def read_hdf5(path: Path, how: Reading, stack: ExitStack) -> Opened:
     for name, dataset in _datasets(file):
         is_list = name.rpartition("/")[2].lower() in CHANNEL_LISTS and _are_words(dataset)
         found[name] = _decoded(dataset[()]) if is_list else _why_no_dataset(dataset) or dataset
-    return _choose(path, found, how, said=_said)
+    return _choose(path, found, how, attributes=_attributes)
 
 
 def _datasets(file: Any) -> list[tuple[str, Any]]:
@@ -449,7 +449,7 @@ def _why_no_dataset(dataset: Any) -> str | None:
     return why
 
 
-def _said(dataset: Any) -> tuple[_Labels, float | None]:
+def _attributes(dataset: Any) -> tuple[_Labels, float | None]:
     """Words that may name the channels of a dataset and its rate, the nearest attributes first."""
     around = [dataset]
     while around[-1].name != "/":
@@ -553,7 +553,7 @@ def read_mat(path: Path, how: Reading, stack: ExitStack) -> Opened:
     own = header_in(found.get("header"))
     if own is not None:
         return opened_from(own, path, Samples(path, found["samples"], 0 if is_hdf5 else 1))
-    return _choose(path, found, how, ".", _said if is_hdf5 else lambda _: ([], None))
+    return _choose(path, found, how, ".", _attributes if is_hdf5 else lambda _: ([], None))
 
 
 def _look(name: str, value: Any, found: dict[str, Any]) -> None:

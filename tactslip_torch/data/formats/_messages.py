@@ -416,7 +416,7 @@ def _opened_messages(
     Args:
         path: of the file or folder.
         messages: in it, of all topics.
-        header: of a recording of ours.
+        header: of a package file.
         how: what a person says of the file; ``samples`` names the topic.
         stack: closes what is kept.
 
@@ -434,8 +434,10 @@ def _opened_messages(
         stamps = None if seconds is None else Samples(path, [seconds])
         return Opened(Samples(path, rows), None, topic.names, stamps, left_out=topic.left_out)
     if how.samples is None:
-        why = "; ".join(f"{name}: {said}" for name, said in sorted(others.items())) or "no messages"
-        raise Refused(f"has no topic with samples ({why[:800]})")
+        reasons = (
+            "; ".join(f"{name}: {why}" for name, why in sorted(others.items())) or "no messages"
+        )
+        raise Refused(f"has no topic with samples ({reasons[:800]})")
     if how.samples in others:
         raise Refused(f"cannot be read at topic {how.samples}: {others[how.samples]}")
     known = ", ".join(sorted(others)) or "none"
@@ -481,16 +483,16 @@ def _read_topic(
     return found, others
 
 
-def _counted(messages: Iterable[Message], said: int | None) -> Iterator[Message]:
+def _counted(messages: Iterable[Message], stated: int | None) -> Iterator[Message]:
     """The messages, which must be as many as the metadata of their file say, if they do."""
     count = 0
     for message in messages:
         count += 1
         yield message
-    if said is not None and count != said:
+    if stated is not None and count != stated:
         raise Refused(
-            f"holds {count} messages, where its metadata say {said}: it is damaged or a part; mcap "
-            "recover, or ros2 bag reindex, saves what is there"
+            f"holds {count} messages, where its metadata say {stated}: it is damaged or a part; "
+            "mcap recover, or ros2 bag reindex, saves what is there"
         )
 
 
@@ -536,7 +538,7 @@ def read_mcap(path: Path, how: Reading, stack: ExitStack) -> Opened:
     footer = file.read()
     if footer[:9] != b"\2\x14\0\0\0\0\0\0\0" or footer[-8:] != b"\x89MCAP0\r\n":
         raise Refused(
-            "is damaged or no recording of ours: it is no MCAP file, or ends in the middle; "
+            "is damaged or no recording: it is no MCAP file, or ends in the middle; "
             "of such a file mcap recover saves what is there"
         )
     file.seek(0)

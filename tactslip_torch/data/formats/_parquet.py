@@ -240,10 +240,10 @@ def _features_in(info: Mapping[str, Any], how: Reading) -> dict[str, int]:
     wanted = "*tactile*" if how.samples is None else how.samples
     chosen = {n: c for n, c in numbers.items() if fnmatchcase(n, wanted) or n == wanted}
     if not chosen or (len(chosen) > 1 and how.samples is None):
-        said = f"no feature {wanted!r}" if not chosen else f"several, {', '.join(chosen)}"
+        what = f"no feature {wanted!r}" if not chosen else f"several, {', '.join(chosen)}"
         listed = ", ".join(numbers) or "none"
         raise Refused(
-            f"has {said[:200]}; say reading.samples=NAME, with * for any text; its features of "
+            f"has {what[:200]}; say reading.samples=NAME, with * for any text; its features of "
             f"numbers are {listed[:400]}"
         )
     if not 0 < (total := sum(chosen.values())) <= MOST_CHANNELS:

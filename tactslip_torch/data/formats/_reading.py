@@ -46,7 +46,7 @@ MOST_MEMBERS = 10_000
 """Arrays, groups, columns or topics of one file that are looked at."""
 MOST_RATIO, FREE_BYTES = 100, 64 * 2**20
 """A file may hold so many times its size, and so many bytes in any case."""
-_MOST_SAID = 200
+_MOST_SHOWN = 200
 
 
 @contextmanager
@@ -61,8 +61,8 @@ def guarded(path: str | os.PathLike[str]) -> Iterator[None]:
     try:
         yield
     except Refused as error:
-        said = str(error)
-        raise (error if said.startswith(name) else Refused(f"{name} {said}")) from None
+        text = str(error)
+        raise (error if text.startswith(name) else Refused(f"{name} {text}")) from None
     except FileNotFoundError:
         raise FileNotFoundError(f"no file at {name}") from None
     except MemoryError as error:
@@ -70,8 +70,8 @@ def guarded(path: str | os.PathLike[str]) -> Iterator[None]:
             f"{name} needs more memory than there is; convert it to .h5, or cut it"
         ) from error
     except Exception as error:  # HDF5, Arrow, zlib, struct, SQLite and YAML raise many kinds
-        said = " ".join(str(error).split())[:_MOST_SAID] or type(error).__name__
-        raise Refused(f"{name} is damaged or no recording of ours ({said})") from error
+        text = " ".join(str(error).split())[:_MOST_SHOWN] or type(error).__name__
+        raise Refused(f"{name} is damaged or no recording ({text})") from error
 
 
 def check_plausible(what: str, claimed: int, stored: int, most: int | None = None) -> None:
@@ -116,7 +116,7 @@ def needs(module: str, what: str, extra: str = "formats") -> ModuleType:
     return importlib.import_module(module)
 
 
-# What a person says -----------------------------------------------------------------------------
+# How files are read -----------------------------------------------------------------------------
 
 _SpeedUnit = Literal["mm/s", "cm/s", "m/s", "um/s"]
 MM_S: dict[_SpeedUnit, float] = {"mm/s": 1.0, "cm/s": 10.0, "m/s": 1000.0, "um/s": 1e-3}
@@ -368,7 +368,7 @@ def pieces(samples: Any, num_samples: int) -> Iterator[Tensor]:
 
 
 class Archived(NamedTuple):
-    """What a file of ours holds.
+    """What a package file holds.
 
     Args:
         recording: samples and truth.
@@ -386,7 +386,7 @@ class Opened(NamedTuple):
 
     Args:
         samples: all of them.
-        archived: all else of a file of ours, around no samples; ``None`` for other files.
+        archived: all else of a package file, around no samples; ``None`` for foreign files.
         names: of the channels, if the file says.
         stamps: when the samples were taken, in the only channel, if the file says. Of rows with
             several samples, when the first of each was.
@@ -538,8 +538,8 @@ def opened_columns(
         opened = opened._replace(names=of[0], left_out=of[1])
     if time is None:
         return opened
-    said = how.time_unit or time_unit_in(names[time] if names else None) or units.get(time)
-    return opened._replace(stamps=samples([time]), time_unit=stamps.get(time, said))
+    unit = how.time_unit or time_unit_in(names[time] if names else None) or units.get(time)
+    return opened._replace(stamps=samples([time]), time_unit=stamps.get(time, unit))
 
 
 def position_of(names: Sequence[str] | None, num_columns: int, wanted: str | int, what: str) -> int:
@@ -568,7 +568,7 @@ def some(words: Sequence[str]) -> str:
 
 FORM = "tactslip_torch recording 1"
 MOST_HEADER = 16 * 2**20
-"""Bytes of header text; a longer one is no header of ours."""
+"""Bytes of header text; a longer one is none."""
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 

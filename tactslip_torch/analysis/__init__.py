@@ -1,1 +1,0 @@
-"""What a detector needs, costs and loses: sensors, latency, precision."""
