@@ -9,12 +9,13 @@ they represent. Arguments are those of ``tactslip train``.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import mean, median, stdev
 from typing import Any, ClassVar
 
+import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
@@ -23,65 +24,32 @@ from benchmarks.subjects import composed
 from benchmarks.tables import Report, Table, percent
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import seen6
-from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.statistics import TrainingStatistics
-from tactslip_torch.model.fit import fit_machine
-from tactslip_torch.runtime import bar, in_processes, one_thread
+from tactslip_torch.runtime import in_processes
+from tactslip_torch.training.bins import BinSample, RecordingBins, SampledBins
+from tactslip_torch.training.choice import balanced_accuracy
 from tactslip_torch.training.datamodule import SlipDataModule
 from tactslip_torch.training.experiment import feature_cache, feature_maker
-from tactslip_torch.training.plan import plan_detector
-from tactslip_torch.training.recipe import Recipe, balanced_accuracy
+from tactslip_torch.training.recipe import Recipe
 
 PAPERS_UNSEEN = frozenset({"iron", "cloth", "copper", "wood"})
 GIVEN = {"general": ("recipe.use=pooled", "recipe.num_features=null", "recipe.degree=1")}
 """What the whole choice of a recipe takes on this set; all of it takes longer."""
 
 
+@dataclass(frozen=True)
 class Materials:
     """What one pass over all recordings keeps of each material.
 
     Args:
         pool: the features.
-        train_bins: bins of each material and class to fit on.
-        scored_bins: and to evaluate on.
-
-    Attributes:
-        training_statistics: of the training cycles, by material.
+        training: by material a sample of the bins of training cycles.
+        scored: by material and role, ``"train"`` or ``"test"``, a sample to evaluate on.
     """
 
-    def __init__(self, pool: FeaturePool, train_bins: int, scored_bins: int) -> None:
-        self.pool = pool
-        self.training_statistics: dict[str, TrainingStatistics] = {}
-        self._train_bins, self._scored_bins = train_bins, scored_bins
-        self._samples: dict[tuple[str, str], BinSample] = {}  # by material and role
-
-    def update(self, batch: Any, role: str) -> None:
-        """Add a recording whose cycle is for ``"train"`` or for ``"test"``."""
-        name, material = str(batch.recording), batch.recording.material
-        if role == "train":
-            statistics = self.training_statistics.setdefault(material, self._statistics())
-            statistics.update(name, material, batch.features, batch.is_slip)
-        sample = self._samples.setdefault((material, role), BinSample(self._scored_bins))
-        sample.update(name, material, batch.features, batch.is_slip)
-
-    def statistics_of(self, materials: Iterable[str]) -> TrainingStatistics:
-        """One statistics of the training cycles of several materials."""
-        merged = self._statistics()
-        for material in sorted(materials):
-            merged.merge(self.training_statistics[material])
-        return merged
-
-    def bins_of(self, materials: Iterable[str], roles: Sequence[str]) -> SampledBins:
-        """The bins to evaluate on."""
-        merged = BinSample(self._scored_bins)
-        for key in itertools.product(sorted(materials), roles):
-            if key in self._samples:
-                merged.merge(self._samples[key])
-        return merged.bins()
-
-    def _statistics(self) -> TrainingStatistics:
-        return TrainingStatistics(len(self.pool.names), self._train_bins)
+    pool: FeaturePool
+    training: dict[str, RecordingBins]
+    scored: dict[tuple[str, str], SampledBins]
 
 
 def read_materials(
@@ -98,12 +66,22 @@ def read_materials(
     """
     by_cycle = seen6(source.ids, seen=list(names), seed=config.seed)[0]
     maker = feature_maker(source, instantiate(config.labels), **config.features)
-    materials = Materials(maker.pool, train_bins, scored)
-    with feature_cache(config.cache) as maker.cache, one_thread():  # workers need the processors
-        data = SlipDataModule(maker, by_cycle, config.num_workers)
-        for batch in bar(data.loader(["train", "test"]), "features of all materials", "recording"):
-            materials.update(batch, by_cycle.roles[batch.recording])
-    return materials
+    fitted = {name: BinSample(train_bins) for name in names}
+    drawn = {(name, role): BinSample(scored) for name in names for role in ("train", "test")}
+    with feature_cache(config.cache) as maker.cache:
+        data = SlipDataModule(maker, [by_cycle], config.num_workers)
+        data.setup()
+        for made in data.features("train", "test"):
+            material, role = made.recording.material, by_cycle.roles[made.recording]
+            bins = RecordingBins(str(made.recording), material, made.features, made.is_slip)
+            drawn[material, role].update(bins)
+            if role == "train":
+                fitted[material].update(bins)
+    training = {}
+    for name, sample in fitted.items():
+        own = sample.bins()
+        training[name] = RecordingBins(name, name, own.features, own.is_slip)
+    return Materials(maker.pool, training, {key: of.bins() for key, of in drawn.items()})
 
 
 def evaluate_split(materials: Materials, recipe: Recipe, unseen: Sequence[str]) -> dict[str, Any]:
@@ -113,21 +91,19 @@ def evaluate_split(materials: Materials, recipe: Recipe, unseen: Sequence[str]) 
         ``unseen``, ``test`` (balanced accuracies), ``per_material`` (of the unseen ones),
         ``num_features``, ``penalty``, and ``materials``, the unseen ones.
     """
-    seen = sorted(set(materials.training_statistics) - set(unseen))
-    statistics = materials.statistics_of(seen)
-    plan = plan_detector(recipe, statistics, materials.pool, is_nested=False)
-    training = plan.training_bins(statistics.sample.bins())
-    head = fit_machine(training, plan.penalty, plan.kernel)
+    seen = sorted(set(materials.training) - set(unseen))
+    bins = [materials.training[name] for name in seen]
+    fit = recipe.fit(bins, materials.pool, is_nested=False)
 
     def score(names: Sequence[str], roles: Sequence[str]) -> tuple[float | None, dict[str, Any]]:
-        bins = materials.bins_of(names, roles)
-        says_slip = head(plan.selection(bins.features)) >= 0
-        by_material = {
-            name: balanced_accuracy(says_slip[mine], bins.is_slip[mine], bins.sample_weight[mine])
-            for index, name in enumerate(bins.group_names)
-            for mine in [bins.group == index]
-        }
-        return balanced_accuracy(says_slip, bins.is_slip, bins.sample_weight), by_material
+        decided: list[tuple[torch.Tensor, ...]] = []
+        for name in names:
+            some = [materials.scored[name, role] for role in roles]
+            says_slip = torch.cat([fit.head(fit.selection(of.features)) >= 0 for of in some])
+            truth, weights = ([getattr(of, n) for of in some] for n in ("is_slip", "weight"))
+            decided.append((says_slip, torch.cat(truth), torch.cat(weights)))
+        by_material = {n: balanced_accuracy(*own) for n, own in zip(names, decided, strict=True)}
+        return balanced_accuracy(*map(torch.cat, zip(*decided, strict=True))), by_material
 
     of_unseen, by_material = score(unseen, ("train", "test"))
     return {
@@ -135,8 +111,8 @@ def evaluate_split(materials: Materials, recipe: Recipe, unseen: Sequence[str]) 
         "unseen": of_unseen,
         "test": score(seen, ("test",))[0],
         "per_material": by_material,
-        "num_features": plan.selection.size,
-        "penalty": plan.penalty,
+        "num_features": fit.selection.size,
+        "penalty": fit.penalty,
     }
 
 

@@ -30,11 +30,11 @@ from benchmarks.harness import Benchmark, Job, code_digest, put_between, resumed
 from benchmarks.subjects import composed, features_of_some
 from benchmarks.tables import Report, Table, lines, mean_sd
 from tactslip_torch.data.recording import RecordingId, RecordingSource
-from tactslip_torch.features.bin_sample import bin_keys
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import calibration_of
 from tactslip_torch.report.results import BASELINES, splits_table
+from tactslip_torch.training.bins import bin_keys
 from tactslip_torch.training.datamodule import RecordingFeatures
 
 LEVELS_MV = (1.0, 3.0, 10.0, 30.0)
@@ -96,7 +96,7 @@ class Generalisation(Benchmark):
     unseen4: tuple[int, ...] = (0, 1, 2, 3, 4)
     deploy: tuple[int, ...] = (0, 1, 2, 3, 4)
     hard: tuple[int, ...] = (0, 1, 2, 3, 4)
-    recipes: tuple[str, ...] = ("general", "robust", "paper")
+    recipes: tuple[str, ...] = ("general", "paper")
     overrides: tuple[str, ...] = ()
     levels_mv: tuple[float, ...] = LEVELS_MV
     evaluated: int = 4
@@ -238,7 +238,7 @@ def _measured(name: str, given: Sequence[str], job: Job, sizes: Generalisation) 
 
     def on(keep: Any, *over: str, half: bool = False) -> list[_Scored]:
         config = composed("train", ["+exp=unseen4", *given, *over]) if over else whole
-        made = features_of_some(config, cache, keep, f"{given[0]} {' '.join(over)}")
+        made = features_of_some(config, cache, keep)
         return [_scored(detector, each, half=half) for each in made]
 
     def having(**most: int) -> Callable[[RecordingSource], list[RecordingId]]:

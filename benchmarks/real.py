@@ -40,16 +40,15 @@ from tactslip_torch.commands.detect import detect
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split
-from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.runtime import bar
 from tactslip_torch.training.alarm import DebouncedAlarm
+from tactslip_torch.training.bins import RecordingBins
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.experiment import feature_maker
-from tactslip_torch.training.plan import TrainingPass, plan_detector
 from tactslip_torch.training.recipe import Recipe
 
 Array = NDArray[Any]
-RECIPES = ("general", "robust", "paper")
+RECIPES = ("general", "paper")
 """Of ours; the first is the one that limits are for."""
 SCENES = {
     "n": "north",
@@ -311,25 +310,21 @@ def methods_of(
 
 def _ours(windows: Windows, recipe: Recipe, train: Array, _: SlipDetector | None) -> Fitted:
     """The detector that ``train`` makes of these windows."""
-    pool = windows.maker.pool
-    statistics = TrainingStatistics(len(pool.names), recipe.sample_bins)
-    for recording, features, is_slip in windows.by_recording(train):
-        statistics.update(str(recording), recipe.group(recording), features, is_slip)
-    plan = plan_detector(recipe, statistics, pool, is_nested=False)
-    second = TrainingPass(plan)
-    for recording, features, is_slip in windows.by_recording(train):
-        second.update(str(recording), features, is_slip)
-    kernel = plan.kernel.to_dict()
-    info = {"penalty": plan.penalty, "calibration": plan.calibration, "kernel": kernel}
-    detector = plan.detector(pool, windows.maker.channel_filter, second.solve(), info)
+    bins = [
+        RecordingBins(str(recording), recording.material, features, is_slip)
+        for recording, features, is_slip in windows.by_recording(train)
+    ]
+    fit = recipe.fit(bins, windows.maker.pool, is_nested=False)
+    metadata = fit.metadata | {"calibration": fit.calibration}
+    detector = fit.detector(windows.maker.pool, windows.maker.channel_filter, metadata)
 
     @torch.no_grad()
     def score(samples: Array) -> Array:
         return detector.predict(torch.from_numpy(samples)).score.numpy()
 
     pooled = sum(name.is_pooled for name in detector.selected_names)
-    chosen = {"features": len(detector.selected), "pooled": pooled, "degree": kernel.get("degree")}
-    return Fitted(score, chosen | {"C": plan.penalty}, detector)
+    chosen = {"features": len(detector.selected), "pooled": pooled, "degree": fit.kernel.degree}
+    return Fitted(score, chosen | {"C": fit.penalty}, detector)
 
 
 def _same_features(

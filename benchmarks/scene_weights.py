@@ -12,26 +12,24 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any, ClassVar
 
 import torch
 from hydra.utils import instantiate
-from torch import Tensor
 
 from benchmarks.harness import Benchmark, Job
-from benchmarks.subjects import composed, features_of_some
+from benchmarks.subjects import composed
 from benchmarks.tables import Table, by
-from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import PAPER_SCENE, Split
-from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.moments import SufficientStats
-from tactslip_torch.training.experiment import feature_maker
-from tactslip_torch.training.plan import candidates, fitted_selection
-from tactslip_torch.training.recipe import Recipe, recalls, sample_groups, sample_weight
+from tactslip_torch.training.bins import RecordingBins
+from tactslip_torch.training.choice import recalls
+from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.experiment import feature_cache, feature_maker
+from tactslip_torch.training.recipe import General
 
 PENALTY = 1e-3  # what validation takes for every seed of +exp=unseen4
 SCENES = ("arm_motion", "paper_loud", "others")
@@ -83,53 +81,44 @@ class SceneWeights(Benchmark):
         return {"tables": {"Errors, %": Table(told, note)}}
 
 
-def _training_bins(cache: Path, small: Sequence[str]) -> tuple[Recipe, FeaturePool, SampledBins]:
-    """The recipe of ``+exp=deploy``, its pool, and a sample of its training bins."""
+def _training_bins(
+    cache: Path, small: Sequence[str]
+) -> tuple[General, FeaturePool, list[RecordingBins]]:
+    """The recipe of ``+exp=deploy`` without second copies, its pool, and its training bins."""
     config = composed("train", ["+exp=deploy", *small])
-    recipe: Recipe = instantiate(config.recipe, _convert_="all")
+    recipe: General = instantiate(config.recipe, _convert_="all")
     source = instantiate(config.data, _convert_="all")
-    pool = feature_maker(source, instantiate(config.labels), **config.features).pool
-    sample = BinSample(recipe.sample_bins)
-
-    def keep(source: RecordingSource) -> list[RecordingId]:
-        fold: Split = instantiate(config.split, _convert_="all")(source.ids)[0]
-        return fold.having("train")
-
-    for made in features_of_some(config, cache, keep, f"{small[0]}, training"):
-        stratum = recipe.stratum(made.recording)
-        sample.update(str(made.recording), stratum, made.features, made.is_slip)
-    return recipe, pool, sample.bins()
-
-
-def _without(sample: SampledBins, is_out: Tensor) -> SampledBins:
-    """The other bins of a sample."""
-    tensors = {of.name: getattr(sample, of.name) for of in fields(sample)}
-    tensors = {name: of[~is_out] for name, of in tensors.items() if isinstance(of, Tensor)}
-    return replace(sample, **tensors)
+    fold: Split = instantiate(config.split, _convert_="all")(source.ids)[0]
+    maker = feature_maker(
+        source,
+        instantiate(config.labels),
+        recipe=recipe,
+        with_baselines=False,
+        **config.features,
+    )
+    with feature_cache(str(cache)) as maker.cache:
+        data = SlipDataModule(maker, [fold], config.num_workers)
+        data.setup()
+        bins = list(data.training_bins())
+    return replace(recipe, drop_channels=0.0, penalties=PENALTY), maker.pool, bins
 
 
 def _errors(
-    recipe: Recipe, pool: FeaturePool, sample: SampledBins, sizes: SceneWeights
+    recipe: General, pool: FeaturePool, bins: Sequence[RecordingBins], sizes: SceneWeights
 ) -> Iterator[dict[str, float]]:
     """Errors in % on each left-out material, for each set of weights."""
-    structure = candidates(recipe, len(sample.is_slip))[0]
-    groups, names = sample_groups(sample)
-    scenes = [name.split("|")[-1] for name in sample.group_names]
-    for place in range(len(names)):
-        is_out = groups == place
-        training = _without(sample, is_out)
-        selection = fitted_selection(recipe, pool, training, structure)
-        z, others = selection(training.features), selection(sample.features[is_out])
+    for material in sorted({of.group for of in bins}):
+        out = [of for of in bins if of.group == material]
+        training = [replace(of, group="others") for of in bins if of.group != material]
         for weights in itertools.product(sizes.arm_motion, sizes.paper_loud, sizes.others):
             by_scene = dict.fromkeys(recipe.scene_weights, weights[-1])
             by_scene |= dict(zip(SCENES, weights[:-1], strict=False))
-            each = sample_weight(replace(recipe, scene_weights=by_scene), training)
-            sums = SufficientStats(selection.size, degree=1)
-            sums.update("training", z, training.is_slip, each)
-            says, wrong = sums.solve(PENALTY, 1.0, balance="none")(others) >= 0, {}
+            fit = replace(recipe, scene_weights=by_scene).fit(training, pool)
+            wrong = {}
             for scene in (PAPER_SCENE, *SCENES[:2]):
-                own = torch.tensor([of == scene for of in scenes])[sample.group[is_out]]
-                found = recalls(says[own], sample.is_slip[is_out][own])
+                own = [of for of in out if of.scene == scene]
+                says = torch.cat([fit.head(fit.selection(of.features)) >= 0 for of in own])
+                found = recalls(says, torch.cat([of.is_slip for of in own]))
                 wrong[scene] = [100 * (1 - recall) for recall in found]
             yield dict(zip(SCENES, weights, strict=True)) | {
                 "protocol": fmean(wrong[PAPER_SCENE]),

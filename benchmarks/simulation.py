@@ -13,15 +13,19 @@ from functools import partial
 from typing import Any, ClassVar
 
 import torch
+from hydra.utils import instantiate
 
-from benchmarks.crossval import read_materials
 from benchmarks.harness import Benchmark, Job, say
-from benchmarks.subjects import FittedMachine, small_training
+from benchmarks.subjects import composed
 from benchmarks.tables import Table, percent, times
 from benchmarks.timing import interleaved, on_threads
+from tactslip_torch.data.splits import seen6
 from tactslip_torch.simulation import SEEN_MATERIALS, Dynamics, Scene, simulate, timeline
 from tactslip_torch.simulation.simulate import SimulatedRecordings
-from tactslip_torch.training.recipe import balanced_accuracy
+from tactslip_torch.training.choice import balanced_accuracy
+from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.experiment import feature_maker
+from tactslip_torch.training.recipe import General
 
 LEVELS: dict[str, tuple[str, dict[str, int]]] = {
     "kinematic": ("kinematic", {}),
@@ -42,23 +46,18 @@ class Simulation(Benchmark):
         materials: that detectors are trained on and evaluated on.
         cycles: of each of them.
         train_bins: of each material and class.
-        num_features: K.
     """
 
     title = "The simulated hand"
     about = "fidelity levels and time steps: cost, difference to the smallest step, and accuracy"
     charts: ClassVar = {"": (("Levels and steps", "s a minute"),)}
-    quick = (
-        "steps_us=[250.0,500.0] recordings=1 rounds=1 materials=[M1,M2] cycles=3 train_bins=20 "
-        "num_features=10"
-    )
+    quick = "steps_us=[250.0,500.0] recordings=1 rounds=1 materials=[M1,M2] cycles=3 train_bins=20"
     steps_us: tuple[float, ...] = (31.25, 62.5, 125.0, 250.0, 500.0)
     recordings: int = 3
     rounds: int = 5
     materials: tuple[str, ...] = tuple(SEEN_MATERIALS)
     cycles: int = 20
     train_bins: int = 200
-    num_features: int = 60
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Costs and differences by level and step; accuracies by level."""
@@ -133,24 +132,28 @@ def _difference(scenes: list[Scene], finest: list[Scene]) -> tuple[float, float]
 def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> list[dict[str, str]]:
     """Balanced accuracy on held-out cycles by the level trained on and the one evaluated on."""
     off = ["cache=off", *overrides]
-    config, recipe = small_training(off, sizes.train_bins, sizes.num_features)
+    config = composed("train", off)
+    recipe = General(use="pooled", num_features=None, degree=1, sample_bins=sizes.train_bins)
     kept = {}
     for level, (fidelity, given) in LEVELS.items():
         say(f"simulation: features of {level}")
         source = SimulatedRecordings(
             cycles=sizes.cycles, materials=list(sizes.materials), fidelity=fidelity, scene=given
         )
-        kept[level] = read_materials(config, source, sizes.materials, sizes.train_bins, 2000)
-    bins = {
-        level: materials.bins_of(sizes.materials, ("test",)) for level, materials in kept.items()
-    }
+        rule = instantiate(config.labels)
+        maker = feature_maker(source, rule, recipe=recipe, with_baselines=False, **config.features)
+        fold = seen6(source.ids, seen=list(sizes.materials))[0]
+        kept[level] = SlipDataModule(maker, [fold], config.num_workers)
+        kept[level].setup()
     rows = []
-    for level, materials in kept.items():
-        machine = FittedMachine.of(materials.statistics_of(sizes.materials), recipe)
+    for level, data in kept.items():
+        fit = recipe.fit(data.training_bins(), data.maker.pool, is_nested=False)
         row: dict[str, str] = {"balanced accuracy, %": f"trained on {level}"}
-        for other, of in bins.items():
-            called = machine.scores(of.features) >= 0
-            row[f"on {other}"] = percent(balanced_accuracy(called, of.is_slip, of.sample_weight))
+        for other, its in kept.items():
+            made = list(its.features("test"))
+            says = torch.cat([fit.head(fit.selection(each.features)) >= 0 for each in made])
+            is_slip = torch.cat([each.is_slip for each in made])
+            row[f"on {other}"] = percent(balanced_accuracy(says, is_slip))
         rows.append(row)
     return rows
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from itertools import cycle
 from pathlib import Path
@@ -21,22 +21,17 @@ from tactslip_torch.commands.configuration import checked
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split
-from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.model.fit import fit_machine
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import KEY
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.onset.rules import Cusum
-from tactslip_torch.runtime import bar, one_thread
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.datamodule import FeatureMaker, RecordingFeatures, SlipDataModule
 from tactslip_torch.training.experiment import feature_cache, feature_maker
-from tactslip_torch.training.plan import plan_detector
-from tactslip_torch.training.recipe import Recipe
 
 Array = NDArray[Any]
 WINDOW_LENGTHS = (51,) * 14 + (11,) * 10
@@ -134,7 +129,6 @@ def features_of_some(
     config: DictConfig,
     cache: Path,
     keep: Callable[[RecordingSource], Sequence[RecordingId]],
-    what: str,
 ) -> Iterator[RecordingFeatures]:
     """The features of some recordings of a set, made by processes and kept.
 
@@ -142,47 +136,12 @@ def features_of_some(
         config: of ``tactslip train``.
         cache: of features.
         keep: which recordings.
-        what: in words, for the progress bar.
     """
     source = instantiate(config.data, _convert_="all")
     maker = feature_maker(source, instantiate(config.labels), **config.features)
     chosen = keep(source)
-    with feature_cache(str(cache)) as maker.cache, one_thread():  # workers need the processors
-        data = SlipDataModule(
-            maker, Split("benchmark", dict.fromkeys(chosen, "unseen")), config.num_workers
-        )
-        yield from bar(data.loader(["unseen"]), what, "recording", total=len(chosen))
-
-
-@dataclass(frozen=True, eq=False)
-class FittedMachine:
-    """A machine of sampled training bins, as a recipe makes it."""
-
-    plan: Any
-    statistics: TrainingStatistics
-    weights: Tensor
-    head: Any
-
-    @classmethod
-    @torch.no_grad()
-    def of(cls, statistics: TrainingStatistics, recipe: Recipe) -> FittedMachine:
-        """Rank, scale, choose K and C, and fit."""
-        plan = plan_detector(recipe, statistics)
-        training = plan.training_bins(statistics.sample.bins())
-        head = fit_machine(training, plan.penalty, plan.kernel)
-        return cls(plan, statistics, training.sample_weight, head)
-
-    @torch.no_grad()
-    def scores(self, features: Tensor) -> Tensor:
-        """Of bins by their whole pool, ``[N, F]`` to ``[N]``."""
-        scores: Tensor = self.head(self.plan.selection(features))
-        return scores
-
-
-def small_training(
-    overrides: Sequence[str], train_bins: int, num_features: int
-) -> tuple[DictConfig, Recipe]:
-    """The configuration of a training, and the recipe of the paper on a sample of bins."""
-    config = composed("train", ["recipe=paper", f"recipe.num_features={num_features}", *overrides])
-    recipe: Recipe = instantiate(config.recipe, _convert_="all")
-    return config, replace(recipe, sample_bins=train_bins)
+    with feature_cache(str(cache)) as maker.cache:
+        fold = Split("benchmark", dict.fromkeys(chosen, "unseen"))
+        data = SlipDataModule(maker, [fold], config.num_workers)
+        data.setup()
+        yield from data.features("unseen")

@@ -1,6 +1,6 @@
 """A fit by shards under any batch scheduler: every job adds up its recordings, the last one solves.
 
-    python -m tactslip_torch.train recipe=robust data.cycles=2 hydra.run.dir=first
+    python -m tactslip_torch.train recipe=paper data.cycles=2 hydra.run.dir=first
     for k in $(seq 16); do python examples/batch_fit.py collect first $k/16 sums-$k.stats; done
     python examples/batch_fit.py solve first detector.pt sums-*.stats
 
@@ -28,14 +28,15 @@ def collect(run: Path, shard: str, out: Path, overrides: list[str]) -> None:
     source = instantiate(config.data, _convert_="all")
     fold = instantiate(config.split, _convert_="all")(source.ids)[0]
     rule = instantiate(config.labels)
-    maker = FeatureMaker(source, detector.pool, detector.channel_filter, rule)
+    pool = detector.pool.select(detector.selected)
+    maker = FeatureMaker(source, pool, detector.channel_filter, rule)
     part, parts = map(int, shard.split("/"))
     sums = SufficientStats(len(detector.selected))
     for recording in fold.having("train")[part - 1 :: parts]:
-        made = maker(recording, fold)
+        made = maker(recording).in_split(fold)
         trained = made.roles["train"]
-        features = made.features[trained][:, list(detector.selected)].double()
-        sums.update(str(recording), detector.scaler(features), made.is_slip[trained])
+        features = detector.scaler(made.features[trained].double())
+        sums.update(str(recording), features, made.is_slip[trained])
     sums.save(out)
 
 

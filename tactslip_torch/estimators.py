@@ -26,18 +26,16 @@ from sklearn.utils.validation import (
 from torch import Tensor
 
 from tactslip_torch.deploy.export import export_detector, wanted_graphs
-from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, most_stuck_samples
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.calibration import Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
-from tactslip_torch.model.kernels import Head
 from tactslip_torch.onset.decisions import calibration_of
 from tactslip_torch.signals.filtering import Align, ChannelFilter
-from tactslip_torch.training.plan import Plan, TrainingPass, plan_detector, solve_metadata
-from tactslip_torch.training.recipe import Recipe
+from tactslip_torch.training.bins import RecordingBins
+from tactslip_torch.training.recipe import Fit, General
 
 FRAMES: Mapping[str, int] = {"SG": 51, "PVDF": 11}
 """Savitzky-Golay frames of the paper's kinds of channels, samples at 2 kHz; others are as given."""
@@ -135,8 +133,7 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         """
         windows = self._lay_out(X)
         pool, recipe = self._pool, self._recipe(num_features=None, degree=1)
-        allowed = recipe.allowed(pool)
-        places = range(len(pool.names)) if allowed is None else allowed.nonzero()[:, 0].tolist()
+        places = recipe.allowed(pool).nonzero()[:, 0].tolist()
         self._layer: ChannelPooling | None = None
         self._columns = described = pool.select(places)
         if self.use != "channel":
@@ -171,18 +168,13 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         names = self._columns.names if self._layer is None else self._layer.names
         return np.array([str(name) for name in names], dtype=object)
 
-    def _recipe(self, **choices: Any) -> Recipe:
+    def _recipe(self, **choices: Any) -> General:
         """The default recipe on these features."""
-        return Recipe(
+        return General(
             name="estimator",
-            compress=True,
-            tail=0.01,
-            balance="weights",
             pooling=self.pooling,
             use=_USES if self.use is None else self.use,
             descriptors=self.descriptors,
-            ranking="gd",
-            validation="nested",
             **choices,
         )
 
@@ -382,22 +374,21 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             penalties=self.penalties,
             tolerance=self.tolerance,
             drop_channels=self.drop_channels,
+            sample_bins=max(len(windows), 2),
         )
         pool, is_slip = features._pool, torch.from_numpy(np.asarray(y == self.slip_label_))
         with torch.no_grad():
             x = pool(features._bins(windows), torch.float64)
-            plan, head = _solved(recipe, pool, x, is_slip, *_groups(y, groups))
+            fit = _fitted(recipe, pool, x, is_slip, *_groups(y, groups))
         self._slope: Platt = _UNCALIBRATED
-        if plan.calibration is not None:
-            self._slope = Platt(plan.calibration["slope"], 0.0)  # a score of 0 says nothing
-        info = plan.metadata | {
-            "validation": plan.validation,
-            "head": head.cost._asdict(),
-            "solve": solve_metadata(head),
+        if fit.calibration is not None:
+            self._slope = Platt(fit.calibration["slope"], 0.0)  # a score of 0 says nothing
+        info = fit.metadata | {
+            "recipe": recipe.name,
             "calibration": self._slope.to_dict(),
             "classes": self._ordered(self.classes_.tolist()),
         }
-        detector = plan.detector(pool, features._filter, head, info)
+        detector = fit.detector(pool, features._filter, info)
         stuck = _stuck_samples(pool, windows)
         detector.sensing = replace(detector.sensing, stuck_samples=stuck)
         self._set(detector, features)
@@ -602,30 +593,18 @@ def _groups(y: Array, groups: Any) -> tuple[Tensor, tuple[str, ...]]:
     return torch.from_numpy(index), tuple(names)
 
 
-def _solved(
-    recipe: Recipe,
+def _fitted(
+    recipe: General,
     pool: FeaturePool,
     features: Tensor,
     is_slip: Tensor,
     group: Tensor,
     names: tuple[str, ...],
-) -> tuple[Plan, Head]:
-    """The plan of the training and its machine, of features ``[N, F]`` that all serve for both."""
-    sample = SampledBins(
-        features=features,
-        is_slip=is_slip,
-        group=group,
-        group_names=names,
-        recording=group,
-        recording_names=names,
-        bin_index=torch.arange(len(features)),
-        sample_weight=torch.ones(len(features), dtype=torch.float64),
-    )
-    with torch.no_grad():
-        plan = plan_detector(recipe, sample, pool, is_nested=False)
-        gathered = TrainingPass(plan)
-        for index, name in enumerate(names):
-            rows = (group == index).nonzero()[:, 0]
-            for part, some in enumerate(rows.split(_BLOCK)):
-                gathered.update(f"{index}.{part} {name}", features[some], is_slip[some])
-        return plan, gathered.solve()
+) -> Fit:
+    """The fit of the training to features ``[N, F]``, of which all serve for choices too."""
+    bins = [
+        RecordingBins(f"{index}.{part} {name}", name, features[some], is_slip[some])
+        for index, name in enumerate(names)
+        for part, some in enumerate((group == index).nonzero()[:, 0].split(_BLOCK))
+    ]
+    return recipe.fit(bins, pool, is_nested=False)

@@ -21,7 +21,6 @@ from tactslip_torch.runtime import regular_file, whole_file
 DETECTOR = "tactslip_torch detector 5"
 SUMS = "tactslip_torch sums 3"
 SIDECAR = "tactslip_torch onnx 2"
-CHECKPOINT = "tactslip_torch checkpoint 2"
 DAMAGE_ERRORS = (
     ArithmeticError,
     AttributeError,
@@ -105,19 +104,6 @@ def read_json(path: str | os.PathLike[str], form: str, most_bytes: int = 2**24) 
         content: dict[str, Any] = json.loads(text)
         if content["format"] != form:
             raise ValueError(f"its format must be {form!r}, got {content['format']!r:.80}")
-    return content
-
-
-def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What is in a checkpoint of a training.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is none, or damaged.
-    """
-    content = _load(path, 2**33)
-    if content["format"] != CHECKPOINT:
-        raise ValueError(f"{os.fspath(path)} is no checkpoint; give last.ckpt of a run")
     return content
 
 

@@ -21,7 +21,7 @@ from tactslip_torch.onset.decisions import KEY, AlarmSettings
 from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.signals.filtering import Align, ChannelFilter, frame_lengths
 from tactslip_torch.signals.wavelet import WaveletFilters, highest_level
-from tactslip_torch.training.recipe import Recipe
+from tactslip_torch.training.recipe import Paper
 
 
 def own_wavelet() -> WaveletFilters:
@@ -179,7 +179,7 @@ def detector_of(name: str, backend: BackendName = "auto") -> SlipDetector:
     features = pool(channel_filter.valid(samples))
     moments = ClassMoments(len(pool.names))
     moments.update(features.float(), is_slip)
-    scores, allowed = t_scores(moments), Recipe().allowed(pool)
+    scores, allowed = t_scores(moments), Paper().allowed(pool)
     if allowed is not None:
         scores[~allowed] = 0.0
     selected = rank_features(scores, hand.num_features).tolist()

@@ -20,7 +20,7 @@ from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.recipe import Recipe
+from tactslip_torch.training.recipe import Paper
 
 SMALL_HAND = HandLayout(
     (Channel("SG1", "SG", "index", "distal"), Channel("PVDF1", "PVDF", "index", "distal"))
@@ -111,8 +111,8 @@ def small_maker(source: SmallSet, cache: FeatureCache | None = None, **rule: Any
     )
 
 
-def small_recipe(**changes: Any) -> Recipe:
-    return Recipe(**({"num_features": 10, "penalties": (0.1, 1.0), "sample_bins": 50} | changes))
+def small_recipe(**changes: Any) -> Paper:
+    return Paper(**({"num_features": 10, "penalties": (0.1, 1.0), "sample_bins": 50} | changes))
 
 
 def refitted_scores(

@@ -20,7 +20,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, score_stream
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.training.experiment import feature_maker
-from tactslip_torch.training.recipe import Recipe
+from tactslip_torch.training.recipe import Paper
 
 any_hand = pytest.mark.parametrize("name", HANDS)
 UNLIKE = ("24 electrodes at 100 Hz", "one slow", "40 at 1 kHz", "own filters, causal")
@@ -143,6 +143,7 @@ def test_features_that_a_hand_cannot_have_are_refused_in_one_line(bin_ms, change
 )
 def test_more_features_than_a_small_hand_has_are_refused(name, num):
     assert len(HANDS[name].pool().names) == num
-    Recipe(num_features=num).check_pool(num)
+    pool = HANDS[name].pool()
+    Paper(num_features=num).allowed(pool)
     with pytest.raises(ValueError, match=f"={num + 1} exceeds the pool's {num}; give at most"):
-        Recipe(num_features=[5, num + 1]).check_pool(num)
+        Paper(num_features=num + 1).allowed(pool)

@@ -9,7 +9,7 @@ import torch
 from tactslip_torch.data.labels import LabelRule, label_bins
 from tactslip_torch.data.recording import RecordingId, Timeline
 from tactslip_torch.onset.events import LatencyParts
-from tactslip_torch.training import learner
+from tactslip_torch.training import evaluation
 from tactslip_torch.training.datamodule import RecordingFeatures
 
 RATE_HZ = 2000.0
@@ -26,12 +26,12 @@ def batch_of(onsets=(2.0, 6.0), ends=(4.0, 8.0), stretches=(), roles=None, slip_
     columns = torch.zeros(num, 1), bins.is_slip, speed, bins.position, bins.stroke, ends_s
     times = Timeline(onsets_s=onsets, speeds_mm_s=speeds, sliding_s=slides)
     hop_s, roles = (rule.hop_ms or rule.bin_ms) / 1000, roles or {"test": torch.ones(num) > 0}
-    return RecordingFeatures(RecordingId("M1", 0), *columns, times, hop_s, roles, {})
+    return RecordingFeatures(RecordingId("M1", 0), *columns, times, hop_s, roles)
 
 
 def events_of(batch, says_slip):
-    part = learner.evaluated_bins(batch, says_slip, {})["test"]
-    return {name: own[0] for name, own in learner.events_by_rule([part], LATENCY).items()}
+    part = evaluation.evaluated_bins(batch, says_slip, {})["test"]
+    return {name: own[0] for name, own in evaluation.events_by_rule([part], LATENCY).items()}
 
 
 def seen(events):
@@ -60,7 +60,7 @@ def test_random_decisions_raise_the_alarms_that_rules_by_hand_do(layout, hop_ms)
     is_apart = batch.stroke == -1
     groups = [batch.stroke == 0, batch.stroke == 1]
     groups += [is_apart & (batch.ends_s < 10.1), is_apart & (batch.ends_s > 10.4)]
-    for share, name in itertools.product((0.2, 0.5, 0.8), learner.RULES):
+    for share, name in itertools.product((0.2, 0.5, 0.8), evaluation.RULES):
         decisions = torch.rand(len(batch.is_slip), generator=generator) < share
         events, alarms = events_of(batch, decisions)[name], []
         for rows in groups:
@@ -91,18 +91,18 @@ def test_a_split_by_bin_has_no_events_and_says_why():
     num = len(whole.is_slip)
     some = torch.arange(num) % 5 > 0
     apart = batch_of(roles={"train": some, "test": ~some, "unseen": torch.zeros_like(some)})
-    parts = learner.evaluated_bins(apart, apart.is_slip, {})
+    parts = evaluation.evaluated_bins(apart, apart.is_slip, {})
     assert {role: part.is_whole for role, part in parts.items()} == {"train": False, "test": False}
     assert sum(len(part.says_slip) for part in parts.values()) == num
-    events = {role: learner.events_by_rule([part], LATENCY) for role, part in parts.items()}
-    for by_rule in learner.event_numbers(events).values():
-        assert list(by_rule) == list(learner.RULES)
+    events = {role: evaluation.events_by_rule([part], LATENCY) for role, part in parts.items()}
+    for by_rule in evaluation.event_numbers(events).values():
+        assert list(by_rule) == list(evaluation.RULES)
         for numbers in by_rule.values():
-            assert numbers["reason"] == learner.BINS_APART
+            assert numbers["reason"] == evaluation.BINS_APART
             assert numbers["found"] is numbers["false_alarms_per_minute"] is None
-    of_whole = learner.evaluated_bins(whole, whole.is_slip, {})["test"]
-    assert learner.events_by_rule([of_whole, parts["test"]], LATENCY) == {
-        name: [] for name in learner.RULES
+    of_whole = evaluation.evaluated_bins(whole, whole.is_slip, {})["test"]
+    assert evaluation.events_by_rule([of_whole, parts["test"]], LATENCY) == {
+        name: [] for name in evaluation.RULES
     }
-    numbers = learner.event_numbers({"test": learner.events_by_rule([of_whole], LATENCY)})
+    numbers = evaluation.event_numbers({"test": evaluation.events_by_rule([of_whole], LATENCY)})
     assert "reason" not in numbers["test"]["first_transition"]

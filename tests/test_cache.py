@@ -34,6 +34,14 @@ def features(num_bins=7, num_features=11, seed=0):
     return torch.randn(num_bins, num_features, generator=torch.Generator().manual_seed(seed))
 
 
+def keep(cache, key, values):
+    cache.store(key, range(values.shape[1]), values, RUN)
+
+
+def kept(cache, key, num_features=11):
+    return cache.load(key, range(num_features))
+
+
 def files(cache):
     return [path for path in cache.folder.rglob("*") if path.is_file()]
 
@@ -52,12 +60,12 @@ TINY = torch.finfo(torch.float32).smallest_normal / 8
     ids=["some", "none", "a view", "extremes"],
 )
 def test_what_is_stored_comes_back_bit_by_bit(cache, values):
-    assert cache.load(KEY) is None
+    assert kept(cache, KEY) is None
     assert not cache.folder.exists()
-    cache.store(KEY, features(2, 2), RUN)
-    cache.store(KEY, values, RUN)  # replaces
+    keep(cache, KEY, features(2, 2))
+    keep(cache, KEY, values)  # replaces
     for _ in range(2):  # what is loaded may be written to
-        loaded, longest_run = cache.load(KEY)
+        loaded, longest_run = kept(cache, KEY, values.shape[1])
         assert longest_run == RUN
         assert loaded.dtype == torch.float32
         assert torch.equal(loaded.view(torch.int32), values.contiguous().view(torch.int32))
@@ -79,19 +87,19 @@ DAMAGES = [
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_file_is_absent_with_a_warning_and_is_written_again(cache, caplog, damage):
-    cache.store(KEY, features(), RUN)
+    keep(cache, KEY, features())
     (path,) = files(cache)
     path.write_bytes(damage(path.read_bytes()))
-    assert cache.load(KEY) is None
+    assert kept(cache, KEY) is None
     (record,) = caplog.records
     assert record.levelname == "WARNING"
     assert all(word in caplog.text for word in (str(path), "damaged"))
-    cache.store(KEY, features(), RUN)
-    assert is_whole(cache.load(KEY))
+    keep(cache, KEY, features())
+    assert is_whole(kept(cache, KEY))
 
 
 def test_a_mutated_file_is_absent_or_right(cache, rng):
-    cache.store(KEY, features(), RUN)
+    keep(cache, KEY, features())
     (path,) = files(cache)
     whole, num_right = path.read_bytes(), 0
     for _ in range(int(os.environ.get("TACTSLIP_HOSTILE_FILES", 400))):
@@ -100,7 +108,7 @@ def test_a_mutated_file_is_absent_or_right(cache, rng):
         place = int(rng.integers(rng.choice(ends))) * int(rng.choice([1, -1]))
         content[place] = int(rng.integers(256))
         path.write_bytes(content)
-        found = cache.load(KEY)
+        found = kept(cache, KEY)
         assert found is None or is_whole(found)
         num_right += found is not None
     assert num_right  # dates are not looked at
@@ -120,33 +128,33 @@ def test_what_cannot_be_written_or_read_is_one_warning_and_no_end(
     def refuse(*args, **options):
         raise CAUSES[cause]
 
-    cache.store(KEY, features(), RUN)
+    keep(cache, KEY, features())
     monkeypatch.setattr(np, "savez", refuse)
     for number in range(3):
-        cache.store(cache_key({"number": number}), features(), RUN)
+        keep(cache, cache_key({"number": number}), features())
     monkeypatch.setattr(Path, "unlink", refuse)
     cache.most_bytes = 0
     cache.prune()
-    assert is_whole(cache.load(KEY))
+    assert is_whole(kept(cache, KEY))
     monkeypatch.setattr(zipfile, "ZipFile", refuse)
     for _ in range(3):
-        assert cache.load(KEY) is None
+        assert kept(cache, KEY) is None
     for record, words in zip(caplog.records, ("cannot be stored", "cannot be read"), strict=True):
         assert all(word in record.getMessage() for word in (words, CAUSES[cause].strerror))
 
 
 def test_a_file_that_nobody_may_touch_is_still_read(cache, monkeypatch, caplog):
-    cache.store(KEY, features(), RUN)
+    keep(cache, KEY, features())
     monkeypatch.setattr(os, "utime", lambda path: (_ for _ in ()).throw(PermissionError("no")))
-    assert is_whole(cache.load(KEY))
+    assert is_whole(kept(cache, KEY))
     assert not caplog.records
 
 
 def test_a_folder_that_cannot_be_made_does_not_end_a_run(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(CAUSES["read-only"]))
     with feature_cache(str(tmp_path / "new")) as cache:
-        cache.store(KEY, features(), RUN)
-        assert cache.load(KEY) is None
+        keep(cache, KEY, features())
+        assert kept(cache, KEY) is None
 
 
 PRUNED = [
@@ -165,7 +173,7 @@ def test_prune_drops_what_was_used_longest_ago_and_nothing_else(
     cache.prune()  # of nothing
     keys = [cache_key({"cycle": i}) for i in range(5)]
     for i, key in enumerate(keys):
-        cache.store(key, features(seed=i), RUN)
+        keep(cache, key, features(seed=i))
         os.utime(cache.folder / key[:2] / f"{key}.npz", (1000 + i, 1000 + i))
     cache.most_bytes = most_files * files(cache)[0].stat().st_size + spare_bytes
     place = cache.folder / keys[0][:2]
@@ -174,9 +182,9 @@ def test_prune_drops_what_was_used_longest_ago_and_nothing_else(
         path.write_text("mine")
     (place / "gone.npz").symlink_to(cache.folder / "nowhere")
     if read is not None:
-        cache.load(keys[read])
+        kept(cache, keys[read])
     cache.prune()
-    assert [i for i, key in enumerate(keys) if cache.load(key) is not None] == left
+    assert [i for i, key in enumerate(keys) if kept(cache, key) is not None] == left
     assert all(path.exists() for path in others)
 
 

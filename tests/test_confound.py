@@ -53,7 +53,7 @@ SMALL = (
 def ran(tmp_path_factory):
     """``+exp=confound`` on the small scenes: the folder, what it printed, what it returned."""
     folder = tmp_path_factory.mktemp("confound")
-    recipe = ("recipe=robust", "recipe.num_features=10", "recipe.penalties=[0.1,1.0]")
+    recipe = ("recipe=paper", "recipe.num_features=10", "recipe.penalties=[0.1,1.0]")
     told = *SMALL, "+exp=confound", *recipe, "recipe.sample_bins=100", "export=false"
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         returned = train(composed(*told), folder)

@@ -4,20 +4,16 @@ from small_set import RATE_HZ, SmallSet, small_maker
 
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.splits import unseen4
+from tactslip_torch.data.splits import leave_one_material_out
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.signals.filtering import ChannelFilter, savgol_filter
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 
 
-def split_of(source, **options):
-    return unseen4(source.ids, seen=["a", "b"], unseen=["c"], **options)[0]
-
-
 def test_features_are_those_of_the_filtered_bins():
     source = SmallSet()
-    made = small_maker(source)(RecordingId("a", 1), split_of(source))
+    made = small_maker(source)(RecordingId("a", 1))
     samples = source.load(RecordingId("a", 1)).samples.double()
     filtered = torch.stack([savgol_filter(samples[0], 51), savgol_filter(samples[1], 11)])
     edge = round((1.1 - 0.010) * RATE_HZ)
@@ -33,10 +29,10 @@ def test_the_cache_saves_the_work_and_a_damaged_entry_is_made_anew(tmp_path, cap
     maker = small_maker(source, FeatureCache(tmp_path))
 
     def made():
-        return maker(RecordingId("a", 0), split_of(source))
+        return maker(RecordingId("a", 0))
 
     first, second = made(), made()
-    assert (source.loads, set(second.seconds)) == (1, {"read_cache"})
+    assert source.loads == 1
     (path,) = tmp_path.glob("*/*.npz")
     path.write_bytes(path.read_bytes()[:-4])
     third = made()
@@ -48,20 +44,20 @@ def test_the_cache_saves_the_work_and_a_damaged_entry_is_made_anew(tmp_path, cap
 
 def test_shuffled_labels_keep_their_counts_and_lose_their_order():
     source = SmallSet()
-    plain = small_maker(source)(RecordingId("a", 0), split_of(source)).is_slip
+    plain = small_maker(source)(RecordingId("a", 0)).is_slip
     maker = small_maker(source, shuffle_seed=3)
-    mixed = maker(RecordingId("a", 0), split_of(source)).is_slip
+    mixed = maker(RecordingId("a", 0)).is_slip
     assert plain.sum() == mixed.sum()
     assert not torch.equal(plain, mixed)
-    assert torch.equal(mixed, maker(RecordingId("a", 0), split_of(source)).is_slip)
-    assert not torch.equal(mixed, maker(RecordingId("a", 1), split_of(source)).is_slip)
+    assert torch.equal(mixed, maker(RecordingId("a", 0)).is_slip)
+    assert not torch.equal(mixed, maker(RecordingId("a", 1)).is_slip)
 
 
 def test_a_sample_that_is_not_finite_is_named():
     broken = RecordingId("b", 2)
     source = SmallSet(broken=broken)
     with pytest.raises(ValueError, match=r"b/2: channel PVDF1, sample \d+ \(1\.\d+ s\) is nan"):
-        small_maker(source)(broken, split_of(source))
+        small_maker(source)(broken)
 
 
 class BrokenBefore(SmallSet):
@@ -78,19 +74,51 @@ def test_a_broken_sample_before_a_causal_bin_is_named(align):
     maker = FeatureMaker(source, FeaturePool(source.hand), layer, LabelRule())
     assert int(maker.lay_bins(source.timeline(source.ids[0])).starts[0]) == 180
     if align == "centred":
-        assert maker(source.ids[0], split_of(source)).features.isfinite().all()
+        assert maker(source.ids[0]).features.isfinite().all()
         return
     with pytest.raises(ValueError, match=r"^a/0: channel SG1, sample 150 \(0\.0750 s\) is nan"):
-        maker(source.ids[0], split_of(source))
+        maker(source.ids[0])
 
 
 @pytest.mark.parametrize("num_workers", [0, 2])
-def test_loaders_give_the_recordings_of_their_roles_in_order(num_workers):
+@pytest.mark.parametrize("memory_gib", [2.0, 1e-4])
+def test_features_are_made_once_for_all_folds_in_memory_or_in_the_cache(
+    num_workers, memory_gib, tmp_path
+):
     source = SmallSet()
-    data = SlipDataModule(small_maker(source), split_of(source), num_workers)
-    trained = [batch.recording for batch in data.train_dataloader()]
-    assert trained == data.split.having("train")
-    assert len(trained) == 8
-    assert [batch.recording for batch in data.test_dataloader()] == sorted(source.ids)
-    with pytest.raises(ValueError, match="9 processes or shards for 8 recordings; use fewer"):
-        data.loader(["train"], parts=9)
+    pool, layer = FeaturePool(source.hand), ChannelFilter([51, 11])
+    cache, rule = FeatureCache(tmp_path), LabelRule()
+    maker = FeatureMaker(source, pool, layer, rule, cache, memory_gib=memory_gib)
+    folds = leave_one_material_out(source.ids)
+    data = SlipDataModule(maker, folds, num_workers)
+    data.setup()
+    for data.fold in folds:
+        (trained,) = data.train_dataloader()
+        for _ in range(2):
+            assert [bins.name for bins in trained] == [str(r) for r in data.fold.having("train")]
+        tested = list(data.test_dataloader())
+        assert [batch.recording for batch in tested] == sorted(source.ids)
+        for batch in tested:
+            roles = data.fold.bin_roles(batch.recording, len(batch.is_slip))
+            assert {role: mask.tolist() for role, mask in batch.roles.items()} == {
+                role: mask.tolist() for role, mask in roles.items()
+            }
+            expected = small_maker(SmallSet())(batch.recording).features
+            assert torch.equal(batch.features, expected)
+    assert source.loads == (0 if num_workers else len(source.ids))  # by workers, or once
+    with pytest.raises(ValueError, match=r"features.memory_gib"):
+        FeatureMaker(source, pool, layer, rule, memory_gib=-1.0)
+
+
+def test_a_selection_of_the_pool_has_its_columns_and_reads_those_of_a_larger_one(tmp_path):
+    source, cache = SmallSet(), FeatureCache(tmp_path)
+    whole = small_maker(source, cache)
+    options = ChannelFilter([51, 11]), LabelRule(), cache
+    few = FeatureMaker(source, whole.pool.select([250, 3, 17]), *options)
+    first = few(source.ids[0])
+    everything = whole(source.ids[0])
+    assert source.loads == 2  # the first one lacks columns
+    assert torch.equal(first.features, everything.features[:, [250, 3, 17]])
+    again = few(source.ids[0])
+    assert source.loads == 2
+    assert torch.equal(again.features, first.features)

@@ -14,7 +14,8 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.onset.events import LatencyParts
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
-from tactslip_torch.training.learner import SlipLearner, evaluated_bins, events_by_rule
+from tactslip_torch.training.evaluation import evaluated_bins, events_by_rule
+from tactslip_torch.training.learner import SlipLearner
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",
@@ -26,7 +27,7 @@ pytestmark = pytest.mark.filterwarnings(
 def trainer(**changes):
     options = {
         "accelerator": "cpu",
-        "max_epochs": 2,
+        "max_epochs": 1,
         "logger": False,
         "enable_checkpointing": False,
         "enable_progress_bar": False,
@@ -37,7 +38,7 @@ def trainer(**changes):
 
 def learn(source, split, maker=None, recipe=None, *, with_baselines=False):
     maker = maker or small_maker(source)
-    data = SlipDataModule(maker, split, num_workers=0)
+    data = SlipDataModule(maker, [split], num_workers=0)
     recipe = recipe or small_recipe()
     learner = SlipLearner(maker.pool, maker.channel_filter, recipe, with_baselines=with_baselines)
     backend = trainer()
@@ -65,10 +66,10 @@ def test_held_out_bins_of_the_random_split_are_not_learned_from(cache):
     before = learn(source, split, maker)
 
     class Perturbed(FeatureMaker):
-        def __call__(self, recording, split):
-            made = super().__call__(recording, split)
-            noisy = torch.where(made.roles["test"][:, None], -9.0, made.features)
-            return made._replace(features=noisy)
+        def __call__(self, recording):
+            made = super().__call__(recording)
+            is_test = split.bin_roles(recording, len(made.is_slip))["test"]
+            return made._replace(features=torch.where(is_test[:, None], -9.0, made.features))
 
     options = (maker.pool, maker.channel_filter, maker.rule, cache)
     after = learn(source, split, Perturbed(source, *options))
@@ -105,7 +106,7 @@ def test_events_are_of_the_detectors_own_decisions_and_the_exact_onset():
             bins, labels = maker.filtered_bins(recording)
             says_slip = learner.detector(bins) >= 0
             right.append(says_slip == labels.is_slip)
-            parts.append(evaluated_bins(maker(recording, split), says_slip, {})[role])
+            parts.append(evaluated_bins(maker(recording).in_split(split), says_slip, {})[role])
         scores = learner.metrics["splits"][role]
         assert scores["accuracy"] == pytest.approx(float(torch.cat(right).double().mean()))
         assert str(learner.events[role]) == str(events_by_rule(parts, latency))

@@ -1,7 +1,5 @@
 """Sums over training bins: what they hold, that they add, and the machines solved from them."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -9,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.kernel_ridge import KernelRidge
 
-from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.package_files import SUMS, load_table, save_table
 
@@ -175,94 +172,3 @@ def test_one_class_is_not_enough_and_neither_is_no_feature():
         stats.solve(1.0)
     with pytest.raises(ValueError, match="1 feature or more and degree 1 or 2, got 0 and 2"):
         SufficientStats(0)
-
-
-SIZES = torch.tensor([1e-4, 1.0, 1e3, 0.0]).double()
-"""Of features; ranges must not show whether 0 or -0 came first."""
-
-
-def make_recordings(seed=0):
-    """The same bins, their features of other sizes."""
-    batches = make_batches(seed=seed)
-    return [(name, name[:2], (z * SIZES).float(), is_slip) for name, z, is_slip, _ in batches]
-
-
-def statistics_of(recordings, sample_bins=3):
-    statistics = TrainingStatistics(NUM, sample_bins)
-    for recording in recordings:
-        statistics.update(*recording)
-    return statistics
-
-
-def bits_of(statistics):
-    """All of a statistics but its moments, as bytes and text, so that 0 and -0 differ."""
-    held = vars(statistics.sample.bins()) | {
-        "batches": dict(sorted(statistics.seen_batches.items()))
-    }
-    held |= {"minimum": statistics.minimum, "maximum": statistics.maximum}
-    return {
-        name: (x.dtype, x.shape, x.numpy().tobytes()) if isinstance(x, torch.Tensor) else x
-        for name, x in held.items()
-    }
-
-
-@given(
-    seed=st.integers(0, 99),
-    order=st.randoms(use_true_random=False),
-    num_shards=st.integers(1, 5),
-    sample_bins=st.integers(0, 6),
-)
-def test_any_order_and_sharding_gives_the_same_bits(seed, order, num_shards, sample_bins):
-    recordings = make_recordings(seed=seed)
-    whole = statistics_of(recordings, sample_bins)
-    order.shuffle(recordings)
-    shards = [statistics_of(recordings[i::num_shards], sample_bins) for i in range(num_shards)]
-    order.shuffle(shards)
-    merged = TrainingStatistics(NUM, sample_bins)
-    for shard in shards:
-        before = bits_of(shard)
-        merged.merge(shard)
-        assert bits_of(shard) == before
-    assert bits_of(merged) == bits_of(whole)
-    assert bits_of(statistics_of(recordings, sample_bins)) == bits_of(whole)
-
-
-def broken_bins(value):
-    features = torch.zeros(5, NUM)
-    features[2, 1] = value
-    return features
-
-
-@pytest.mark.parametrize(
-    ("name", "features", "labels", "match"),
-    [
-        ("M1/1", torch.zeros(5, NUM), torch.zeros(5), "'M1/1' is in these statistics already"),
-        ("new", torch.zeros(5, 3), torch.zeros(5), r"'new'.*\[N, 4\].*\(5, 3\)"),
-        ("new", torch.zeros(5, NUM).double(), torch.zeros(5), "'new'.*hand float32"),
-        ("new", broken_bins(math.nan), torch.zeros(5), "'new'.*nan in row 2, column 1"),
-    ],
-)
-def test_a_refused_recording_changes_nothing(name, features, labels, match):
-    statistics = statistics_of(make_recordings())
-    before = bits_of(statistics)
-    with pytest.raises(ValueError, match=match) as error:
-        statistics.update(name, "M1", features, labels)
-    assert "\n" not in str(error.value)
-    assert bits_of(statistics) == before
-    if name == "new":
-        statistics.update(name, "M1", torch.zeros(5, NUM), torch.zeros(5))
-
-
-def test_other_refusals_of_merge_change_nothing():
-    recordings = make_recordings()
-    statistics = statistics_of(recordings[:5])
-    before = bits_of(statistics)
-    for other, match in [
-        (statistics_of(recordings[4:]), "1 batches are in both statistics, such as 'M1/4'"),
-        (statistics, "5 batches are in both"),
-        (statistics_of(recordings[5:], sample_bins=4), "statistics of 3 and 4 sample_bins"),
-        (TrainingStatistics(NUM + 1, 3), "4 and 5 features"),
-    ]:
-        with pytest.raises(ValueError, match=match):
-            statistics.merge(other)
-        assert bits_of(statistics) == before

@@ -48,6 +48,32 @@ def drawn(whole=None, **changes):
 # By cycle ------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("make", [drawn, lambda **o: random_bins(recordings(), seen=SEEN, **o)[0]])
+def test_the_seed_of_a_split_decides_who_is_drawn(make):
+    def drawn_by(split):
+        masks = [split.bin_roles(r, 50)["test"].tolist() for r in split.having("train", "test")]
+        return split.roles, masks
+
+    assert drawn_by(make(seed=1)) == drawn_by(make(seed=1))
+    assert drawn_by(make(seed=1)) != drawn_by(make(seed=2))
+
+
+def test_each_session_is_drawn_by_itself():
+    """Its draw is the same without the others, and not theirs."""
+    whole = [
+        RecordingId("M1", cycle, session=session)
+        for session in ("1", "2", "3")
+        for cycle in range(20)
+    ]
+    tested = {}
+    for session in ("1", "2", "3"):
+        alone = [r for r in whole if r.session == session]
+        of_all, own = (seen6(each, seen=["M1"], seed=4)[0] for each in (whole, alone))
+        tested[session] = {r.cycle for r in of_role(of_all, "test") if r.session == session}
+        assert tested[session] == {r.cycle for r in of_role(own, "test")}
+    assert tested["1"] != tested["2"] != tested["3"]
+
+
 def test_unseen4_stratifies_by_material_and_gives_every_recording_one_role():
     split = drawn()
     for material in SEEN:

@@ -23,13 +23,13 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.evaluation import merged_results
 from tactslip_torch.training.experiment import (
     common_metadata,
     feature_cache,
     feature_rows,
     features_of,
     make_trainer,
-    merged_results,
 )
 from tactslip_torch.training.learner import SlipLearner
 
@@ -59,17 +59,17 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
         for fold in folds:
             _print_overlap(fold, overlaps[fold.name])
     results: dict[str, dict[str, Any]] = {}
+    events: dict[str, Any] = {}
+    once = evaluated_once(folds)
     with feature_cache(config.cache) as cache:
         maker = features_of(detector, source, rule, cache)
-        once = evaluated_once(folds)
-        for fold in once:
+        data = SlipDataModule(maker, once, config.num_workers)
+        for data.fold in once:
             learner = SlipLearner(maker.pool, maker.channel_filter, detector=detector)
-            place = folder if len(once) == 1 else folder / fold.name  # each its own logs
-            trainer = make_trainer(config.trainer, place)
-            data = SlipDataModule(maker, fold, config.num_workers)
-            trainer.test(learner, datamodule=data, verbose=False)
-            results[fold.name] = learner.metrics | {"recording_events": learner.events}
-    metrics = common_metadata(source, detector.pool, config) | merged_results(results)
+            place = folder if len(once) == 1 else folder / data.fold.name  # each its own logs
+            make_trainer(config.trainer, place).test(learner, datamodule=data, verbose=False)
+            results[data.fold.name], events[data.fold.name] = learner.metrics, learner.events
+    metrics = common_metadata(maker, config) | merged_results(results, events)
     metrics |= {
         "selected": [str(name) for name in detector.selected_names],
         "timing_s": {"total": time.perf_counter() - started},

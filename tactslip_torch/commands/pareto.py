@@ -16,7 +16,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import get_object, instantiate
+from hydra.utils import get_method, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, save_config
@@ -31,9 +31,6 @@ from tactslip_torch.pareto import (
     time_in_fresh_process,
 )
 from tactslip_torch.runtime import bar, check_number, write_json
-
-_TRAIN = "tactslip_torch.commands.train.train"
-"""Trains a candidate; what it imports is loaded with the first."""
 
 
 def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
@@ -103,7 +100,7 @@ def _trained(
     if size is not None:
         own.recipe.num_features = size
     with redirect_stdout(io.StringIO()):
-        get_object(_TRAIN)(own, folder)
+        get_method("tactslip_torch.commands.train.train")(own, folder)
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     rows = metrics.get("validation")
     if not rows:

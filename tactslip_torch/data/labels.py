@@ -127,8 +127,8 @@ def label_bins(
         hop = whole_samples(rule.hop_ms, sample_rate_hz, "labels.hop_ms")
     num_samples = round(duration_s * sample_rate_hz)
     strokes = _strokes(rule, onsets_s, sliding_s, num_samples, sample_rate_hz)
-    given = [(stretch, False) for stretch in non_slip_s] + [(stretch, True) for stretch in slip_s]
-    stretches = [(*_samples_of(s, num_samples, sample_rate_hz), is_slip) for s, is_slip in given]
+    told = [(stretch, False) for stretch in non_slip_s] + [(stretch, True) for stretch in slip_s]
+    stretches = [(*_samples_of(s, num_samples, sample_rate_hz), is_slip) for s, is_slip in told]
     if rule.assign != "whole":
         return _windows(rule, strokes, stretches, bin_samples, hop, num_samples)
     lead = 0 if not strokes else strokes[0].edge - strokes[0].first

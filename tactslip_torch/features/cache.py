@@ -28,9 +28,10 @@ _MAKE_FEATURES = (
     "data",
     "features",
     "native",
+    "training/bins.py",
     "training/datamodule.py",
 )
-_KEPT = ("features", "longest_run")
+_KEPT = ("features", "columns", "longest_run")
 _told: set[tuple[str, str]] = set()
 
 
@@ -95,12 +96,20 @@ class FeatureCache:
         self.folder = Path(folder)
         self.most_bytes = most_bytes
 
-    def load(self, key: str) -> tuple[Tensor, int] | None:
-        """Features ``[N, F]`` and the longest run of equal samples; ``None`` if damaged or none."""
+    def load(self, key: str, columns: Sequence[int]) -> tuple[Tensor, int] | None:
+        """Features ``[N, F]`` and the longest run of equal samples.
+
+        Args:
+            key: of the file.
+            columns: numbers of the features in the whole pool.
+
+        Returns:
+            ``None`` if there is no file, it is damaged, or lacks a column.
+        """
         path = self._path(key)
         try:
             with zipfile.ZipFile(path) as content:  # to their ends, where the checksums are
-                features, longest_run = (
+                features, stored, longest_run = (
                     np.load(io.BytesIO(content.read(f"{name}.npy"))) for name in _KEPT
                 )
         except FileNotFoundError:
@@ -113,14 +122,20 @@ class FeatureCache:
             return None
         with contextlib.suppress(OSError):
             os.utime(path)  # prune drops what was used longest ago
+        if stored.tolist() != list(columns):
+            place = {column: index for index, column in enumerate(stored.tolist())}
+            if not place.keys() >= set(columns):
+                return None
+            features = features[:, [place[column] for column in columns]]
         return torch.from_numpy(features), int(longest_run)
 
-    def store(self, key: str, features: Tensor, longest_run: int) -> None:
-        """Write features ``[N, F]`` and the longest run, whole or not at all."""
+    def store(self, key: str, columns: Sequence[int], features: Tensor, longest_run: int) -> None:
+        """Write features ``[N, F]``, their numbers and the longest run, whole or not at all."""
         array, run = features.numpy().astype("<f4", order="C"), np.int64(longest_run)
+        places = np.array(columns, dtype=np.int64)
         try:
             with whole_file(self._path(key)) as temporary, temporary.open("wb") as file:
-                np.savez(file, features=array, longest_run=run)
+                np.savez(file, features=array, columns=places, longest_run=run)
         except OSError as error:
             self._warn(f"cannot be stored: {_cause(error)}", self._path(key))
 

@@ -352,7 +352,7 @@ _SHARE = 1 / 16  # of bins, in which it may move further: a value may lie at an 
 
 
 def is_rounding(pool: FeaturePool) -> Tensor:
-    """Which features of a whole pool rounding decides, ``[F]``, bool; none of the paper's wavelet.
+    """Which features of a pool rounding decides, ``[F]``, bool; none of the paper's wavelet.
 
     The details of Haar's, for one, come in pairs of opposite sign, so that their mean, median and
     skewness are zero but for rounding, and two backends differ in them altogether. Found on noise
@@ -360,9 +360,9 @@ def is_rounding(pool: FeaturePool) -> Tensor:
     by ``1e-13``.
     """
     of_fast = _of_fast_channel(pool.bin_samples, pool.wavelet, pool.level, pool.spectrum)
-    num_slow = len(pool.names) - len(pool.hand.fast) * len(of_fast)
+    num_slow = len(pool_names(pool.hand, pool.level)) - len(pool.hand.fast) * len(of_fast)
     slow = torch.zeros(num_slow, dtype=torch.bool)
-    return torch.cat([slow, of_fast.repeat(len(pool.hand.fast))])
+    return torch.cat([slow, of_fast.repeat(len(pool.hand.fast))])[list(pool.selected)]
 
 
 @lru_cache(maxsize=16)

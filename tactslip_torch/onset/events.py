@@ -1,6 +1,7 @@
-"""Alarms against onsets, by event: slips found, how late, and how many false alarms.
+"""Slips found, how late, and false alarms: alarms of recordings matched with their onsets.
 
-Intervals are by a bootstrap that draws recordings with replacement.
+Numbers over recordings have intervals by a bootstrap over recordings, since what happens within
+one is correlated.
 """
 
 from __future__ import annotations

@@ -409,8 +409,6 @@ def validation_table(metrics: _Metrics) -> str:
         cells |= dict(zip(titles, _structure(row), strict=True))
         cells |= {"C": f"{row['penalty']:g}", "validation %": style.percent(row["mean"])}
         cells |= {"worst %": style.percent(scores[worst]), "group": worst}
-        if is_nested:
-            cells["at its best threshold %"] = style.percent(row["worst"]["at_best_threshold"])
         rows.append(cells)
     lines = [style.table(rows)]
     if nested := metrics.get("nested_validation"):

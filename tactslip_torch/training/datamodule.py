@@ -1,14 +1,11 @@
-"""From recordings to features of labelled bins: made by workers, cached, handed to Lightning.
-
-``FeatureMaker`` simulates or reads one recording, filters, cuts, describes and caches it;
-``SlipDataModule`` hands a split's recordings to the learner.
-"""
+"""From recordings to features of labelled bins: made once by workers, kept, handed to Lightning."""
 
 from __future__ import annotations
 
+import copy
 import time
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -32,25 +29,26 @@ from tactslip_torch.features.cache import FeatureCache, cache_key, features_dige
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import longest_runs
 from tactslip_torch.native import BackendName
-from tactslip_torch.runtime import num_processes
-from tactslip_torch.signals.filtering import ChannelFilter, bins_at, extended
+from tactslip_torch.runtime import bar, check_number, num_processes, one_thread
+from tactslip_torch.signals.filtering import ChannelFilter, bins_at
+from tactslip_torch.training.bins import RecordingBins
 
 
 class RecordingFeatures(NamedTuple):
-    """What the learner sees of one recording.
+    """Features and labels of the bins of one recording.
 
     Attributes:
         times: what is true of the recording; its slides are in the order of the strokes' numbers.
         hop_s: distance of neighbouring bins.
 
     Shape:
-        - features: ``[N, F]``, float32, the whole pool
+        - features: ``[N, F]``, float32
         - is_slip: ``[N]``, bool
         - speed_mm_s: ``[N]``, steady speed of the stroke of each bin, 0 for bins of no stroke
         - position, stroke: ``[N]``, place beside the onset and number of the stroke, as
           ``LabelledBins`` has them
         - ends_s: ``[N]``, float64, when the last sample of each bin is in
-        - roles: role to ``[N]``, bool
+        - roles: role to ``[N]``, bool; of no split empty
         - longest_run: most equal samples in a row of a channel that moves
     """
 
@@ -63,12 +61,17 @@ class RecordingFeatures(NamedTuple):
     ends_s: Tensor
     times: Timeline
     hop_s: float
-    roles: dict[str, Tensor]
-    seconds: dict[str, float]
+    roles: dict[str, Tensor] = {}  # noqa: RUF012  # a NamedTuple replaces, it does not change
     longest_run: int = 0
 
+    def in_split(self, split: Split) -> RecordingFeatures:
+        """With the roles that its bins have in a split."""
+        return self._replace(roles=split.bin_roles(self.recording, len(self.is_slip)))
+
     def of(self, mask: Tensor) -> RecordingFeatures:
-        """Some of its bins, by a mask ``[N]``."""
+        """Some of its bins, by a mask ``[N]``; itself where they are all."""
+        if bool(mask.all()):
+            return self
         names = ("features", "is_slip", "speed_mm_s", "position", "stroke", "ends_s")
         kept = {name: getattr(self, name)[mask] for name in names}
         roles = {role: own[mask] for role, own in self.roles.items()}
@@ -76,16 +79,17 @@ class RecordingFeatures(NamedTuple):
 
 
 class FeatureMaker:
-    """Features of a recording of a source, computed or from the cache.
+    """Features of a recording of a source: kept in memory, from the cache, or computed.
 
     Args:
         source: the recordings.
-        pool: the features; its bin length and rate must fit source and rule.
+        pool: the features, whole or a selection; its bin length and rate must fit source and rule.
         channel_filter: the filter of each channel.
         rule: where the bins lie and what they are.
         cache: where features are kept, if they are.
         dtype: in which features are computed; they are handed on in float32.
         backend: what computes them.
+        memory_gib: of features that are kept in memory at most.
 
     Raises:
         ValueError: if rate, channels or bin length of the parts disagree, bins or hops are no whole
@@ -101,7 +105,9 @@ class FeatureMaker:
         cache: FeatureCache | None = None,
         dtype: torch.dtype = torch.float64,
         backend: BackendName = "auto",
+        memory_gib: float = 2.0,
     ) -> None:
+        check_number("features.memory_gib", memory_gib, least=0)
         if pool.hand != source.hand:
             raise ValueError(
                 f"the features expect {len(pool.hand)} channels {pool.hand.names[0]}.."
@@ -133,21 +139,34 @@ class FeatureMaker:
         self.rule = rule
         self.cache = cache
         self.dtype = dtype
+        self.memory_gib = memory_gib
+        self._kept: dict[RecordingId, RecordingFeatures] = {}
+        self._kept_bytes = 0
         self._code = features_digest(simulated=source.is_simulated)
         self._libraries = [version(name) for name in ("torch", "ptwt", "PyWavelets")]
         if source.is_simulated:  # its random numbers may change between feature releases
             self._libraries.append(".".join(version("numpy").split(".")[:2]))
 
-    def __call__(self, recording: RecordingId, split: Split) -> RecordingFeatures:
-        """Features, labels and roles of one recording.
+    def keep(self, made: RecordingFeatures) -> bool:
+        """Hold the features of a recording in memory, unless there is no room for them."""
+        size = made.features.numel() * made.features.element_size()
+        if has_room := self._kept_bytes + size <= self.memory_gib * 2**30:
+            # a copy: tensors of a worker lie in shared memory, and each keeps a file open
+            self._kept[made.recording] = copy.deepcopy(made)
+            self._kept_bytes += size
+        return has_room
+
+    def __call__(self, recording: RecordingId) -> RecordingFeatures:
+        """Features and labels of one recording.
 
         Raises:
             ValueError: if bins leave the recording or a sample they need is not finite.
         """
+        if (kept := self._kept.get(recording)) is not None:
+            return kept
         times = self.source.timeline(recording)
         bins = self.lay_bins(times)
-        seconds: dict[str, float] = {}
-        features, longest_run = self._features(recording, times, bins, seconds)
+        features, longest_run = self._features(recording, times, bins)
         is_slip = bins.is_slip
         if self.rule.shuffle_seed is not None:
             place = self.source.ids.index(recording)
@@ -163,43 +182,14 @@ class FeatureMaker:
             (bins.starts + bins.bin_samples).double() / self.source.sample_rate_hz,
             times,
             (self.rule.bin_ms if self.rule.hop_ms is None else self.rule.hop_ms) / 1000,
-            split.bin_roles(recording, len(is_slip)),
-            seconds,
-            longest_run,
+            longest_run=longest_run,
         )
-
-    def key(self, recording: RecordingId) -> str:
-        """A digest of everything that determines the features of a recording."""
-        return self._key(recording, self.lay_bins(self.source.timeline(recording)))
 
     def filtered_bins(self, recording: RecordingId) -> tuple[Tensor, LabelledBins]:
         """The filtered bins ``[N, C, n]`` that features are taken from, and their labels."""
         times = self.source.timeline(recording)
         bins = self.lay_bins(times)
         return self._filter(recording, self._load(recording, times, bins), bins), bins
-
-    def raw_bins(self, recording: RecordingId, index: Tensor) -> Tensor:
-        """Some bins of a recording before filtering, with the context that it takes.
-
-        At the ends of a recording the context is what ``extended`` makes of it. Samples are as they
-        are: a NaN or Inf stays.
-
-        Args:
-            recording: of the source.
-            index: numbers of bins, ``[m]``, among those that ``__call__`` hands on.
-
-        Shape:
-            - output: ``[m, C, context_before + n + context_after]``, in the maker's dtype
-
-        Raises:
-            ValueError: if a bin leaves the recording.
-        """
-        times = self.source.timeline(recording)
-        bins = self.lay_bins(times)
-        loaded = self._load(recording, times, bins)
-        whole = extended(loaded.samples.to(self.dtype), self.channel_filter)
-        context = self.channel_filter.context_before + self.channel_filter.context_after
-        return bins_at(whole, bins.starts[index], bins.bin_samples + context)
 
     def lay_bins(self, times: Timeline) -> LabelledBins:
         """Where the bins of a recording lie, and what they are; no sample is needed for that.
@@ -227,25 +217,17 @@ class FeatureMaker:
         recording: RecordingId,
         times: Timeline,
         bins: LabelledBins,
-        seconds: dict[str, float],
     ) -> tuple[Tensor, int]:
-        started = time.perf_counter()
         key = self._key(recording, bins)
-        cached = None if self.cache is None else self.cache.load(key)
-        if cached is not None and cached[0].shape == (len(bins.starts), len(self.pool.names)):
-            seconds["read_cache"] = time.perf_counter() - started
+        cached = None if self.cache is None else self.cache.load(key, self.pool.selected)
+        if cached is not None and len(cached[0]) == len(bins.starts):
             return cached
         loaded = self._load(recording, times, bins)
-        seconds["simulate" if self.source.is_simulated else "read"] = _lap(started, seconds)
-        filtered = self._filter(recording, loaded, bins)
-        seconds["filter"] = _lap(started, seconds)
         with torch.no_grad():
-            features: Tensor = self.extractor(filtered).float()
+            features: Tensor = self.extractor(self._filter(recording, loaded, bins)).float()
         longest_run = int(longest_runs(loaded.samples).max())
-        seconds["features"] = _lap(started, seconds)
         if self.cache is not None:
-            self.cache.store(key, features, longest_run)
-        seconds["write_cache"] = _lap(started, seconds)
+            self.cache.store(key, self.pool.selected, features, longest_run)
         return features, longest_run
 
     def _load(self, recording: RecordingId, times: Timeline, bins: LabelledBins) -> Recording:
@@ -291,98 +273,120 @@ class FeatureMaker:
         return cache_key(content)
 
 
-def _lap(started: float, seconds: dict[str, float]) -> float:
-    """Seconds since ``started`` that no earlier stage has."""
-    return time.perf_counter() - started - sum(seconds.values())
+@dataclass(frozen=True)
+class TrainingBins:
+    """Training bins of recordings, read one recording at a time and as often as asked for."""
 
+    maker: FeatureMaker
+    fold: Split
+    recordings: Sequence[RecordingId]
 
-NOTHING: Any = ()
-"""A batch of no recording."""
+    def __iter__(self) -> Iterator[RecordingBins]:
+        for recording in self.recordings:
+            made = self.maker(recording).in_split(self.fold)
+            some = made.of(made.roles["train"])
+            yield RecordingBins(
+                str(recording),
+                recording.material,
+                some.features,
+                some.is_slip,
+                recording.scene,
+                made.longest_run,
+            )
 
 
 class SlipDataModule(L.LightningDataModule):
-    """Recordings of a split as batches of one recording each, made by workers.
+    """The recordings of one or more folds.
 
-    The training loader holds the recordings with training bins, always in one order; the test
-    loader all that have a role. Of several processes each gets every so-many-th recording: none
-    is padded with recordings of another, as Lightning's own sampler would.
+    ``setup`` makes the features of each recording once for all folds. The only batch of training is
+    all training bins, as a fit needs them together; a batch of a test is one recording. Of several
+    processes each gets every so-many-th recording: none is padded with recordings of another, as
+    Lightning's own sampler would.
 
     Args:
         maker: makes features of a recording.
-        split: who has which role.
+        folds: of recordings.
         num_workers: processes that make features; 0 makes them in this one, ``None`` takes as
             many as there are processors, at most 8, shared by the processes of a machine.
+
+    Attributes:
+        fold: the one that loaders are of; the first one to begin with.
+        seconds: time that making features took.
+
+    Raises:
+        ValueError: if there is no such number of processes.
     """
 
-    def __init__(self, maker: FeatureMaker, split: Split, num_workers: int | None = None) -> None:
+    def __init__(
+        self, maker: FeatureMaker, folds: Sequence[Split], num_workers: int | None = None
+    ) -> None:
         super().__init__()
-        self.maker = maker
-        self.split = split
+        self.maker, self.folds, self.fold = maker, folds, folds[0]
         self.num_workers = num_processes(num_workers)
+        self.seconds = 0.0
         self._shares_processors = num_workers is None
+        self._made: set[RecordingId] = set()
 
-    def train_dataloader(self) -> DataLoader[RecordingFeatures]:
-        """This process's share of the recordings with training bins.
+    def setup(self, stage: str = "test") -> None:
+        """Make the features of this process's recordings, each once, for a fit those that train."""
+        started, workers = time.perf_counter(), self.num_workers
+        if self._shares_processors and self.trainer is not None:
+            workers = max(1, workers // self.trainer.num_devices)
+        wanted = self._having(*(["train"] if stage == "fit" else ROLES))
+        recordings = [recording for recording in wanted if recording not in self._made]
+        loader = self._loader(recordings, self.maker, workers)
+        with one_thread():  # the processors belong to the workers
+            for made in bar(loader, "features", "recording", show=bool(recordings)):
+                self.maker.keep(made)
+        self._made.update(recordings)
+        self.seconds += time.perf_counter() - started
 
-        Lightning keeps training in step, so a share that is one short ends in ``NOTHING``.
-        """
-        part, parts = self._share()
-        num = -(-len(self.split.having("train")) // parts)
-        return self.loader(["train"], part, parts, at_least=num)
+    def train_dataloader(self) -> DataLoader[TrainingBins]:
+        """One batch: the training bins of this process's recordings."""
+        return self._loader([self.training_bins()])
 
     def test_dataloader(self) -> DataLoader[RecordingFeatures]:
-        """This process's share of the recordings with a role."""
-        return self.loader(list(ROLES), *self._share())
+        """This process's recordings with a role, one a batch."""
+        return self._loader(self._having(*ROLES), self._in_fold)
 
-    def fingerprint(self) -> str:
-        """A digest of everything that determines the training bins; for resuming."""
-        split = self.split
-        features = {
-            str(recording): self.maker.key(recording) for recording in split.having("train")
-        }
-        shared = [split.test_fraction, split.seed, self.maker.rule.shuffle_seed]
-        return cache_key({"features": features, "shared": shared})
+    def training_bins(self) -> TrainingBins:
+        """Of this process's recordings."""
+        return TrainingBins(self.maker, self.fold, self._having("train"))
+
+    def features(self, *roles: str) -> Iterator[RecordingFeatures]:
+        """This process's recordings of the fold with any of the roles, one at a time."""
+        return map(self._in_fold, self._having(*roles))
 
     def transfer_batch_to_device(self, batch: Any, device: Any, dataloader_idx: int) -> Any:
         """Features stay where they are: moments and solve run in float64 on the processor."""
         return batch
 
-    def loader(
-        self, roles: Sequence[str], part: int = 0, parts: int = 1, at_least: int = 0
-    ) -> DataLoader[RecordingFeatures]:
-        """Recordings with any of the roles, every ``parts``-th of them from ``part`` on.
+    def _having(self, *roles: str) -> list[RecordingId]:
+        wanted = set(self.fold.having(*roles))
+        return [recording for recording in self._of_process() if recording in wanted]
 
-        Behind them ``NOTHING`` until there are ``at_least`` so many.
+    def _of_process(self) -> list[RecordingId]:
+        """Every so-many-th recording with a role in any fold."""
+        every = sorted({recording for fold in self.folds for recording in fold.having(*ROLES)})
+        trainer = self.trainer
+        part, parts = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
+        if parts > len(every):
+            raise ValueError(f"{parts} processes for {len(every)} recordings; use fewer")
+        return every[part::parts]
 
-        Raises:
-            ValueError: if there are more parts than recordings.
-        """
-        recordings = self.split.having(*roles)
-        if parts > len(recordings):
-            raise ValueError(
-                f"{parts} processes or shards for {len(recordings)} recordings; use fewer"
-            )
-        workers = self.num_workers
-        if self._shares_processors and self.trainer is not None:
-            workers = max(1, workers // self.trainer.num_devices)
-        own: list[Any] = recordings[part::parts]
+    def _in_fold(self, recording: RecordingId) -> RecordingFeatures:
+        return self.maker(recording).in_split(self.fold)
+
+    def _loader(
+        self, items: list[Any], collate: Callable[[Any], Any] = lambda item: item, workers: int = 0
+    ) -> DataLoader[Any]:
+        """A loader that makes something of one item at a time."""
         return DataLoader(
-            own + [None] * (at_least - len(own)),  # type: ignore[arg-type]  # a list is a dataset
+            items,  # type: ignore[arg-type]  # a list is a dataset
             batch_size=None,
             num_workers=workers,
-            collate_fn=partial(_batch, self.maker, self.split),
-            persistent_workers=workers > 0,
+            collate_fn=collate,
         )
-
-    def _share(self) -> tuple[int, int]:
-        if self.trainer is None:
-            return 0, 1
-        return self.trainer.global_rank, self.trainer.world_size
-
-
-def _batch(maker: FeatureMaker, split: Split, recording: RecordingId | None) -> RecordingFeatures:
-    made: RecordingFeatures = NOTHING if recording is None else maker(recording, split)
-    return made
 
 
 def training_origin(source: RecordingSource, fold: Split) -> dict[str, Any]:

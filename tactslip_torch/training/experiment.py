@@ -1,4 +1,4 @@
-"""What the sections of a configuration make: features, cache, trainer; and what results say."""
+"""An experiment as a sequence of stages: features, fit, test, alarm, export; fold by fold."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import errno
 import logging
 import os
 import tempfile
+import time
 import warnings
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ import lightning as L
 import numpy as np
 import torch
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import Checkpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
@@ -26,6 +26,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
+from tactslip_torch.data.splits import Split, have_same_bins
 from tactslip_torch.features.cache import (
     FeatureCache,
     default_cache_folder,
@@ -37,46 +38,132 @@ from tactslip_torch.features.pooling import statistics_of
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.native import BackendName, backend_of
-from tactslip_torch.report.metrics import merged_metrics, summed_metrics
-from tactslip_torch.runtime import LEAD, Progress, check_choice
+from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import Align, ChannelFilter, frame_lengths
 from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
-from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.learner import event_numbers
+from tactslip_torch.training.baselines import SimpleStatistics
+from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule, training_origin
+from tactslip_torch.training.evaluation import merged_results
+from tactslip_torch.training.learner import SlipLearner
+from tactslip_torch.training.recipe import Recipe
+
+log = logging.getLogger(__name__)
 
 
-def merged_results(
-    folds: Mapping[str, Mapping[str, Any]], *, by_fold: bool = False
-) -> dict[str, Any]:
-    """Splits, baselines and events of several tests as of one, by role.
+@dataclass(frozen=True)
+class Experiment:
+    """All that a training is made of.
 
     Args:
-        folds: of each its ``metrics`` as ``SlipLearner`` has them, and ``recording_events``.
-        by_fold: whether folds have the same bins, which then are not summed: results have each role
-            of each fold, such as ``"protocol/unseen"``.
+        maker: of features.
+        folds: of recordings, each with a detector of its own.
+        recipe: how detectors are made.
+        alarm: sets the alarm of a detector and returns what that measured; ``None``: nothing does.
+        trainer: Lightning's, for a folder of results.
+        cache: as ``feature_cache`` takes it.
+        metadata: of the experiment, to be kept with detectors.
+        num_workers: processes that make features; ``None``: one a processor.
+        with_baselines: whether baselines are fitted and evaluated.
+        export: writes the ONNX files of a detector into a folder; ``None``: nothing does.
     """
-    splits = defaultdict[str, list[Any]](list)
-    baselines, events = (defaultdict[str, Any](lambda: defaultdict(list)) for _ in range(2))
-    for fold, found in folds.items():
-        before = f"{fold}/" if by_fold else ""
-        for role, scores in found["splits"].items():
-            splits[before + role].append(scores)
-        for name, about in found["baselines"].items():
-            for role, scores in about["splits"].items():
-                baselines[name][before + role].append(scores)
-        for role, by_rule in found["recording_events"].items():
-            for name, recordings in by_rule.items():
-                events[before + role][name] += recordings
-    summed = {
-        name: {"splits": {role: summed_metrics(own) for role, own in by_role.items()}}
-        for name, by_role in baselines.items()
+
+    maker: FeatureMaker
+    folds: Sequence[Split]
+    recipe: Recipe
+    alarm: Callable[[SlipDetector], dict[str, Any]] | None
+    trainer: Callable[[Path], L.Trainer]
+    cache: str | bool | None = "auto"
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    num_workers: int | None = None
+    with_baselines: bool = True
+    export: Callable[[SlipDetector, Path], dict[str, Any]] | None = None
+
+
+def run_experiment(experiment: Experiment, folder: Path) -> dict[str, Any]:
+    """Features once for all folds; for each fold fit, test, alarm, export; results merged.
+
+    Args:
+        experiment: to be run.
+        folder: of results; of several folds each has a folder in it.
+
+    Returns:
+        Plain values, as ``metrics.json`` has them; ``features`` are rows of the selected features.
+    """
+    folds = experiment.folds
+    results: dict[str, dict[str, Any]] = {}
+    with feature_cache(experiment.cache) as experiment.maker.cache:
+        data = SlipDataModule(experiment.maker, folds, experiment.num_workers)
+        for data.fold in folds:
+            place = folder if len(folds) == 1 else folder / data.fold.name
+            results[data.fold.name] = _run_fold(experiment, data, place)
+    seconds = {"features": data.seconds, **_added([of.pop("timing_s") for of in results.values()])}
+    first, *others = results.values()
+    shared = set(first["selected"]).intersection(*(of["selected"] for of in others))
+    features = [row for row in first["features"] if row["name"] in shared]
+    recording_events = [of.pop("recording_events") for of in results.values()]
+    for of in results.values():
+        del of["features"]
+    metrics = dict(first)
+    if others:
+        events = dict(zip(results, recording_events, strict=True))
+        metrics = merged_results(results, events, by_fold=have_same_bins(folds))
+        metrics |= {"selected": [row["name"] for row in features], "folds": results}
+    return metrics | {
+        "timing_s": seconds,
+        "features": features,
     }
-    only = next(iter(folds.values()))["baselines"] if len(folds) == 1 else None
+
+
+def _run_fold(experiment: Experiment, data: SlipDataModule, folder: Path) -> dict[str, Any]:
+    """Fit, test, set the alarm of, save and export the detector of a fold; its results."""
+    maker, trainer = experiment.maker, experiment.trainer(folder)
+    learner = SlipLearner(
+        maker.pool,
+        maker.channel_filter,
+        experiment.recipe,
+        with_baselines=experiment.with_baselines,
+    )
+    trainer.fit(learner, datamodule=data)
+    detector, started = learner.detector, time.perf_counter()
+    if detector is None:
+        raise ValueError("nothing was fitted; leave trainer.max_epochs at 1")
+    trainer.test(learner, datamodule=data, verbose=False)
+    tested = time.perf_counter()
+    detector.info |= training_origin(maker.source, data.fold) | dict(experiment.metadata)
+    alarm: dict[str, Any] = {}
+    onnx: dict[str, Any] = {}
+    if trainer.is_global_zero:
+        detector.save(folder / "detector.pt")  # stays, whatever comes
+        alarm = experiment.alarm(detector) if experiment.alarm else {}
+        detector.save(folder / "detector.pt")
+    alarmed = time.perf_counter()
+    if trainer.is_global_zero and experiment.export:
+        onnx = experiment.export(detector, folder)
+    seconds = {"test": tested - started, "alarm": alarmed - tested}
     return {
-        "splits": {role: merged_metrics(scores) for role, scores in splits.items()},
-        "baselines": summed if only is None else only,  # what they are is told of one fold alone
-        "events": event_numbers(events),
+        **learner.metrics,
+        "events": learner.metrics["events"] | alarm.pop("events", {}),
+        **({"alarm": alarm} if alarm else {}),
+        "recording_events": learner.events,
+        **learner.metadata,
+        "selected": [str(name) for name in detector.selected_names],
+        "features": feature_rows(detector.selected_names, maker.source.hand),
+        "trained_on": {
+            "materials": detector.info["train_materials"],
+            "sessions": detector.info["train_sessions"],
+            "scenes": sorted({recording.scene for recording in data.fold.having("train")}),
+        },
+        "onnx": onnx,
+        "timing_s": learner.seconds | seconds | {"save_export": time.perf_counter() - alarmed},
     }
+
+
+def _added(several: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Sums of the values of each key."""
+    total = Counter[str]()
+    for each in several:
+        total.update(each)
+    return dict(total)
 
 
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -95,6 +182,9 @@ def feature_maker(
     backend: BackendName,
     align: Align = "centred",
     pooling: str | Sequence[str] | None = None,
+    memory_gib: float = 2.0,
+    recipe: Recipe | None = None,
+    with_baselines: bool = True,
 ) -> FeatureMaker:
     """The features of the ``features`` section, without a cache; no recording is read for it.
 
@@ -110,6 +200,9 @@ def feature_maker(
         backend: what computes them.
         align: of the filter.
         pooling: statistics over channels; the recipe takes them, here they are only checked.
+        memory_gib: of features that are kept in memory at most.
+        recipe: that the features are for; ``None`` makes all there are.
+        with_baselines: whether they are for baselines too.
 
     Raises:
         ValueError: if a kind of channel has no frame, a statistic is unknown, a bin
@@ -137,25 +230,38 @@ def feature_maker(
         arithmetic="native" if dtype == "float32" else "double",
         backend=backend,
     )
-    channel_filter = ChannelFilter(lengths, polyorder, align)
-    computed_in, computed_by = DTYPES[dtype], backend_of(backend)
-    return FeatureMaker(source, pool, channel_filter, rule, None, computed_in, computed_by)
+    if recipe is not None and recipe.descriptors is not None:
+        wanted = {*recipe.descriptors, "range"}  # ranges tell which channels are silent
+        names = {name for name in pool.names if name.descriptor in wanted}
+        if with_baselines:
+            names.update(*SimpleStatistics.names(pool).values())
+        pool = pool.select([i for i, name in enumerate(pool.names) if name in names])
+    return FeatureMaker(
+        source,
+        pool,
+        ChannelFilter(lengths, polyorder, align),
+        rule,
+        dtype=DTYPES[dtype],
+        backend=backend_of(backend),
+        memory_gib=memory_gib,
+    )
 
 
 def features_of(
     detector: SlipDetector, source: RecordingSource, rule: LabelRule, cache: FeatureCache | None
 ) -> FeatureMaker:
-    """The features of a detector, computed as in its training."""
-    dtype = DTYPES[detector.info.get("features_dtype", "float64")]
-    return FeatureMaker(source, detector.pool, detector.channel_filter, rule, cache, dtype)
+    """The features that a detector reads, computed as in its training."""
+    pool, dtype = detector.pool, DTYPES[detector.info.get("features_dtype", "float64")]
+    pool = pool.select(sorted(set(detector.selected)))
+    return FeatureMaker(source, pool, detector.channel_filter, rule, cache, dtype)
 
 
 @contextmanager
 def feature_cache(setting: str | bool | None) -> Iterator[FeatureCache]:
     """The cache of ``cache=auto|off|FOLDER``; ``off`` keeps features for this run only.
 
-    Two passes need the features twice, so even ``off`` holds them on disk, in a temporary folder
-    that goes with the run.
+    What memory has no room for is read again, so even ``off`` holds features on disk, in a
+    temporary folder that goes with the run.
     """
     if setting in ("off", False, None):  # YAML reads a bare off as false
         with tempfile.TemporaryDirectory(prefix="tactslip-") as folder:
@@ -173,43 +279,7 @@ def feature_cache(setting: str | bool | None) -> Iterator[FeatureCache]:
     cache.prune()
 
 
-class _RecordingProgressBar(TQDMProgressBar):
-    """Lightning's bar, named after the pass that is running and counting recordings."""
-
-    def __init__(self) -> None:
-        super().__init__(refresh_rate=1)
-
-    def init_train_tqdm(self) -> Any:
-        """The bar of both training passes, on standard error: standard output is for results."""
-        return Progress(
-            unit=" recording", dynamic_ncols=True, disable=self.is_disabled, smoothing=0
-        )
-
-    def init_test_tqdm(self) -> Any:
-        """The bar of the test pass."""
-        return self.init_train_tqdm()
-
-    def on_train_epoch_start(self, trainer: Any, *args: Any) -> None:
-        """Name the pass."""
-        super().on_train_epoch_start(trainer, *args)
-        what = "statistics" if trainer.current_epoch == 0 else "sums"
-        self.train_progress_bar.set_description_str(f"{'features, ' + what:{LEAD}}")
-
-    def on_test_batch_start(self, *args: Any, **kwargs: Any) -> None:
-        """Name the pass; Lightning numbers its loaders instead."""
-        super().on_test_batch_start(*args, **kwargs)
-        self.test_progress_bar.set_description_str(f"{'features, scores':{LEAD}}")
-
-    def get_metrics(self, trainer: Any, pl_module: Any) -> dict[str, Any]:
-        """Nothing, instead of Lightning's version number."""
-        return {}
-
-
-def make_trainer(
-    config: DictConfig,
-    folder: Path,
-    callbacks: Sequence[L.Callback] = (),
-) -> L.Trainer:
+def make_trainer(config: DictConfig, folder: Path) -> L.Trainer:
     """The Lightning trainer of the ``trainer`` section, logging to TensorBoard and CSV.
 
     Raises:
@@ -225,8 +295,8 @@ def make_trainer(
             TensorBoardLogger(str(folder), name="", version="tensorboard"),
             CSVLogger(str(folder), name="", version="csv"),
         ],
-        callbacks=[_RecordingProgressBar(), *callbacks],
-        enable_checkpointing=any(isinstance(callback, Checkpoint) for callback in callbacks),
+        enable_checkpointing=False,
+        enable_progress_bar=False,  # features and validation have their own
     )
     started = int(os.environ.get("WORLD_SIZE", "1"))
     if "TORCHELASTIC_RUN_ID" in os.environ and started != trainer.world_size:
@@ -238,19 +308,13 @@ def make_trainer(
 
 
 def write_tensorboard(folder: Path, config: DictConfig, metrics: Mapping[str, Any]) -> None:
-    """Add to a run's TensorBoard its figures, validation, configuration, and final scores.
-
-    The curve of validation has the choices in the order of C as its steps.
+    """Add to a run's TensorBoard its figures, configuration, and final scores.
 
     Args:
         folder: of the run, with its figures.
         config: of the run.
         metrics: the content of ``metrics.json``.
     """
-    plain: Any = OmegaConf.to_container(config, resolve=True)
-    flat = {key: value for key, value in _flat(plain) if "._" not in key}
-    is_simple = (bool, int, float, str)
-    given = {key: v if isinstance(v, is_simple) else str(v) for key, v in flat.items()}
     final = {
         f"final/{role}/{name}": scores[name]
         for role, scores in metrics["splits"].items()
@@ -262,41 +326,27 @@ def write_tensorboard(folder: Path, config: DictConfig, metrics: Mapping[str, An
         for path in sorted(folder.glob("*.png")):
             with Image.open(path) as image:
                 board.add_image(path.stem, np.asarray(image.convert("RGB")), dataformats="HWC")
-        choices = sorted(metrics.get("validation") or (), key=lambda row: row["penalty"])
-        penalties = sorted({row["penalty"] for row in choices})
-        for row in choices:
-            kernel = "_".join(f"{k}={v}" for k, v in row["kernel"].items())
-            name = f"validation/{row.get('use', 'channel')}/K={row['num_features']}/{kernel}"
-            board.add_scalar(name, row["mean"], penalties.index(row["penalty"]))
-        board.add_hparams(given, final, run_name=".")
-
-
-def _flat(section: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in section.items():
-        if isinstance(value, dict) and value:
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+        for name, score in final.items():
+            board.add_scalar(name, score)
 
 
 def feature_rows(names: Sequence[FeatureName], hand: HandLayout) -> list[dict[str, str]]:
     """Features as plain rows, with the kind and finger of their channel, for tables and figures."""
     rows = []
     for name in names:
-        about = {"channel": "all", "kind": name.channel, "finger": "all"}
+        place = {"channel": "all", "kind": name.channel, "finger": "all"}
         if not name.is_pooled:
             channel = hand.channel(name.channel)
-            about = {"kind": channel.kind, "finger": channel.finger}
-        rows.append({"name": str(name), **asdict(name), **about})
+            place = {"kind": channel.kind, "finger": channel.finger}
+        rows.append({"name": str(name), **asdict(name), **place})
     return rows
 
 
-def common_metadata(
-    source: RecordingSource, pool: FeaturePool, config: DictConfig
-) -> dict[str, Any]:
+def common_metadata(maker: FeatureMaker, config: DictConfig) -> dict[str, Any]:
     """What every ``metrics.json`` says of its origin."""
+    pool = maker.pool
     return {
-        "simulated": source.is_simulated,
+        "simulated": maker.source.is_simulated,
         "experiment": config.name,
         "seed": config.seed,
         "labels": OmegaConf.to_container(config.labels, resolve=True),

@@ -1,225 +1,196 @@
-"""How a detector is made: how features are ranked and scaled, and what is chosen from.
+"""Recipes: from labelled bins to a machine, ``General`` (the default) and ``Paper``.
 
-A ``Recipe`` is the choice of methods; ``training.plan`` applies it to the statistics that the
-first pass over the training recordings gathered.
+Each reads the training bins twice: once for statistics and a bounded sample, by which features,
+scaling and penalty are chosen, and once to solve for the machine. In a run of several processes
+each reads its own recordings; the first one chooses and solves for all.
 """
 
 from __future__ import annotations
 
+import itertools
+import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
-from typing import Any, Literal
+from typing import Any, TypeVar
 
 import torch
+import torch.distributed
 from torch import Tensor
 
-from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import PAPER_SCENE
-from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
 from tactslip_torch.features.groups import checked_attributes, matching
 from tactslip_torch.features.pool import FeaturePool, is_rounding
-from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.features.selection import ScoreVariance, rank_distinct, t_scores
-from tactslip_torch.features.sensing import Sensing, SpanFeatures
-from tactslip_torch.features.statistics import TrainingStatistics
-from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
+from tactslip_torch.features.sensing import (
+    Sensing,
+    SpanFeatures,
+    least_alive,
+    most_stuck_samples,
+)
+from tactslip_torch.model.detector import SlipDetector, counted_channels
+from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
+from tactslip_torch.model.kernels import PAPER_KERNEL, Head, Polynomial
+from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.runtime import check_number
+from tactslip_torch.native import BackendName
+from tactslip_torch.runtime import bar, check_choice, check_number
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.bins import BinSample, RecordingBins, SampledBins, bin_keys
+from tactslip_torch.training.choice import (
+    CandidateBins,
+    Choice,
+    FeatureSelection,
+    Structure,
+    balanced_accuracy,
+    choose_model,
+    platt_or_none,
+)
 
-Balance = Literal["undersample", "weights"]
-GroupBy = Literal["material", "cycle"]
-CYCLE_GROUPS = 5
+log = logging.getLogger(__name__)
+Value = TypeVar("Value")
+
 FREE_CONSTANT = 1.0e6
 """``c`` of degree 1, where it weighs the constant alone: so large, the penalty does not reach it.
 A penalised constant moves the threshold of a machine with few bins or a strong penalty."""
-_SCENE = "|"  # between group and scene in the name of a stratum
-_NUMBERS: Mapping[str, tuple[str, Callable[[float], bool]]] = {
-    "num_features": ("be whole numbers of at least 1", lambda k: k >= 1 and k.is_integer()),
-    "sample_bins": ("be at least 2", lambda num: num >= 2),
-    "penalties": ("be positive", lambda penalty: penalty > 0),
-    "offsets": ("not be negative", lambda offset: offset >= 0),
-    "tail": ("lie in [0, 0.5)", lambda part: 0 <= part < 0.5),
-    "most_correlation": ("lie in (0, 1]", lambda r: 0 < r <= 1),
-    "tolerance": ("lie in [0, 1)", lambda part: 0 <= part < 1),
-    "drop_channels": ("lie in [0, 1)", lambda part: 0 <= part < 1),
-    "scene_weights": ("be positive", lambda weight: 0 < weight < math.inf),
-}
-_LISTS = ("num_features", "offsets", "penalties", "use", "degree")
-"""Of these there may be several values."""
-_CHOICES = {
-    "use": ("channel", "pooled", "both"),
-    "score_variance": ("pooled", "welch"),
-    "balance": ("undersample", "weights"),
-    "group_by": ("material", "cycle"),
-    "ranking": ("t", "gd"),
-    "validation": ("held", "nested"),
-}
+MOST_DUAL_BINS = 2500
+"""Up to so many training bins a machine of degree 2 on all features is a candidate: it does not
+fold, so its cost grows with the bins."""
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """How the machine is made; defaults are the paper's where it states one.
+class _Plan:
+    """All that is decided before the solve."""
 
-    Args:
-        name: for folders and tables.
-        num_features: how many features are selected; ``None`` takes all. Of several values of this,
-            ``degree``, ``offsets``, ``penalties`` or ``use`` validation chooses one.
-        score_variance: of the t-test, ``"pooled"`` or ``"welch"``.
-        most_correlation: features that correlate more than this within the classes with one
-            already taken are passed over (ours); 1 takes them all.
-        compress: scale the signed log of the features (ours).
-        tail: share of sampled bins beyond the scaled range on either side; they are clipped.
-        degree: of the polynomial kernel, 1 or 2.
-        offsets: of the polynomial kernel, its ``c``.
-        penalties: the paper's ``C``.
-        balance: ``"undersample"`` (authors) or ``"weights"`` (ours).
-        group_by: what a validation fold leaves out: a ``"material"`` or a fifth of the
-            ``"cycle"`` numbers (ours; the authors' search is not described).
-        sample_bins: bins of each group and class that the first pass keeps for quantiles,
-            correlations, baselines and validation. Exact ranges and the t-test take
-            every bin.
-        feature_filter: ranks only features that match (ours), such as ``{"kind": "SG",
-            "descriptor": "mean"}``: of each attribute a value, or one of several. ``num_features``
-            is cut to what matches.
-        pooling: statistics over the channels of a kind, as ``features.pooling`` has them (ours).
-        use: ``"channel"`` features, ``"pooled"`` ones or ``"both"``.
-        descriptors: those that may be used; ``None``: all.
-        ranking: ``"t"``, the paper's t-test, or ``"gd"``, which knows of groups (ours:
-            ``group_scores``).
-        validation: ``"held"``: features are ranked and scaled once for all validation folds;
-            ``"nested"``: anew in each fold, and the choice is evaluated by leaving out two groups
-            (``training.plan``).
-        tolerance: choices within so much of the best balanced accuracy are as good: of them, the
-            simplest machine with the strongest penalty is taken. For ``"nested"``.
-        scene_weights: weight of a kind of scene beside the paper's: of all its bins of a class
-            together, as a part of the protocol's bins of that class. Scenes that are not named
-            count bin by bin. For ``"nested"``.
-        drop_channels: of every recording a second copy is trained on, from which up to this part
-            of the channels is left out at random. For pooled features.
-        min_alive: channels that must be alive for a valid decision, of the fast ones in use (of all
-            in use, where nothing is pooled). ``None``: as many as the second copies have at least;
-            half where nothing is pooled.
+    selection: FeatureSelection
+    kernel: Polynomial
+    penalty: float
+    imputation: Tensor
+    sensing: Sensing
+    num_bins: int
+    sample: SampledBins
+    weights: dict[str, tuple[float, float]]
+    validation: list[dict[str, Any]]
+    nested: dict[str, Any] | None = None
 
-    Raises:
-        ValueError: for an unknown name or a number that is not positive.
+
+@dataclass(frozen=True)
+class Fit(_Plan):
+    """A machine, and how it was made.
+
+    Attributes:
+        selection: which features, how scaled; indices are those of the bins' features.
+        kernel: of the machine.
+        penalty: the paper's ``C``.
+        imputation: mean of the scaled columns, both classes counting alike; for lost channels.
+        sensing: spans of channels that work, of the training bins.
+        num_bins: how many bins are trained on; about, where classes are undersampled.
+        sample: of the training bins.
+        weights: of each bin by scene, non-slip and slip; of ``Paper`` the part that is trained on.
+        validation: one row per candidate, with the balanced accuracy of each held-out group; the
+            one that was taken has ``chosen`` and the ``calibration`` of its held-out scores.
+        nested: balanced accuracy of the whole choice on groups that it did not see, if measured.
+        head: the machine.
     """
 
-    name: str = "paper"
-    num_features: int | Sequence[int | None] | None = 120
-    score_variance: ScoreVariance = "pooled"
-    most_correlation: float = 1.0
-    compress: bool = False
-    tail: float = 0.0
-    degree: int | Sequence[int] = 2
-    offsets: float | Sequence[float] = 0.5
-    penalties: float | Sequence[float] = (0.05, 0.08, 0.1, 0.13, 0.17, 0.2, 0.25, 0.3, 1.0, 3.0)
-    balance: Balance = "undersample"
-    group_by: GroupBy = "material"
+    head: Head = field(kw_only=True)
+
+    @property
+    def calibration(self) -> dict[str, Any] | None:
+        """By held-out scores of the choice that was taken; None if there was nothing to choose."""
+        chosen = (row.get("calibration") for row in self.validation if row.get("chosen"))
+        return next(chosen, None)
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """How the machine was made, for files, JSON-able."""
+        return {
+            "kernel": self.kernel.to_dict(),
+            "penalty": self.penalty if math.isfinite(self.penalty) else "inf",  # JSON has none
+            "num_bins": self.num_bins,
+            "validation": self.validation,
+            "nested_validation": self.nested,
+            "head": self.head.cost._asdict(),
+            "solve": {} if self.head.solved is None else self.head.solved.metadata(),
+        }
+
+    def detector(
+        self,
+        pool: FeaturePool,
+        channel_filter: ChannelFilter,
+        metadata: Mapping[str, Any],
+        backend: BackendName | None = None,
+    ) -> SlipDetector:
+        """The detector with this machine.
+
+        Args:
+            pool: of the features of the bins, whole or a selection of one.
+            channel_filter: of the bins.
+            metadata: to be kept with it, JSON-able.
+            backend: of features; by default that of the pool.
+        """
+        whole = FeaturePool(pool.hand, **pool.config(), backend=backend or pool.backend)
+        selection = self.selection
+        return SlipDetector(
+            whole,
+            channel_filter,
+            tuple(pool.selected[index] for index in selection.selected),
+            selection.scaler,
+            self.head,
+            metadata,
+            self.imputation,
+            selection.pooling,
+            sensing=self.sensing,
+            backend=whole.backend,
+        )
+
+
+@dataclass(frozen=True)
+class _Recipe(ABC):
+    """What both recipes have."""
+
+    name: str
+    penalties: float | Sequence[float]
     sample_bins: int = 400
     feature_filter: Mapping[str, str | Sequence[str]] | None = None
-    pooling: str | Sequence[str] | None = None
-    use: str | Sequence[str] = "channel"
     descriptors: Sequence[str] | None = None
-    ranking: Literal["t", "gd"] = "t"
-    validation: Literal["held", "nested"] = "held"
-    tolerance: float = 0.0
-    scene_weights: Mapping[str, float] = field(default_factory=dict)
-    drop_channels: float = 0.0
     min_alive: int | None = None
 
     def __post_init__(self) -> None:
-        for name in _LISTS:
-            object.__setattr__(self, name, _several(getattr(self, name)))
-        for name in ("pooling", "descriptors"):  # lists of a configuration
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, str):
+        for name, value in vars(self).items():  # lists of a configuration
+            if isinstance(value, list):
                 object.__setattr__(self, name, tuple(value))
-        object.__setattr__(self, "scene_weights", dict(self.scene_weights))
-        if self.feature_filter is not None:
-            object.__setattr__(
-                self,
-                "feature_filter",
-                checked_attributes("recipe.feature_filter", self.feature_filter),
-            )
+        check_number("recipe.sample_bins", self.sample_bins, least=2, whole=True)
         if self.min_alive is not None:
             check_number("recipe.min_alive", self.min_alive, whole=True)
-        if problem := next(self._problems(), None):
-            raise ValueError(f"recipe{problem}")
-        _ = self.kernels  # their own checks
-
-    def _problems(self) -> Iterator[str]:
-        """What is wrong with the arguments, most basic first."""
-        for name, known in _CHOICES.items():
-            for value in _several(getattr(self, name)):
-                if value not in known:
-                    yield f".{name} must be one of {', '.join(known)}, got {value!r}"
-        for name, (wanted, is_right) in _NUMBERS.items():
-            value = getattr(self, name)
-            values = value if name in _LISTS or isinstance(value, Mapping) else (value,)
-            if not _all_pass(values, is_right, may_be_none=name == "num_features"):
-                shown = list(value) if isinstance(value, tuple) else value
-                yield f".{name} must {wanted}, got {shown!r}"
-        if len(self.penalties_ascending) > 1 and not math.isfinite(self.penalties_ascending[-1]):
-            yield ".penalties: validation needs finite values; give inf alone, or leave it out"
-        if set(self.uses) != {"channel"} and self.pooling is None:
-            yield ".use=pooled needs statistics over channels; set features.pooling=[mean, std]"
-        degrees = _several(self.degree)
-        if self.validation == "nested":
-            return
-        for name, is_wanted in {
-            "use": set(self.uses) != {"channel"},
-            "num_features=null": self.takes_all,
-            "several degrees": len(degrees) > 1,
-            "ranking=gd": self.ranking == "gd",
-            "scene_weights": bool(self.scene_weights),
-        }.items():
-            if is_wanted:
-                yield f": {name} needs recipe.validation=nested, as general has"
-
-    @property
-    def uses(self) -> tuple[str, ...]:
-        """Kinds of features to choose from."""
-        return _several(self.use)
-
-    @property
-    def takes_all(self) -> bool:
-        """Whether all features, without selection, are among what is chosen from."""
-        return None in _several(self.num_features)
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Numbers of features to choose from, ascending, without ``None``."""
-        return tuple(sorted(size for size in _several(self.num_features) if size is not None))
+        penalties = self.penalties_ascending
+        if not penalties or not all(penalty > 0 for penalty in penalties):
+            raise ValueError(f"recipe.penalties must be positive, got {list(penalties)!r}")
+        if len(penalties) > 1 and not math.isfinite(penalties[-1]):
+            raise ValueError(
+                "recipe.penalties: validation needs finite values; give inf alone, or leave it out"
+            )
+        if self.feature_filter is not None:
+            checked_attributes("recipe.feature_filter", self.feature_filter)
 
     @property
     def penalties_ascending(self) -> tuple[float, ...]:
         """Values of C to choose from, as numbers."""
-        return tuple(sorted(float(penalty) for penalty in _several(self.penalties)))
+        return tuple(sorted(_numbers("recipe.penalties", self.penalties)))
 
-    def check_pool(self, num_features: int) -> None:
-        """Refuse a pool that has fewer features than are to be selected.
-
-        Raises:
-            ValueError: if it has.
-        """
-        if self.validation == "held" and self.sizes[-1] > num_features:
-            raise ValueError(
-                f"recipe.num_features={self.sizes[-1]} exceeds the pool's {num_features}; give at "
-                f"most {num_features}"
-            )
-
-    def allowed(self, pool: FeaturePool) -> Tensor | None:
-        """Which features of a pool may be selected, ``[F]``, bool; ``None`` if all may.
+    def allowed(self, pool: FeaturePool) -> Tensor:
+        """Which features of a pool may be selected, ``[F]``, bool.
 
         Those that rounding decides, as some wavelets have them, never may.
 
         Raises:
-            ValueError: if ``feature_filter`` names a value that no feature has, or nothing matches.
+            ValueError: if ``descriptors`` or ``feature_filter`` names what no feature has, or
+                nothing matches.
         """
-        is_firm = ~is_rounding(pool)
+        mask = ~is_rounding(pool)
         if self.descriptors is not None:
             known = {*TIME_DESCRIPTORS, *SPECTRUM_DESCRIPTORS, "band_energy_ratio"}
             if unknown := [name for name in self.descriptors if name not in known]:
@@ -227,311 +198,499 @@ class Recipe:
                     f"recipe.descriptors: unknown {unknown[0]!r}, expected some of "
                     f"{', '.join(sorted(known))}"
                 )
-            is_firm &= torch.tensor([name.descriptor in self.descriptors for name in pool.names])
-        if self.feature_filter is None:
-            return None if bool(is_firm.all()) else is_firm
-        try:
-            mask = matching(pool.hand, pool.names, self.feature_filter) & is_firm
-        except ValueError as error:
-            raise ValueError(f"recipe.feature_filter: {error}") from None
+            mask &= torch.tensor([name.descriptor in self.descriptors for name in pool.names])
+        if self.feature_filter is not None:
+            try:
+                mask &= matching(pool.hand, pool.names, self.feature_filter)
+            except ValueError as error:
+                raise ValueError(f"recipe.feature_filter: {error}") from None
         if not bool(mask.any()):
             raise ValueError(
-                f"recipe.feature_filter: of {pool.wavelet}, rounding decides all that match"
+                "recipe.feature_filter: no feature of recipe.descriptors matches that is more than "
+                "rounding; ask for others"
             )
         return mask
 
+    def fit(
+        self,
+        bins: Iterable[RecordingBins],
+        pool: FeaturePool,
+        *,
+        is_nested: bool = True,
+        show: bool = False,
+    ) -> Fit:
+        """Choose a machine and fit it.
+
+        Args:
+            bins: training bins; they are gone through twice.
+            pool: of their features, whole or a selection.
+            is_nested: whether a nested validation also evaluates the choice itself.
+            show: progress bars.
+
+        Raises:
+            ValueError: if a class is absent, or a solve fails.
+        """
+        statistics = self._statistics(pool)
+        for some in bins:
+            statistics.update(some)
+        statistics = _merged(statistics)
+        plan: _Plan = from_first_process(lambda: self._plan(statistics, pool, is_nested, show))
+        size, degree, kept = plan.selection.size, plan.kernel.degree, {}
+        sums = SufficientStats(size, degree=degree)
+        adds_up = plan.num_bins > plan.kernel.num_monomials(size)  # else the bins are fewer
+        for some in bins:
+            part = self._weighted(plan, some)
+            if adds_up:
+                sums.update(some.name, *part)
+            else:
+                kept[some.name] = part
+        if not adds_up:
+            kept = dict(itertools.chain(*(own.items() for own in gathered(kept))))
+        elif _num_processes() > 1:
+            for total in (sums.sums, sums.count):
+                torch.distributed.all_reduce(total)
+
+        def solve() -> Head:
+            if adds_up:
+                return sums.solve(plan.penalty, plan.kernel.offset, balance="none")
+            columns = zip(*(kept[name] for name in sorted(kept)), strict=True)
+            return fit_machine(TrainingBins(*map(torch.cat, columns)), plan.penalty, plan.kernel)
+
+        return Fit(**vars(plan), head=from_first_process(solve))
+
+    @abstractmethod
+    def _statistics(self, pool: FeaturePool) -> BinSample | _Statistics:
+        """What the first look at training bins gathers."""
+
+    @abstractmethod
+    def _plan(self, statistics: Any, pool: FeaturePool, is_nested: bool, show: bool) -> _Plan:
+        """Choose by what was gathered."""
+
+    @abstractmethod
+    def _weighted(self, plan: _Plan, bins: RecordingBins) -> tuple[Tensor, Tensor, Tensor]:
+        """Scaled bins ``[N, K]``, classes and weights ``[N]`` that the machine is fitted to."""
+
+    def _sensing(
+        self,
+        pool: FeaturePool,
+        selection: FeatureSelection,
+        sample: SampledBins,
+        alive_fraction: float,
+    ) -> Sensing:
+        """Spans of channels that work, of the training bins of a selection."""
+        channels = pool.hand.names
+        used = sorted({channels.index(pool.names[i].channel) for i in selection.selected})
+        num_counted = len(counted_channels(pool.hand, used, selection.pooling is not None))
+        return Sensing.fit(
+            SpanFeatures(pool.hand, pool.names, pool.bin_samples)(sample.features),
+            self.min_alive or least_alive(num_counted, alive_fraction),
+            most_stuck_samples(pool.sample_rate_hz, sample.longest_run),
+        )
+
+
+@dataclass(frozen=True)
+class General(_Recipe):
+    """Features of each channel, pooled over channels, or both, chosen by nested validation.
+
+    Features are compressed by a signed logarithm and scaled by quantiles; classes weigh alike.
+
+    Args:
+        name: for tables.
+        penalties: the paper's ``C``. Of several values of this, ``use``, ``num_features`` and
+            ``degree`` validation chooses one; a grid that ends at its edge is extended.
+        sample_bins: bins of each group and class that choices are made by.
+        feature_filter: only features that match are used, such as ``{"kind": "SG", "descriptor":
+            "mean"}``: of each attribute a value, or one of several.
+        descriptors: those that may be used; ``None``: all.
+        min_alive: channels that must be alive for a valid decision, of the fast ones in use (of all
+            in use, where nothing is pooled). ``None``: as many as the second copies have at least;
+            half where nothing is pooled.
+        use: ``"channel"`` features, ``"pooled"`` ones or ``"both"``.
+        num_features: how many are selected, best first; ``None`` takes all.
+        degree: of the polynomial kernel, 1 or 2.
+        pooling: statistics over the channels of a kind, as ``features.pooling`` has them.
+        tolerance: choices within so much of the best balanced accuracy are as good: of them, the
+            simplest machine with the strongest penalty is taken.
+        scene_weights: weight of a kind of scene beside the paper's: of all its bins of a class
+            together, as a part of the protocol's bins of that class. Scenes that are not named
+            count bin by bin.
+        drop_channels: of every recording a second copy is trained on, from which up to this part
+            of the channels is left out at random. For pooled features.
+
+    Raises:
+        ValueError: for an unknown name or a number out of range.
+    """
+
+    name: str = "general"
+    penalties: float | Sequence[float] = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+    use: str | Sequence[str] = ("channel", "pooled", "both")
+    num_features: int | Sequence[int | None] | None = (None, 120)
+    degree: int | Sequence[int] = (1, 2)
+    pooling: str | Sequence[str] | None = ("mean", "std", "min", "max")
+    tolerance: float = 0.005
+    scene_weights: Mapping[str, float] = field(default_factory=dict)
+    drop_channels: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for use in _several(self.use):
+            check_choice("recipe.use", use, ("channel", "pooled", "both"))
+        for num in _several(self.num_features):
+            if num is not None:
+                check_number("recipe.num_features", num, whole=True)
+        for name in ("tolerance", "drop_channels"):
+            if not 0 <= _numbers(f"recipe.{name}", getattr(self, name))[0] < 1:
+                raise ValueError(f"recipe.{name} must lie in [0, 1), got {getattr(self, name)!r}")
+        for weight in self.scene_weights.values():
+            check_number("recipe.scene_weights", weight)
+        if set(_several(self.use)) != {"channel"} and self.pooling is None:
+            raise ValueError(
+                "recipe.use=pooled needs statistics over channels; set features.pooling=[mean, std]"
+            )
+        _ = self.kernels  # their own checks
+
     @property
     def kernels(self) -> tuple[Polynomial, ...]:
-        """Kernels to choose from."""
-        offsets = [float(c) for c in _several(self.offsets)]
+        """Kernels to choose from, the lower degree first."""
+        offset = PAPER_KERNEL.offset
         return tuple(
-            Polynomial(degree, c)
+            Polynomial(degree, FREE_CONSTANT if degree == 1 else offset)
             for degree in sorted(_several(self.degree))
-            for c in ([FREE_CONSTANT] if degree == 1 else offsets)
         )
 
-    def group(self, recording: RecordingId) -> str:
-        """The validation group of a recording."""
-        if self.group_by == "material":
-            return recording.material
-        return str(recording.cycle % CYCLE_GROUPS)
+    def _statistics(self, pool: FeaturePool) -> BinSample:
+        return BinSample(self.sample_bins)
 
-    def stratum(self, recording: RecordingId) -> str:
-        """What a recording is sampled with: its group and, if scenes are weighed, its scene."""
-        group = self.group(recording)
-        return f"{group}{_SCENE}{recording.scene}" if self.scene_weights else group
+    def _weighted(self, plan: _Plan, bins: RecordingBins) -> tuple[Tensor, Tensor, Tensor]:
+        selection, is_slip = plan.selection, bins.is_slip
+        z, of_class = selection(bins.features), torch.tensor(plan.weights[bins.scene]).double()
+        if self.drop_channels == 0 or selection.pooling is None:
+            return z, is_slip, of_class[is_slip.long()]
+        is_lost = _dropped(bins.name, len(selection.pooling.hand), self.drop_channels)
+        fewer = selection(bins.features, is_lost.expand(len(z), -1))
+        return torch.cat([z, fewer]), is_slip.repeat(2), of_class[is_slip.long()].repeat(2) / 2
+
+    def _plan(self, statistics: BinSample, pool: FeaturePool, is_nested: bool, show: bool) -> _Plan:
+        sample = statistics.bins()
+        allowed = self.allowed(pool)
+        weights = self.weights(sample)
+        table = torch.tensor([weights[scene] for scene in sample.scene_names])
+        weight = sample.weight * table.double()[sample.scene, sample.is_slip.long()]
+        candidates = CandidateBins(sample, weight, pool, allowed, self.pooling)
+        num_bins = round(float(sample.weight.sum()))
+        structures, penalties = self._structures(num_bins), self.penalties_ascending
+        if len(sample.group_names) > 1:
+            how = {"is_nested": is_nested, "show": show}
+            choice = choose_model(candidates, structures, penalties, self.tolerance, **how)
+        else:
+            choice = Choice(structures[0], penalties[len(penalties) // 2])
+            log.warning(
+                "%s, C=%g are taken unvalidated: one group", choice.structure, choice.penalty
+            )
+        selection = candidates.select(choice.structure)
+        is_pooled = selection.pooling is not None and self.drop_channels > 0
+        fraction = 1 - self.drop_channels if is_pooled else 0.5
+        return _Plan(
+            selection=selection,
+            kernel=choice.structure.kernel,
+            penalty=choice.penalty,
+            imputation=_class_mean(selection(sample.features), sample.is_slip, weight),
+            sensing=self._sensing(pool, selection, sample, fraction),
+            num_bins=num_bins,
+            sample=sample,
+            weights=weights,
+            validation=choice.rows,
+            nested=choice.nested,
+        )
+
+    def _structures(self, num_bins: int) -> list[Structure]:
+        """All structures for a machine of so many training bins, the simplest first.
+
+        Raises:
+            ValueError: if there is none.
+        """
+        sizes = sorted(_several(self.num_features), key=lambda size: (size is not None, size or 0))
+        may_grow = num_bins <= MOST_DUAL_BINS
+        found = [
+            Structure(use, size, kernel)
+            for size, kernel, use in itertools.product(sizes, self.kernels, _several(self.use))
+            if kernel.degree == 1 or may_grow or (size is not None and not self.scene_weights)
+        ]
+        if not found:
+            raise ValueError(
+                "no candidate is left: degree 2 needs recipe.num_features and no scene_weights; "
+                "add degree 1"
+            )
+        return found
+
+    def weights(self, sample: SampledBins) -> dict[str, tuple[float, float]]:
+        """The weight of each bin of a scene, non-slip and slip, with both classes balanced.
+
+        Raises:
+            ValueError: if a class is absent, or a scene is weighed that no recording is of.
+        """
+        class_counts(sample)  # refuses one that is absent
+        scenes = sample.scene_names
+        if strangers := sorted(set(self.scene_weights) - set(scenes) - {PAPER_SCENE}):
+            raise ValueError(
+                f"recipe.scene_weights names {strangers[0]!r}, of which there is no training "
+                f"recording; there is {', '.join(scenes)}"
+            )
+        totals = torch.zeros(len(scenes), 2, dtype=torch.float64)
+        totals.index_put_((sample.scene, sample.is_slip.long()), sample.weight, True)
+        weights = torch.ones_like(totals)
+        protocol = totals[scenes.index(PAPER_SCENE)] if PAPER_SCENE in scenes else 0 * totals[0]
+        for row, scene in enumerate(scenes):
+            wanted = self.scene_weights.get(scene, 0.0) * protocol / totals[row]
+            weights[row] = torch.where((wanted > 0) & wanted.isfinite(), wanted, 1.0)
+        counts = (totals * weights).sum(0)
+        weights *= counts.sum() / (2 * counts)
+        return {scene: (a, b) for scene, (a, b) in zip(scenes, weights.tolist(), strict=True)}
 
 
 @dataclass(frozen=True)
-class FeatureSelection:
-    """Which features, and how they are scaled.
+class Paper(_Recipe):
+    """The paper's: features the t-test ranks highest, min-max scaling, a polynomial kernel ELM.
+
+    Ranking and scaling take every training bin; the classes are undersampled to one size. ``C`` is
+    chosen by leaving out groups of the sample; ranking and scaling have seen them, so these scores
+    are for model selection only.
 
     Args:
-        selected: pool indices of the features that are read, best first.
-        scaler: of the columns.
-        pooling: from those features to the columns; ``None``: they are the columns.
-        silence: what tells which channels are silent, and what is known of them; they are left out
-            of their pools. ``None``: none is.
+        name: for tables.
+        penalties: the paper's ``C``; of several values validation chooses one.
+        sample_bins: bins of each group and class that ``C`` is chosen by.
+        feature_filter: as in ``General``; ``num_features`` is cut to what matches.
+        descriptors: as in ``General``.
+        min_alive: as in ``General``.
+        num_features: how many are selected.
+        degree: of the polynomial kernel, 1 or 2.
+        offset: of the polynomial kernel, its ``c``.
+
+    Raises:
+        ValueError: for an unknown name or a number out of range.
     """
 
-    selected: tuple[int, ...]
-    scaler: FeatureScaler
-    pooling: ChannelPooling | None = None
-    silence: tuple[SpanFeatures, Sensing] | None = None
+    name: str = "paper"
+    penalties: float | Sequence[float] = (0.05, 0.08, 0.1, 0.13, 0.17, 0.2, 0.25, 0.3, 1.0, 3.0)
+    num_features: int = 120
+    degree: int = PAPER_KERNEL.degree
+    offset: float = PAPER_KERNEL.offset
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_number("recipe.num_features", self.num_features, whole=True)
+        _ = self.kernel  # its own checks
 
     @property
-    def size(self) -> int:
-        """Number of columns, K."""
-        return len(self.scaler.minimum)
+    def kernel(self) -> Polynomial:
+        """The kernel."""
+        return Polynomial(self.degree, self.offset)
 
-    def __call__(self, features: Tensor, is_lost: Tensor | None = None) -> Tensor:
-        """Scaled columns in float64, ``[N, F] -> [N, K]``, without channels ``[N, C]`` or with."""
-        columns = features[:, list(self.selected)].double()
-        if self.pooling is not None:
-            if self.silence is not None:
-                spans, sensing = self.silence
-                silent = spans.is_silent(spans(features), sensing)
-                is_lost = silent if is_lost is None else silent | is_lost
-            columns = self.pooling(columns, is_lost)
-        scaled: Tensor = self.scaler(columns)
-        return scaled
+    def allowed(self, pool: FeaturePool) -> Tensor:
+        """As ``General.allowed``; refuses a pool with fewer features than are to be selected."""
+        mask = super().allowed(pool)
+        num = int(mask.sum())
+        if self.num_features > num and self.feature_filter is None:
+            raise ValueError(
+                f"recipe.num_features={self.num_features} exceeds the pool's {num}; give at most "
+                f"{num}"
+            )
+        return mask
 
-    def first(self, num: int) -> FeatureSelection:
-        """The best ``num`` columns alone."""
-        scaler = self.scaler
-        compression = None if scaler.compression is None else scaler.compression[:num]
-        scaler = FeatureScaler(scaler.minimum[:num], scaler.maximum[:num], compression)
-        if self.pooling is None:
-            return FeatureSelection(self.selected[:num], scaler)
-        place = dict(zip(self.pooling.inputs, self.selected, strict=True))
-        layer = self.pooling.select(range(min(num, self.size)))
-        selected = tuple(place[name] for name in layer.inputs)
-        return FeatureSelection(selected, scaler, layer, self.silence)
+    def _statistics(self, pool: FeaturePool) -> _Statistics:
+        return _Statistics(len(pool.names), self.sample_bins)
 
+    def _weighted(self, plan: _Plan, bins: RecordingBins) -> tuple[Tensor, Tensor, Tensor]:
+        is_slip, fractions = bins.is_slip, torch.tensor(plan.weights[PAPER_SCENE]).double()
+        kept = bin_keys(bins.name, len(is_slip)) < fractions[is_slip.long()]
+        z = plan.selection(bins.features[kept])
+        return z, is_slip[kept], torch.ones(len(z), dtype=torch.float64)
 
-def select_features(
-    recipe: Recipe, statistics: TrainingStatistics, allowed: Tensor | None = None
-) -> FeatureSelection:
-    """Rank and scale by the statistics of the training bins.
-
-    Args:
-        recipe: how.
-        statistics: the statistics.
-        allowed: what ``recipe.allowed`` gives; no more features are taken than it lets pass.
-
-    Raises:
-        ValueError: if a class is absent, the pool is smaller than the selection, or a recipe with
-            ``feature_filter`` comes without ``allowed``.
-    """
-    if recipe.feature_filter is not None and allowed is None:
-        raise ValueError("recipe.feature_filter needs the names of features; hand over the pool")
-    sample, most = statistics.sample.bins(), recipe.sizes[-1]
-    scores, features = t_scores(statistics.moments, recipe.score_variance), sample.features
-    places = torch.arange(len(scores))
-    if allowed is not None:
-        places = allowed.nonzero().flatten()
-        scores, features, most = scores[places], features[:, places], min(most, len(places))
-    order = rank_distinct(scores, features, sample.is_slip, most, recipe.most_correlation)
-    return scaled_selection(recipe, statistics, places[order].tolist())
-
-
-def scaled_selection(
-    recipe: Recipe, statistics: TrainingStatistics, selected: Sequence[int]
-) -> FeatureSelection:
-    """Scale these features by the statistics of the training bins."""
-    index = list(selected)
-    if recipe.compress or recipe.tail > 0:
-        chosen = statistics.sample.bins().features[:, index].double()
-        scaler = FeatureScaler.fit(chosen, compress=recipe.compress, tail=recipe.tail)
-    else:  # the exact range of every training bin
-        scaler = FeatureScaler(
-            statistics.minimum[index].double(), statistics.maximum[index].double()
+    def _plan(
+        self, statistics: _Statistics, pool: FeaturePool, is_nested: bool, show: bool
+    ) -> _Plan:
+        sample = statistics.sample.bins()
+        counts = class_counts(sample)
+        fractions = min(counts) / counts[0], min(counts) / counts[1]
+        weight = sample.weight * torch.tensor(fractions).double()[sample.is_slip.long()]
+        places = self.allowed(pool).nonzero()[:, 0]
+        size = min(self.num_features, len(places))
+        if size < self.num_features:
+            log.warning(
+                "recipe.num_features=%d is cut to %d: no more match", self.num_features, size
+            )
+        best = places[rank_features(t_scores(statistics.moments)[places], size)].tolist()
+        scaler = FeatureScaler(statistics.minimum[best].double(), statistics.maximum[best].double())
+        selection = FeatureSelection(tuple(best), scaler)
+        z = selection(sample.features)
+        penalty, rows = self._penalty(TrainingBins(z, sample.is_slip, weight), sample, show)
+        return _Plan(
+            selection=selection,
+            kernel=self.kernel,
+            penalty=penalty,
+            imputation=_class_mean(z, sample.is_slip, weight),
+            sensing=self._sensing(pool, selection, sample, 0.5),
+            num_bins=2 * min(counts),
+            sample=sample,
+            weights={PAPER_SCENE: fractions},
+            validation=rows,
         )
-    return FeatureSelection(tuple(selected), scaler)
+
+    def _penalty(
+        self, bins: TrainingBins, sample: SampledBins, show: bool
+    ) -> tuple[float, list[dict[str, Any]]]:
+        """The penalty of the best mean balanced accuracy on left-out groups; a row for each."""
+        penalties = self.penalties_ascending
+        if len(penalties) == 1:
+            return penalties[0], []
+        if len(sample.group_names) < 2:
+            middle = penalties[len(penalties) // 2]
+            log.warning("C=%g is taken unvalidated: one group", middle)
+            return middle, []
+        rows, machine = [], HeldOut(bins, sample.group, self.kernel)
+        for penalty in bar(penalties, "choose C on held-out groups", show=show):
+            scores = machine.at(penalty).scores
+            by_group = {
+                name: balanced_accuracy(scores[mine] >= 0, bins.is_slip[mine])
+                for index, name in enumerate(sample.group_names)
+                for mine in [sample.group == index]
+            }
+            known = [value for value in by_group.values() if value is not None]
+            if not known:
+                raise ValueError(
+                    "no validation group has bins of both classes; add recordings, or give one "
+                    "value of recipe.penalties"
+                )
+            rows.append(
+                {
+                    "num_features": bins.features.shape[1],
+                    "kernel": self.kernel.to_dict(),
+                    "penalty": penalty,
+                    "mean": sum(known) / len(known),
+                    "balanced_accuracy": by_group,
+                    "calibration": platt_or_none(scores, bins.is_slip, bins.weights),
+                }
+            )
+        best = max(rows, key=lambda row: float(row["mean"]))
+        best["chosen"] = True
+        return best["penalty"], rows
 
 
-def recalls(says_slip: Tensor, is_slip: Tensor, weights: Tensor | None = None) -> list[float]:
-    """Recall of non-slip and of slip, of decisions and truths ``[N]``; absent classes left out."""
-    is_right = says_slip == is_slip
-    weights = torch.ones(len(is_slip), dtype=torch.float64) if weights is None else weights
-    return [
-        float(weights[mine & is_right].sum() / weights[mine].sum())
-        for mine in (~is_slip, is_slip)
-        if bool(mine.any())
-    ]
+Recipe = General | Paper
+"""How a detector is made."""
 
 
-def balanced_accuracy(
-    says_slip: Tensor, is_slip: Tensor, weights: Tensor | None = None
-) -> float | None:
-    """Mean recall of both classes, of decisions and truths ``[N]``; ``None`` if one is absent."""
-    found = recalls(says_slip, is_slip, weights)
-    return sum(found) / 2 if len(found) == 2 else None
-
-
-@dataclass(frozen=True)
-class FeatureThreshold:
-    """Says slip where ``sign * feature > sign * threshold``.
-
-    Args:
-        index: position of the feature.
-        threshold: in the feature's unit.
-        sign: +1 if slip has the larger values, -1 otherwise.
-    """
-
-    index: int
-    threshold: float
-    sign: int
-
-    def __call__(self, features: Tensor) -> Tensor:
-        """Decisions: ``[*, K] -> [*]``, bool."""
-        decision: Tensor = self.sign * features[..., self.index] > self.sign * self.threshold
-        return decision
-
-
-def best_threshold(
-    features: Tensor, is_slip: Tensor, weights: Tensor | None = None
-) -> FeatureThreshold:
-    """The single feature and threshold of the best balanced accuracy on training bins.
-
-    Shape:
-        - features: ``[N, K]``, finite; is_slip: ``[N]``, bool
-        - weights: ``[N]``, of each bin; 1 by default
-
-    Raises:
-        ValueError: if a class is absent.
-    """
-    check_classes(is_slip)
-    weights = torch.ones(len(is_slip), dtype=torch.float64) if weights is None else weights
-    slip, quiet = weights * is_slip, weights * ~is_slip
-    step = slip / slip.sum() - quiet / quiet.sum()
-    values, order = features.sort(dim=0)
-    below = step[order].cumsum(0)[:-1]  # slip recall minus non-slip recall if cut above this value
-    below = torch.where(values[1:] > values[:-1], below, 0.0)  # no cut between equal values
-    best = below.abs().flatten().argmax()
-    row, index = divmod(int(best), features.shape[1])
-    sign = -1 if below[row, index] > 0 else 1
-    lower, upper = float(values[row, index]), float(values[row + 1, index])
-    threshold = lower + (upper - lower) / 2
-    if threshold in (lower, upper):  # neighbouring floats: the side that is not slip
-        threshold = lower if sign > 0 else upper
-    return FeatureThreshold(index, threshold, sign)
-
-
-def has_both_classes(is_slip: Tensor) -> bool:
-    """Whether bins ``[N]`` are of slip and of non-slip."""
-    return bool(is_slip.any()) and not bool(is_slip.all())
-
-
-def check_classes(is_slip: Tensor) -> None:
-    """Refuse bins ``[N]`` of one class.
-
-    Raises:
-        ValueError: if they are.
-    """
-    if not has_both_classes(is_slip):
-        raise ValueError("baselines need training bins of both classes; got only one")
-
-
-def _class_counts(sample: SampledBins) -> list[int]:
+def class_counts(sample: SampledBins) -> list[int]:
     """How many training bins of non-slip and of slip a sample was drawn from.
 
     Raises:
         ValueError: if there is none of a class.
     """
-    counts = [
-        round(float(sample.sample_weight[mine].sum())) for mine in (~sample.is_slip, sample.is_slip)
-    ]
+    counts = [round(float(sample.weight[mine].sum())) for mine in (~sample.is_slip, sample.is_slip)]
     for name, count in zip(("non-slip", "slip"), counts, strict=True):
         if not count:
             raise ValueError(f"training needs bins of both classes, got no {name} bin")
     return counts
 
 
-def number_of_bins(recipe: Recipe, sample: SampledBins) -> int:
-    """How many training bins there are, classes balanced."""
-    counts, fractions = _class_counts(sample), class_fractions(recipe, sample)
-    return round(counts[0] * fractions[0] + counts[1] * fractions[1])
+class _Statistics:
+    """Moments, ranges and a sample of training bins."""
+
+    def __init__(self, num_features: int, sample_bins: int) -> None:
+        self.moments = ClassMoments(num_features)
+        self.minimum = torch.full((num_features,), torch.inf)
+        self.maximum = -self.minimum
+        self.sample = BinSample(sample_bins)
+
+    def update(self, bins: RecordingBins) -> None:
+        """Add a recording."""
+        try:
+            self.moments.update(bins.features, bins.is_slip)
+        except ValueError as error:
+            raise ValueError(f"recording {bins.name!r}: {error}") from None
+        self.sample.update(bins)
+        if len(bins.features):
+            self._widen(bins.features.amin(0), bins.features.amax(0))
+
+    def merge(self, other: _Statistics) -> None:
+        """Add the recordings of another process."""
+        self.moments.merge(other.moments)
+        self.sample.merge(other.sample)
+        self._widen(other.minimum, other.maximum)
+
+    def _widen(self, minimum: Tensor, maximum: Tensor) -> None:
+        # which of 0 and -0 is taken depends on their order; adding 0 leaves 0 alone
+        self.minimum = torch.minimum(self.minimum, minimum) + 0.0
+        self.maximum = torch.maximum(self.maximum, maximum) + 0.0
 
 
-def class_fractions(recipe: Recipe, sample: SampledBins) -> tuple[float, float]:
-    """The part of non-slip and of slip bins that is trained on."""
-    counts = _class_counts(sample)
-    if recipe.balance != "undersample":
-        return 1.0, 1.0
-    return min(counts) / counts[0], min(counts) / counts[1]
+def _dropped(recording: str, num: int, largest: float) -> Tensor:
+    """Channels that the second copy of a recording is without, ``[num]``, bool."""
+    keys = bin_keys(f"{recording}, channels", num + 1)
+    order = keys[1:].argsort()[: math.floor(float(keys[0]) * (math.floor(largest * num) + 1))]
+    return torch.zeros(num, dtype=torch.bool).index_fill(0, order, True)
 
 
-def sample_weight(recipe: Recipe, sample: SampledBins) -> Tensor:
-    """The weight of each sampled bin, for all bins that it was drawn from, ``[n]`` float64.
-
-    Classes are balanced: under ``undersample`` by the fraction of the class that is trained on,
-    under ``weights`` by a factor, and where scenes are weighed as ``scene_weights`` says.
-
-    Raises:
-        ValueError: if a class is absent, or a scene is weighed that no recording is of.
-    """
-    by_scene = scene_weights(recipe, sample)
-    of_stratum = sample.sample_weight.new_tensor(
-        [by_scene[_scene(name)] for name in sample.group_names]
-    )
-    return sample.sample_weight * of_stratum[sample.group, sample.is_slip.long()]
-
-
-def scene_weights(recipe: Recipe, sample: SampledBins) -> dict[str, tuple[float, float]]:
-    """The weight of each bin of a scene, non-slip and slip, with both classes balanced.
-
-    Raises:
-        ValueError: if a class is absent, or a scene is weighed that no recording is of.
-    """
-    scenes = list(dict.fromkeys(map(_scene, sample.group_names)))
-    if strangers := sorted(set(recipe.scene_weights) - set(scenes) - {PAPER_SCENE}):
-        raise ValueError(
-            f"recipe.scene_weights names {strangers[0]!r}, of which there is no training recording;"
-            f" there is {', '.join(scenes)}"
-        )
-    place = torch.tensor([scenes.index(_scene(name)) for name in sample.group_names])
-    totals = torch.zeros(len(scenes), 2, dtype=torch.float64)
-    totals.index_put_((place[sample.group], sample.is_slip.long()), sample.sample_weight, True)
-    weights = torch.ones_like(totals)
-    protocol = totals[scenes.index(PAPER_SCENE)] if PAPER_SCENE in scenes else 0 * totals[0]
-    for row, scene in enumerate(scenes):
-        wanted = recipe.scene_weights.get(scene, 0.0) * protocol / totals[row]
-        weights[row] = torch.where((wanted > 0) & wanted.isfinite(), wanted, 1.0)
-    counts = (totals * weights).sum(0)
-    _class_counts(sample)  # refuses one that is absent
-    weights *= weights.new_tensor(_balance(recipe, counts.tolist()))
-    return {scene: (own[0], own[1]) for scene, own in zip(scenes, weights.tolist(), strict=True)}
-
-
-def _balance(recipe: Recipe, counts: Sequence[float]) -> list[float]:
-    """The factor of the weights of non-slip and of slip bins."""
-    if recipe.balance == "undersample":
-        return [min(counts) / count for count in counts]
-    return [sum(counts) / (2 * count) for count in counts]
-
-
-def _scene(stratum: str) -> str:
-    return stratum.split(_SCENE)[-1]
-
-
-def sample_groups(sample: SampledBins) -> tuple[Tensor, tuple[str, ...]]:
-    """The validation group of sampled bins, ``[n]``, all scenes together, and names of groups."""
-    of_stratum = [name.split(_SCENE)[0] for name in sample.group_names]
-    names = tuple(dict.fromkeys(of_stratum))
-    index = torch.tensor([names.index(name) for name in of_stratum], dtype=torch.int64)
-    return index[sample.group], names
-
-
-def _all_pass(values: Any, is_right: Callable[[float], bool], *, may_be_none: bool) -> bool:
-    """Whether the numbers of a setting, at least one but of a mapping, are such."""
-    passed = [
-        (may_be_none and x is None) or (isinstance(x, Real) and is_right(float(x)))
-        for x in (values.values() if isinstance(values, Mapping) else values)
-    ]
-    return all(passed) and (bool(passed) or isinstance(values, Mapping))
+def _class_mean(z: Tensor, is_slip: Tensor, weight: Tensor) -> Tensor:
+    """Mean of columns, both classes counting alike, ``[N, K] -> [K]``."""
+    means = [weight[mine] @ z[mine] / weight[mine].sum() for mine in (is_slip, ~is_slip)]
+    return (means[0] + means[1]) / 2
 
 
 def _several(value: Any) -> tuple[Any, ...]:
     is_several = isinstance(value, Sequence) and not isinstance(value, str)
     return tuple(value) if is_several else (value,)
+
+
+def _numbers(name: str, value: Any) -> list[float]:
+    """A number or several.
+
+    Raises:
+        ValueError: for what is none.
+    """
+    for each in _several(value):
+        if not isinstance(each, Real) or isinstance(each, bool):
+            raise ValueError(f"{name} must be a number, got {each!r}")
+    return [float(each) for each in _several(value)]
+
+
+# Processes of a distributed fit ------------------------------------------------------------------
+
+
+def _num_processes() -> int:
+    ready = torch.distributed.is_available() and torch.distributed.is_initialized()
+    return torch.distributed.get_world_size() if ready else 1
+
+
+def gathered(own: Value) -> list[Value]:
+    """The value of every process, in the order of their ranks."""
+    values: list[Any] = [own] * _num_processes()
+    if len(values) > 1:
+        torch.distributed.all_gather_object(values, own)
+    return values
+
+
+def _merged(own: Any) -> Any:
+    """What every process holds, put together in the order of their ranks."""
+    values = gathered(own)
+    for other in values[1:]:
+        values[0].merge(other)
+    return values[0]
+
+
+def from_first_process(make: Callable[[], Value]) -> Value:
+    """What the first process makes, in every process; its error as well, so that none waits."""
+    if _num_processes() == 1:
+        return make()
+    box: list[Any] = [None, None]
+    if torch.distributed.get_rank() == 0:
+        try:
+            box[0] = make()
+        except Exception as error:
+            box[1] = error
+    torch.distributed.broadcast_object_list(box)
+    if box[1] is not None:
+        raise box[1]
+    made: Value = box[0]
+    return made

@@ -44,7 +44,6 @@ KEYS = {
     "materials": "data.materials",
     "num_features": "recipe.num_features",
     "penalties": "recipe.penalties",
-    "resume": "ckpt_path",
     "root": "data.root",
     "root_of_data": "root",
     "source_of_stream": "source",
@@ -74,13 +73,12 @@ def _written(value: object) -> str:
 
 DETECTOR = "detector.pt"
 METRICS = "metrics.json"
-CHECKPOINT = "last.ckpt"
 BIN_GRAPH = "model.onnx"
 STREAM_GRAPH = "stream.onnx"
 ONSETS = ("onsets.json", "onsets.csv")
 MANIFEST = "manifest.csv"
 DECISIONS = "{}_decisions.csv"
-RUN_FILES = (DETECTOR, METRICS, CHECKPOINT, "config.yaml", "confusion.png", "selected_features.png")
+RUN_FILES = (DETECTOR, METRICS, "config.yaml", "confusion.png", "selected_features.png")
 CONVERT = "convert"
 UNSEEN_EXPERIMENT, REAL_EXPERIMENT = "unseen4", "biotacsp_dos"
 

@@ -1,17 +1,12 @@
-"""What a fit may depend on, and how it goes on after a kill."""
-
-import contextlib
-import os
-import signal
+"""What a fit may depend on."""
 
 import pytest
 import torch
 
 from . import names
-from .names import settings
 from .recordings import HELD_OUT as HELD_OUT_MATERIALS
 from .recordings import SEEN, TRIALS, bins_of, samples_of, write_set
-from .running import train, wait_for
+from .running import train
 
 
 def scores_of(detector):
@@ -61,26 +56,3 @@ def test_a_training_recording_does_change_the_fit(paper, with_other_recordings):
     """So that the test above would notice a leak."""
     other = with_other_recordings(paper, {min(trained_on(paper.detector))})
     assert (scores_of(other.detector) - scores_of(paper.detector)).abs().max() > 1e-6
-
-
-# Going on after a kill ---------------------------------------------------------------------------
-
-
-def test_a_killed_run_goes_on_behind_its_last_pass(command, paper, tmp_path):
-    """Killed once the first pass is written; what is made then is the detector of a whole run."""
-    overrides = paper.overrides
-    for attempt in ("1", "2", "3"):  # on a busy machine a run may end first
-        run = tmp_path / attempt / "run"
-        pid = command.start(tmp_path / attempt, "train", *overrides, *settings(folder="run"))
-        wait_for(run / names.CHECKPOINT)
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
-        if command.wait().status == -signal.SIGKILL and not (run / names.DETECTOR).exists():
-            break
-    assert not (run / names.DETECTOR).exists()
-    resumed = train(command, tmp_path / "again", overrides, resume=run)
-    torch.testing.assert_close(
-        scores_of(resumed.detector), scores_of(paper.detector), rtol=1e-12, atol=1e-12
-    )
-    for name, scores in paper.metrics[names.SPLITS].items():
-        assert resumed.metrics[names.SPLITS][name][names.CONFUSION] == scores[names.CONFUSION], name

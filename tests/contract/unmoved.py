@@ -25,7 +25,7 @@ MOST_MOVED = 2
 EXPERIMENTS = {
     "paper": settings(experiment=UNSEEN_EXPERIMENT, recipe="paper", seed=0),
     "default": settings(experiment=UNSEEN_EXPERIMENT, seed=0),
-    "real": settings(experiment=REAL_EXPERIMENT, recipe="robust", root=REAL_DATA, seed=0),
+    "real": settings(experiment=REAL_EXPERIMENT, root=REAL_DATA, seed=0),
 }
 
 

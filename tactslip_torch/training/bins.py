@@ -1,0 +1,172 @@
+"""Labelled bins of recordings, and a bounded random sample that any worker would have drawn.
+
+A bin's key is a hash of its recording and number. The sample of a stratum (group, scene and class)
+is the bins of smallest key, so it depends neither on their order nor on who saw them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.data.splits import PAPER_SCENE
+
+
+@dataclass(frozen=True)
+class RecordingBins:
+    """Labelled bins of one recording.
+
+    Args:
+        name: of the recording.
+        group: that validation leaves out as a whole, such as its material.
+        features: of the bins, finite.
+        is_slip: which they are.
+        scene: of the recording.
+        longest_run: most equal samples in a row of a channel that moves; ``None``: not known.
+
+    Shape:
+        - features: ``[N, F]``; is_slip: ``[N]``, bool
+    """
+
+    name: str
+    group: str
+    features: Tensor
+    is_slip: Tensor
+    scene: str = PAPER_SCENE
+    longest_run: int | None = None
+
+
+@dataclass(frozen=True)
+class SampledBins:
+    """Bins of a sample, by recording and then by number.
+
+    Attributes:
+        features: ``[n, F]``.
+        is_slip: ``[n]``, bool.
+        group: ``[n]``, index into ``group_names``.
+        group_names: ascending.
+        scene: ``[n]``, index into ``scene_names``.
+        scene_names: ascending.
+        weight: ``[n]``, float64, for how many bins of its stratum each stands.
+        longest_run: most equal samples in a row, of all recordings; ``None``: not known.
+    """
+
+    features: Tensor
+    is_slip: Tensor
+    group: Tensor
+    group_names: tuple[str, ...]
+    scene: Tensor
+    scene_names: tuple[str, ...]
+    weight: Tensor
+    longest_run: int | None = None
+
+    @property
+    def stratum(self) -> Tensor:
+        """Group, scene and class of each bin as one number, ``[n]``."""
+        return 2 * (self.group * len(self.scene_names) + self.scene) + self.is_slip.long()
+
+
+class _Stratum(NamedTuple):
+    """Bins of one stratum: how many there were, and those of smallest key, ascending."""
+
+    num_seen: int
+    places: list[tuple[float, str, int]]  # key, recording, bin
+    features: Tensor  # [len(places), F]
+
+
+class BinSample:
+    """At most so many bins of every group, scene and class, drawn by ``bin_keys``.
+
+    Args:
+        most: bins kept of each stratum.
+
+    Raises:
+        ValueError: if ``most`` is negative.
+    """
+
+    def __init__(self, most: int) -> None:
+        if most < 0:
+            raise ValueError(f"a sample keeps 0 bins or more of a group and class, got {most}")
+        self.most = most
+        self._longest_run: int | None = None
+        self._strata: dict[tuple[str, str, bool], _Stratum] = {}
+
+    def update(self, bins: RecordingBins) -> None:
+        """Add the bins of a recording, all at once and once only (that is not checked)."""
+        self._add_run(bins.longest_run)
+        keys = bin_keys(bins.name, len(bins.is_slip))
+        for label in (False, True):
+            rows = (bins.is_slip == label).nonzero()[:, 0]
+            kept = rows[keys[rows].argsort()[: self.most]]
+            places = [(float(keys[row]), bins.name, row) for row in kept.tolist()]
+            if len(rows):
+                stratum = bins.group, bins.scene, label
+                self._add(stratum, _Stratum(len(rows), places, bins.features[kept]))
+
+    def merge(self, other: BinSample) -> None:
+        """Add the bins of another sample of that size; of other recordings (not checked)."""
+        self._add_run(other._longest_run)
+        for name, part in other._strata.items():
+            self._add(name, part)
+
+    def bins(self) -> SampledBins:
+        """The sample, in an order that depends on the bins alone.
+
+        Raises:
+            ValueError: if there is no bin.
+        """
+        if not self._strata:
+            raise ValueError("training needs bins of both classes, got none; add recordings")
+        strata = sorted(self._strata.items())
+        rows = [
+            (recording, index, group, scene, label, part.num_seen / len(part.places))
+            for (group, scene, label), part in strata
+            for _, recording, index in part.places
+        ]
+        order = sorted(range(len(rows)), key=rows.__getitem__)
+        _, _, of_group, of_scene, is_slip, weight = zip(*(rows[i] for i in order), strict=True)
+        groups, scenes = sorted(set(of_group)), sorted(set(of_scene))
+        return SampledBins(
+            features=torch.cat([part.features for _, part in strata])[order],
+            is_slip=torch.tensor(is_slip),
+            group=torch.tensor([groups.index(name) for name in of_group]),
+            group_names=tuple(groups),
+            scene=torch.tensor([scenes.index(name) for name in of_scene]),
+            scene_names=tuple(scenes),
+            weight=torch.tensor(weight, dtype=torch.float64),
+            longest_run=self._longest_run,
+        )
+
+    def _add_run(self, longest_run: int | None) -> None:
+        runs = [run for run in (self._longest_run, longest_run) if run is not None]
+        self._longest_run = max(runs, default=None)
+
+    def _add(self, name: tuple[str, str, bool], part: _Stratum) -> None:
+        if name in self._strata:
+            own = self._strata[name]
+            part = _Stratum(
+                own.num_seen + part.num_seen,
+                own.places + part.places,
+                torch.cat([own.features, part.features]),
+            )
+        order = sorted(range(len(part.places)), key=part.places.__getitem__)[: self.most]
+        places = [part.places[i] for i in order]
+        self._strata[name] = _Stratum(part.num_seen, places, part.features[order])
+
+
+def bin_keys(recording: str, num_bins: int) -> Tensor:
+    """Numbers uniform in [0, 1) that the bins of a recording carry for good, ``[N]``, float64.
+
+    The smaller, the sooner a bin is in a ``BinSample``.
+    """
+    keys = [
+        int.from_bytes(
+            hashlib.blake2b(f"{recording}:{row}".encode(), digest_size=8).digest(), "big"
+        )
+        for row in range(num_bins)
+    ]
+    return torch.tensor([key >> 11 for key in keys], dtype=torch.float64) * 2.0**-53

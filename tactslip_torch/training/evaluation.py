@@ -1,0 +1,214 @@
+"""From decisions on labelled bins to scores and events, and from several folds to one result.
+
+Bins of a stroke in their order are a short stream: a rule makes alarms of the decisions, and these
+find a slip or do not. The detector was not made for these rules; they show what its errors would
+mean in use.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tactslip_torch.data.labels import NO_POSITION
+from tactslip_torch.onset.events import (
+    EventRecord,
+    EventRules,
+    LatencyParts,
+    RecordingEvents,
+    first_releases,
+    pooled_metrics,
+    recording_events,
+)
+from tactslip_torch.report.metrics import (
+    bin_metrics,
+    confusion_matrix,
+    merged_metrics,
+    split_metrics,
+    summed_metrics,
+)
+from tactslip_torch.training.datamodule import RecordingFeatures
+
+RULES: Mapping[str, tuple[int, int]] = MappingProxyType(
+    {"first_transition": (1, 1), "two_of_three": (2, 3)}
+)
+"""From decisions to alarms, each k of the last n: the paper's, every first slip bin after a
+non-slip one, and two of three. Either is armed again by a decision for which it does not hold."""
+
+BINS_APART = "bins of one stroke are on both sides of this split"
+"""Why a split by bin has no events."""
+
+
+class EvaluatedBins(NamedTuple):
+    """Decisions on bins of one recording that have one role.
+
+    Attributes:
+        bins: which they are; without features.
+        says_slip: of the detector, ``[N]``, bool.
+        baselines: decisions of baselines by name, ``[N]`` each.
+        is_whole: whether these are all bins of the recording.
+    """
+
+    bins: RecordingFeatures
+    says_slip: Tensor
+    baselines: Mapping[str, Tensor]
+    is_whole: bool
+
+
+def evaluated_bins(
+    batch: RecordingFeatures,
+    says_slip: Tensor,
+    baselines: Mapping[str, Tensor],
+) -> dict[str, EvaluatedBins]:
+    """Decisions ``[N]`` on the bins of a recording, for each role that some of them have."""
+    light = batch._replace(features=batch.features[:, :0])
+    return {
+        role: EvaluatedBins(
+            light.of(mask),
+            says_slip[mask],
+            {name: decisions[mask] for name, decisions in baselines.items()},
+            bool(mask.all()),
+        )
+        for role, mask in batch.roles.items()
+        if bool(mask.any())
+    }
+
+
+def bin_scores(parts: Sequence[EvaluatedBins]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """``bin_metrics`` of the detector, and ``split_metrics`` of each baseline, on all bins."""
+    truth = torch.cat([part.bins.is_slip for part in parts])
+    places = torch.cat([part.bins.position for part in parts]).tolist()
+    scores = bin_metrics(
+        truth,
+        torch.cat([part.says_slip for part in parts]),
+        [part.bins.recording.material for part in parts for _ in part.says_slip],
+        torch.cat([part.bins.speed_mm_s for part in parts]).tolist(),
+        [part.bins.recording.scene for part in parts for _ in part.says_slip],
+        [None if place == NO_POSITION else place for place in places],
+    )
+    return scores, {
+        name: split_metrics(
+            confusion_matrix(truth, torch.cat([part.baselines[name] for part in parts]))
+        )
+        for name in parts[0].baselines
+    }
+
+
+def events_by_rule(
+    parts: Sequence[EvaluatedBins], latency: LatencyParts
+) -> dict[str, list[RecordingEvents]]:
+    """What each of ``RULES`` makes of the bins; no recordings where a split is by bin."""
+    if not all(part.is_whole for part in parts):
+        return {name: [] for name in RULES}
+    return {
+        name: [
+            recording_events(_watched(part, k, n, latency), EventRules(), latency) for part in parts
+        ]
+        for name, (k, n) in RULES.items()
+    }
+
+
+def event_numbers(
+    events: Mapping[str, Mapping[str, Sequence[RecordingEvents]]],
+) -> dict[str, dict[str, Any]]:
+    """``pooled_metrics`` by role and rule; of no recordings with the ``reason``, all None."""
+    return {
+        role: {
+            name: pooled_metrics(own) | ({} if own else {"reason": BINS_APART})
+            for name, own in by_rule.items()
+        }
+        for role, by_rule in events.items()
+    }
+
+
+def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> EventRecord:
+    """A recording as the detector saw it through an alarm of k of the last n decisions.
+
+    It starts anew with every stroke and every unbroken stretch of bins of no stroke, whatever order
+    their labels put them in. Watched is from one hop before the first decision of such a stretch to
+    the last one.
+    """
+    bins, times = part.bins, part.bins.times
+    order = np.lexsort((bins.ends_s.numpy(), bins.stroke.numpy() < 0))
+    available_s = (bins.ends_s + latency.look_ahead_s).numpy()[order]
+    says_slip, stroke = part.says_slip.numpy()[order], bins.stroke.numpy()[order]
+    is_apart = np.diff(available_s) > bins.hop_s + 1e-6
+    is_new = (np.diff(stroke) != 0) | ((stroke[1:] < 0) & is_apart)
+    stretches = np.split(np.arange(len(stroke)), np.flatnonzero(is_new) + 1)
+    alarms: list[tuple[float, float]] = []
+    seen: list[tuple[float, float]] = []
+    for rows in sorted(stretches, key=lambda rows: float(available_s[rows[0]])):
+        hops_s = available_s[rows]
+        is_on = np.convolve(says_slip[rows], np.ones(n))[: len(rows)] > k - 0.5
+        raised = np.flatnonzero(is_on & ~np.append(False, is_on[:-1]))
+        off = np.append(np.flatnonzero(~is_on), len(rows))
+        ends = np.append(hops_s, math.inf)[off[np.searchsorted(off, raised)]]
+        alarms += zip(hops_s[raised].tolist(), ends.tolist(), strict=True)
+        before = seen[-1][1] if seen else -math.inf  # a hop may be longer than a bin
+        seen.append((max(float(hops_s[0]) - bins.hop_s, before), float(hops_s[-1])))
+    first = []
+    for number, release_s in enumerate(first_releases(times.onsets_s, times.released_s)):
+        is_later = says_slip & (stroke == number) & (available_s >= release_s)
+        first.append(next(iter(available_s[is_later].tolist()), math.nan))
+    return EventRecord(
+        recording=str(bins.recording),
+        material=bins.recording.material,
+        scene=bins.recording.scene,
+        duration_s=seen[-1][1],
+        alarms_s=tuple(alarm for alarm, _ in alarms),
+        onset_estimates_s=(),
+        onsets_s=times.onsets_s,
+        sliding_s=tuple(
+            (o, end) for o, (_, end) in zip(times.onsets_s, times.sliding_s, strict=True)
+        ),
+        speeds_mm_s=times.speeds_mm_s,
+        first_positive_s=tuple(first),
+        watched_s=tuple(seen),
+        alarm_ends_s=tuple(end for _, end in alarms),
+        released_s=times.released_s,
+    )
+
+
+def merged_results(
+    folds: Mapping[str, Mapping[str, Any]],
+    recording_events: Mapping[str, Mapping[str, Mapping[str, Sequence[RecordingEvents]]]],
+    *,
+    by_fold: bool = False,
+) -> dict[str, Any]:
+    """Splits, baselines and events of several tests as of one, by role.
+
+    Args:
+        folds: of each its ``metrics`` as ``SlipLearner`` has them.
+        recording_events: of each its ``events`` as ``SlipLearner`` has them.
+        by_fold: whether folds have the same bins, which then are not summed: results have each role
+            of each fold, such as ``"protocol/unseen"``.
+    """
+    splits = defaultdict[str, list[Any]](list)
+    baselines, events = (defaultdict[str, Any](lambda: defaultdict(list)) for _ in range(2))
+    for fold, found in folds.items():
+        before = f"{fold}/" if by_fold else ""
+        for role, scores in found["splits"].items():
+            splits[before + role].append(scores)
+        for name, baseline in found["baselines"].items():
+            for role, scores in baseline["splits"].items():
+                baselines[name][before + role].append(scores)
+        for role, by_rule in recording_events[fold].items():
+            for name, recordings in by_rule.items():
+                events[before + role][name] += list(recordings)
+    summed = {
+        name: {"splits": {role: summed_metrics(own) for role, own in by_role.items()}}
+        for name, by_role in baselines.items()
+    }
+    only = next(iter(folds.values()))["baselines"] if len(folds) == 1 else None
+    return {
+        "splits": {role: merged_metrics(scores) for role, scores in splits.items()},
+        "baselines": summed if only is None else only,  # what they are is told of one fold alone
+        "events": event_numbers(events),
+    }
