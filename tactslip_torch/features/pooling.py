@@ -1,8 +1,6 @@
 """Pooling over channels: statistics of each descriptor over all channels of a kind.
 
-Which finger touches what changes with every grasp, so a feature of one channel does not carry over
-to another material or mounting. Its mean and spread over the channels of a kind do. One layer over
-features that any backend has made, before scaling and head:
+One layer over features that any backend has made, before scaling and head:
 
     y_c = k sign(x_c) log(1 + |x_c| / k),    pooled = statistic of y_c over the channels c in use
 

@@ -1,14 +1,14 @@
-"""Fast evidence of a slip's beginning, a column vector every few milliseconds, and its classifier.
+"""Evidence that a slip begins, every few milliseconds, and the classifier on it.
 
 - *fast channels*: power of four band filters over 10, 25 and 50 ms, as a log ratio to the channel's
-  noise floor, the mean of the log power over the last second;
+  mean log power over the last second;
 - *slow channels*: steps between means of neighbouring stretches of 10 to 100 ms, their size and,
-  with their sign, how far they exceed the usual step;
+  with their sign, how far they exceed the channel's noise;
 - each as mean, largest and smallest over the channels of its kind.
 
-Three filters are differences of neighbouring means (Haar wavelets); the fourth first takes away the
-mean of the last periods of the mains (a comb). The classifier is a kernel machine of degree 2 whose
-score is averaged over three hops. All is causal; the first second of a stream has no evidence.
+Three filters are differences of neighbouring means (Haar wavelets); the fourth first subtracts the
+mean of the last periods of the mains, a comb. The classifier is the kernel machine of degree 2,
+averaged over three hops. All is causal; the first second of a stream has no evidence.
 """
 
 from __future__ import annotations

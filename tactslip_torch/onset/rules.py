@@ -1,9 +1,8 @@
-"""Sequential rules, the latch that makes alarms of their statistic, and thresholds for it.
+"""Sequential rules: log likelihood ratios of decisions in, one statistic per decision, alarms out.
 
-Rules take log likelihood ratios of decisions and give a statistic; they are causal, with a state of
-fixed size. A *budget* is a rate of false alarms an hour of a kind of recording, or a share of its
-knocks, to hold with a stated confidence. The most sensitive threshold within it is found by
-counting alarms of the latch on whole recordings, as neighbouring decisions are correlated.
+Every rule is causal, keeps a state of fixed size, and makes the same statistic whatever pieces a
+stream comes in. An alarm is raised where the statistic reaches a threshold, stands until the
+statistic has been low for a while, and only then may the next one come (``latch``).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Fits the onset classifier: hops in which a slip begins against all that is no beginning.
+"""Fits the onset classifier: hops in which a slip begins against all others.
 
-Negatives are holding, handling (taps, grips, the carrying arm), machines, mains, the moment before
-an onset, and steady sliding. Each of these, of each scene, weighs alike, and so do onsets of each
-scene. Hard negatives of a first pass, fitted on some recordings, get their own class weight.
+Negatives are holding, handling, machines, mains, the moment before an onset, and steady sliding;
+each kind of each scene weighs alike, and so do onsets of each scene. Hard negatives of the first
+pass get their own class weight in the second.
 """
 
 from __future__ import annotations
