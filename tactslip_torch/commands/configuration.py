@@ -72,7 +72,9 @@ def conf_dir() -> Path:
 @cache
 def presets() -> Mapping[str, Mapping[str, Any]]:
     """Options of groups that are no files of their own, ``conf/scenes.yaml``; registered once."""
-    groups: dict[str, dict[str, Any]] = yaml.safe_load((conf_dir() / "scenes.yaml").read_text())
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    text = (conf_dir() / "scenes.yaml").read_text(encoding="utf-8")
+    groups: dict[str, dict[str, Any]] = yaml.load(text, loader)
     for group, options in groups.items():
         for name, node in options.items():
             ConfigStore.instance().store(name, node, group)
