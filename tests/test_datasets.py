@@ -507,7 +507,7 @@ def test_a_rate_that_nobody_says_is_asked_for(tmp_path):
     manifest(tmp_path, "a.csv,wood,0,,,")
     said = r"no rate and has no times; give reading\.sample_rate_hz"
     refused(said, tmp_path, reading={"time": None})
-    manifest(tmp_path, "a.csv,wood,250", columns="file,material,sample_rate_hz")
+    manifest(tmp_path, "a.csv,wood,250.00003", columns="file,material,sample_rate_hz")
     assert FileRecordings(tmp_path, reading={"time": None}).sample_rate_hz == 250.0
     refused(r"its times are 200 Hz, but 250 Hz is stated", tmp_path)
 
