@@ -602,6 +602,7 @@ UNSAID = [
     ({"root": "../linked"}, r"n/pen9.csv: is a link out of the folder"),
     ({"pattern": "{scene}"}, r"data.pattern must name \{material\}, got"),
     ({"pattern": "{material}{thing}"}, "pattern must name each of"),
+    ({"pattern": "{trial:c}{material}1"}, "trial 'c' is no number"),
     ({"pattern": "{material}.{trial}.x"}, "no file in .* has a path that matches"),
     ({"labels": {"n": "slips"}}, "data.labels must be of slip and non-slip, got 'slips'"),
     ({"labels": {"n": "slip"}}, r"t/case1.csv: 't' is none of data.labels: n .*2 problems"),

@@ -14,15 +14,15 @@ from tactslip_torch.data.manifest import (
     Entry,
     Listing,
     Problem,
+    label_of,
     manifest_of,
     read_manifest,
     twice,
     with_manifest,
 )
-from tactslip_torch.data.recording import Label, RecordingId, Timeline
+from tactslip_torch.data.recording import RecordingId, Timeline
 from tactslip_torch.hand import HandLayout
 
-_LABELS: Mapping[str, Label] = {"slip": "slip", "non-slip": "non-slip"}
 STEMS: Mapping[str, str] = {
     "abs": "M1",
     "lb": "M2",
@@ -139,7 +139,7 @@ def _listed(
     """
     if "{material" not in pattern:
         raise ValueError(f"data.pattern must name {{material}}, got {pattern!r}")
-    if wrong := [word for word in (labels or {}).values() if word not in _LABELS]:
+    if wrong := [word for word in (labels or {}).values() if label_of(word) is None]:
         raise ValueError(f"data.labels must be of slip and non-slip, got {wrong[0]!r}")
     renamed = {old.lower(): new for old, new in rename.items()}
     entries: list[Entry] = []
@@ -152,18 +152,20 @@ def _listed(
             continue
         material = renamed.get(found["material"].lower(), found["material"])
         scene = found.get("scene", RecordingId.scene)
-        trial = int(found.get("trial", counts[material, scene]))
+        trial = found.get("trial", str(counts[material, scene]))
         counts[material, scene] += 1
         word = found.get("label", scene)
-        label = _LABELS.get((labels or _LABELS).get(word, ""))
+        label = label_of(word if labels is None else labels.get(word, ""))
         if not path.resolve().is_relative_to(root.resolve()):
             problems.append(Problem(file, "is a link out of the folder; copy it there"))
+        elif not trial.isdecimal():
+            problems.append(Problem(file, f"trial {trial!r} is no number"))
         elif labels is not None and label is None:
             known = ", ".join(labels)
             problems.append(Problem(file, f"{word!r} is none of data.labels: {known}"))
         else:
             truth = Timeline(label=label) if label else None
-            entries.append(Entry(file, file, RecordingId(material, trial, scene), truth))
+            entries.append(Entry(file, file, RecordingId(material, int(trial), scene), truth))
     if not entries and not problems:
         raise ValueError(f"no file in {root} has a path that matches data.pattern={pattern!r}")
     return Listing(tuple(entries), tuple(problems))
