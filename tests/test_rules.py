@@ -97,21 +97,6 @@ def test_any_cut_gives_the_same_bits(rule: Rule, dtype: torch.dtype, data: st.Da
         assert rule.scan_row(llr.tolist(), start, llr.numpy().dtype.type)[0] == whole.tolist()
 
 
-# ------------------------------------------------------------------------------------- gradients
-@RULE
-def test_gradients(rule: Rule, rng: np.random.Generator) -> None:
-    llr = torch.from_numpy(rng.standard_normal((2, 9)))
-    _, state = rule.scan(llr.roll(1, -1) + 0.01, rule.start(llr[:, 0]))
-    if isinstance(rule, KOfN):  # no decision counts until it is one
-        state = torch.from_numpy(rng.standard_normal(state.shape))
-    llr.requires_grad_()
-    state = state.detach().requires_grad_(bool(state.numel()))
-    if state.numel():
-        assert torch.autograd.gradcheck(rule.scan, (llr, state), eps=1e-6)
-    else:  # gradcheck takes no empty tensor
-        assert torch.autograd.gradcheck(lambda x: rule.scan(x, state)[0], (llr,), eps=1e-6)
-
-
 # ----------------------------------------------------------------------------------- as plain data
 @RULE
 def test_survives_json(rule: Rule) -> None:
@@ -196,8 +181,7 @@ def test_what_is_no_number_moves_nothing_but_the_time_since_an_alarm() -> None:
     assert latch(values, math.inf, rearm=1, refractory=0)[0] == [False, True] * 2
 
 
-# ---------------------------------------------------------------------------- the Poisson interval
-# ------------------------------------------------------------------------------------ the rate
+# Budgets -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])

@@ -481,10 +481,7 @@ class OnsetStream:
         self, x: Array, rows: Array, num_rows: int, num_lost: int, listened: Array
     ) -> tuple[Array, Array, int, int]:
         """As ``native.OnsetEngine``."""
-        evidence, num_filters = (
-            self._classifier.evidence,
-            len(self._classifier.evidence.fast_compression),
-        )
+        evidence = self._classifier.evidence
         made = evidence.blocks(torch.from_numpy(x))
         logs = (made.power.log() * 0.5).transpose(1, 2)  # [F, k, B]
         fast = listened[list(evidence.hand.fast)]
@@ -493,25 +490,18 @@ class OnsetStream:
         alive = logs.sum(-1).isfinite() & ((rises > 0.0) & made.moves | rises.isinf())  # [F, k]
         is_lost = alive.numpy()[fast].sum(0) < evidence.min_alive
         made_rows = torch.cat([logs.transpose(1, 2).flatten(0, 1), made.mean]).T.numpy()
-        score, segments = np.full(len(made_rows), math.nan), list[tuple[bool, list[int]]]()
-        for hop in range(len(made_rows)):
-            num_lost += int(is_lost[hop])
-            if is_lost[hop]:
-                continue
-            if begins_anew := num_lost > self._most_lost:
-                segments.append((begins_anew, []))
-            elif not segments:
-                segments.append((False, []))
-            segments[-1][1].append(hop)
-            num_lost = 0
-        for begins_anew, hops in segments:
-            first = 0 if begins_anew else num_rows
+        score, kept = np.full(len(made_rows), math.nan), np.flatnonzero(~is_lost)
+        lost_before = np.diff(kept, prepend=-1 - num_lost) - 1
+        num_lost = len(is_lost) + (-1 - int(kept[-1]) if len(kept) else num_lost)
+        begins_anew = np.flatnonzero(lost_before > self._most_lost)
+        for part, hops in enumerate(np.split(kept, begins_anew)):
+            first = 0 if part else num_rows
             num_rows = first + len(hops)
             rows[first:num_rows] = made_rows[hops]
             known = torch.from_numpy(rows[max(first + 1 - evidence.memory, 0) : num_rows].T)
             if (num := known.shape[-1] - evidence.memory + 1) > 0:
                 own, means = known.split([len(known) - len(made.mean), len(made.mean)])
-                power = (2.0 * own).exp().unflatten(0, (-1, num_filters))
+                power = (2.0 * own).exp().unflatten(0, (-1, made.power.shape[1]))
                 found = self._classifier.score(Blocks(power, means), torch.from_numpy(~listened))
                 score[hops[-num:]] = found.numpy()
         return score, is_lost, num_rows, num_lost

@@ -17,6 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tactslip_torch.runtime import check_share
+
 HOLD_S = 0.25
 """Lost samples in a row up to which a rule keeps its state; beyond, it begins anew."""
 
@@ -63,7 +65,6 @@ class KOfN:
             - llr, statistic: ``[*, T]``, ``T`` may be 0
             - state: ``[*, n - 1]``
         """
-        _check_state(llr, state, self.n - 1)
         if llr.shape[-1] == 0:
             return llr, state
         known = torch.cat([state, llr], dim=-1)  # [*, n - 1 + T]
@@ -129,7 +130,6 @@ class Cusum:
             - llr, statistic: ``[*, T]``, ``T`` may be 0
             - state: ``[*, 1]``
         """
-        _check_state(llr, state, 1)
         steps = self.evidence * (llr - self.drift)
         total = state[..., 0]
         statistic = []
@@ -245,14 +245,6 @@ def most_lost(window_samples: int, hold_samples: int, hop_samples: int) -> int:
     return -(-(window_samples + hold_samples) // hop_samples)
 
 
-def _check_state(llr: Tensor, state: Tensor, size: int) -> None:
-    if llr.ndim == 0 or state.shape != (*llr.shape[:-1], size):
-        raise ValueError(
-            f"expected llr [*, T] and the state [*, {size}] that start or scan gave, "
-            f"got {tuple(llr.shape)} and {tuple(state.shape)}"
-        )
-
-
 # Thresholds --------------------------------------------------------------------------------------
 
 
@@ -294,8 +286,7 @@ class Budget:
         if not (0 < self.limit < math.inf and (self.limit < 1 or not self.is_share)):
             most = "between 0 and 1" if self.is_share else "positive"
             raise ValueError(f"onset.budget of {self.scene} must be {most}, got {self.limit}")
-        if not 0 < self.confidence < 1:
-            raise ValueError(f"onset.confidence must lie between 0 and 1, got {self.confidence}")
+        check_share("onset.confidence", self.confidence)
 
     def bound(self, alarms: int, amount: float) -> float:
         """The upper confidence bound of what so many alarms in so many hours, or knocks, show.

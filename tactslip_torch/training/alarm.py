@@ -41,7 +41,6 @@ from tactslip_torch.onset.decisions import (
     Decider,
     Decisions,
     Scorer,
-    calibration_of,
     score_stream,
 )
 from tactslip_torch.onset.events import (
@@ -66,7 +65,7 @@ from tactslip_torch.onset.rules import (
 )
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.report.metrics import weights_at_share
-from tactslip_torch.runtime import bar, check_number, in_processes, one_thread
+from tactslip_torch.runtime import bar, check_number, check_share, in_processes, one_thread
 from tactslip_torch.training.onset import OnsetTraining
 
 log = logging.getLogger(__name__)
@@ -94,7 +93,6 @@ _PUSHES = 200  # timed
 _FULL_S = 2.0  # of stream, until memories are full
 _OF_BINS = 0.5  # of what a budget allows, at most, that bins alone raise
 _SETTLE_S = 0.05  # behind what a decision rests on, as EventRules.settle_s
-_FOUND = 0.95  # share of slips below which a warning names the budgets that cost them
 _LEVEL = 0.95  # of intervals
 _OTHERS = "others"  # scenes without hours of their own
 
@@ -414,8 +412,8 @@ class CalibratedAlarm:
                 )
         if self.slip_free not in self.budget:
             raise ValueError(f"onset.budget must say what {self.slip_free} may have, an hour")
-        _check_numbers(self, positive=("hop_ms",))
-        self.made_rule(self.hop_samples)  # bad numbers are refused now
+        check_number("onset.hop_ms", self.hop_ms)
+        self._settings(self.made_rule(1), Platt(1.0, 0.0), self.hop_samples)  # refuses bad numbers
 
     @property
     def hop_samples(self) -> int:
@@ -535,10 +533,8 @@ class CalibratedAlarm:
         methods = self.methods(scored["calibrate"], timings, onset)
         amounts = self._amounts({"learn": learn, **roles})
         _, settings = methods[JOINT]
-        calibrating: dict[str, list[Stream]] = {PAPER_SCENE: [], self.slip_free: []}
-        for stream in scored["calibrate"][OURS]:
-            calibrating.setdefault(stream.recording.scene, []).append(stream)
-        curve = threshold_curve(calibrating[self.slip_free], settings, timings[OURS])
+        quiet = [x for x in scored["calibrate"][OURS] if x.recording.scene == self.slip_free]
+        curve = threshold_curve(quiet, settings, timings[OURS])
         metadata = {
             **settings.metadata,
             "simulated": self.streams.is_simulated,
@@ -562,8 +558,6 @@ class CalibratedAlarm:
                 events[scene][role][name] = found
             if name == JOINT and (found := _reliability(by_scene[""], settings, timings[OURS])):
                 calibrations[f"{role} stream"] = found
-        of_paper = self._events(calibrating[PAPER_SCENE], settings, timings[OURS], None)
-        self._warn_of_costs(of_paper, settings)
         budget_rows = self._budget_rows(events, methods, roles)
         usual = events.pop("", {})
         return {
@@ -768,20 +762,6 @@ class CalibratedAlarm:
         """Decisions of an hour."""
         return 3600 * self.streams.sample_rate_hz / settings.decision_samples
 
-    def _warn_of_costs(self, numbers: Mapping[str, Any], settings: AlarmSettings) -> None:
-        """Warn where budgets leave fewer slips found than wanted, and name what costs them."""
-        share = numbers["found"] and numbers["found"]["value"]
-        if share is None or share >= _FOUND:
-            return
-        full = [row for row in settings.metadata["budget"] if row["alarms"] == row["allowed"]]
-        log.warning(
-            "%.1f %% of the slips that calibrate are found, fewer than %.0f: the budget "
-            "of %s leaves no more; allow it more alarms, or give it more hours to show its rate on",
-            100 * share,
-            100 * _FOUND,
-            ", ".join(row["scene"] for row in full) or "every scene",
-        )
-
     def _budget_rows(
         self,
         events: Mapping[str, Mapping[str, Mapping[str, Any]]],
@@ -834,7 +814,7 @@ class CalibratedAlarm:
             recording_events(event_record(*made), EventRules(), latency)
             for made in decide(streams, settings, timing)
         ]
-        return pooled_metrics(seen, level=_LEVEL)
+        return pooled_metrics(seen)
 
     def _amounts(
         self, roles: Mapping[str, Sequence[RecordingId]]
@@ -904,10 +884,12 @@ class DebouncedAlarm:
     refractory_s: float = 0.2
 
     def __post_init__(self) -> None:
-        _check_numbers(self, positive=() if self.hop_ms is None else ("hop_ms",))
+        if self.hop_ms is not None:
+            check_number("onset.hop_ms", self.hop_ms)
         for name in ("k", "n"):
             check_number(f"onset.{name}", getattr(self, name), whole=True)
-        KOfN(self.k, self.n)
+        check_share("onset.probability", self.probability)
+        self._settings(Platt(1.0, 0.0), 1)  # refuses bad numbers
 
     def hop_samples(self, sample_rate_hz: float, bin_samples: int) -> int:
         """The distance of two decisions in samples.
@@ -925,34 +907,25 @@ class DebouncedAlarm:
         Raises:
             ValueError: if training had nothing to choose, so that scores have no calibration.
         """
-        known = calibration_of(detector)
+        known = detector.calibration
         if known is None:
             raise ValueError(
                 "onset=debounced needs the calibration of held-out scores, and training chose "
                 "nothing; give several recipe.penalties"
             )
-        pool = detector.pool
-        odds, share_odds = (p / (1 - p) for p in (self.probability, self.slip_share))
+        hop = self.hop_samples(detector.pool.sample_rate_hz, detector.pool.bin_samples)
+        detector.info[KEY] = self._settings(known[0], hop).to_dict()
+
+    def _settings(self, calibration: Platt, hop_samples: int) -> AlarmSettings:
         settings = AlarmSettings(
-            hop_samples=self.hop_samples(pool.sample_rate_hz, pool.bin_samples),
-            calibration=known[0],
-            rule=KOfN(self.k, self.n),
-            threshold=math.log(odds) - math.log(share_odds),
+            hop_samples,
+            calibration,
+            KOfN(self.k, self.n),
+            threshold=0.0,
             target_per_hour=None,
             slip_share=self.slip_share,
             rearm_s=self.rearm_s,
             refractory_s=self.refractory_s,
         )
-        detector.info[KEY] = settings.to_dict()
-
-
-def _check_numbers(stage: CalibratedAlarm | DebouncedAlarm, positive: Sequence[str]) -> None:
-    """Refuse numbers that cannot be, of both stages."""
-    for name in positive:
-        check_number(f"onset.{name}", getattr(stage, name))
-    for name in ("rearm_s", "refractory_s"):
-        check_number(f"onset.{name}", getattr(stage, name), least=0)
-    for name in ("slip_share", "probability"):
-        value = getattr(stage, name, 0.5)
-        if type(value) not in (int, float) or not 0 < value < 1:
-            raise ValueError(f"onset.{name} must lie between 0 and 1, got {value!r}")
+        odds, share_odds = (p / (1 - p) for p in (self.probability, self.slip_share))
+        return replace(settings, threshold=math.log(odds) - math.log(share_odds))
