@@ -300,6 +300,18 @@ def threshold_curve(
     return points[::-1]
 
 
+def _events(
+    streams: Sequence[Stream], settings: AlarmSettings, timing: Timing, compute_s: float | None
+) -> dict[str, Any]:
+    rate = timing.sample_rate_hz
+    latency = LatencyParts(timing.look_ahead / rate, timing.bin_samples / rate, compute_s)
+    seen = [
+        recording_events(event_record(*made), EventRules(), latency)
+        for made in decide(streams, settings, timing)
+    ]
+    return pooled_metrics(seen)
+
+
 def _reliability(
     streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
 ) -> dict[str, Any]:
@@ -543,23 +555,7 @@ class CalibratedAlarm:
         }
         settings = replace(settings, metadata=metadata)
         detector.info[KEY] = settings.to_dict()
-        compute_s = {OURS: _push_seconds(detector, settings)}
-        events = defaultdict[str, dict[str, dict[str, Any]]](lambda: defaultdict(dict))
-        calibrations = {}
-        checked = [role for role in roles if role != "calibrate" and roles[role]]
-        for role, name in bar(list(product(checked, methods)), "events", "table row"):
-            scorer, made = methods[name]
-            by_scene = defaultdict[str, list[Stream]](list)  # "" the usual ones
-            for stream in scored[role][scorer]:
-                scene = stream.recording.scene
-                by_scene["" if scene in (PAPER_SCENE, self.slip_free) else scene].append(stream)
-            for scene, own in by_scene.items():
-                found = self._events(own, made, timings[scorer], compute_s.get(scorer))
-                events[scene][role][name] = found
-            if name == JOINT and (found := _reliability(by_scene[""], settings, timings[OURS])):
-                calibrations[f"{role} stream"] = found
-        budget_rows = self._budget_rows(events, methods, roles)
-        usual = events.pop("", {})
+        del scored["calibrate"]
         return {
             "rule": JOINT,
             "sample_rate_hz": rate,
@@ -575,6 +571,33 @@ class CalibratedAlarm:
                 }
                 for name, (scorer, made) in methods.items()
             },
+            **self._evaluated(scored, methods, timings, _push_seconds(detector, settings)),
+        }
+
+    def _evaluated(
+        self,
+        scored: Mapping[str, Mapping[str, Sequence[Stream]]],
+        methods: Mapping[str, tuple[str, AlarmSettings]],
+        timings: Mapping[str, Timing],
+        compute_s: float,
+    ) -> dict[str, Any]:
+        """What came of each method on recordings of each role that set nothing."""
+        events = defaultdict[str, dict[str, dict[str, Any]]](lambda: defaultdict(dict))
+        calibrations = {}
+        for role, name in bar(list(product(scored, methods)), "events", "table row"):
+            scorer, made = methods[name]
+            by_scene = defaultdict[str, list[Stream]](list)  # "" the usual ones
+            for stream in scored[role][scorer]:
+                scene = stream.recording.scene
+                by_scene["" if scene in (PAPER_SCENE, self.slip_free) else scene].append(stream)
+            for scene, own in by_scene.items():
+                measured_s = compute_s if scorer == OURS else None
+                events[scene][role][name] = _events(own, made, timings[scorer], measured_s)
+            if name == JOINT and (found := _reliability(by_scene[""], made, timings[OURS])):
+                calibrations[f"{role} stream"] = found
+        budget_rows = self._budget_rows(events, methods, scored)
+        usual = events.pop("", {})
+        return {
             "budget": budget_rows,
             "reliability": calibrations,
             "events": {f"{role} stream": found for role, found in usual.items()},
@@ -766,11 +789,11 @@ class CalibratedAlarm:
         self,
         events: Mapping[str, Mapping[str, Mapping[str, Any]]],
         methods: Mapping[str, object],
-        roles: Mapping[str, Sequence[RecordingId]],
+        scored: Mapping[str, Mapping[str, Sequence[Stream]]],
     ) -> list[dict[str, Any]]:
         """What each method had of each budget, on recordings of each role."""
         rows = []
-        for role, budget, name in product(roles, self.budgets, methods):
+        for role, budget, name in product(scored, self.budgets, methods):
             is_usual = budget.scene == self.slip_free
             scene = "" if is_usual else budget.scene
             numbers = events.get(scene, {}).get(role, {}).get(name, {})
@@ -780,8 +803,8 @@ class CalibratedAlarm:
                 continue
             alarms, amount = numbers["num_false_alarms"], numbers["quiet_hours"]
             if budget.is_share:
-                own = (one for one in roles[role] if one.scene == budget.scene)
-                amount = sum(len(self.streams.timeline(one).non_slip_s) for one in own)
+                own = (x for x in scored[role][OURS] if x.recording.scene == budget.scene)
+                amount = sum(len(stream.times.non_slip_s) for stream in own)
             if not amount:
                 continue
             low, high = budget.interval(alarms, amount, _LEVEL)
@@ -800,21 +823,6 @@ class CalibratedAlarm:
                 }
             )
         return rows
-
-    def _events(
-        self,
-        streams: Sequence[Stream],
-        settings: AlarmSettings,
-        timing: Timing,
-        compute_s: float | None,
-    ) -> dict[str, Any]:
-        rate = timing.sample_rate_hz
-        latency = LatencyParts(timing.look_ahead / rate, timing.bin_samples / rate, compute_s)
-        seen = [
-            recording_events(event_record(*made), EventRules(), latency)
-            for made in decide(streams, settings, timing)
-        ]
-        return pooled_metrics(seen)
 
     def _amounts(
         self, roles: Mapping[str, Sequence[RecordingId]]
