@@ -1,6 +1,6 @@
 """The hand: which tactile channels there are, in file order, and where each one sits.
 
-Section III-A of the paper (REFERENCE.md section 1). Everything that depends on the number or the
+Section III-A of the paper. Everything that depends on the number or the
 kind of channels asks a ``HandLayout``, so another hand is another layout and nothing else.
 """
 
@@ -35,12 +35,12 @@ class Channel:
         finger: the finger it sits in, such as ``"index"``.
         segment: the part of the finger, such as ``"distal"``.
         adapting: ``"slow"`` or ``"fast"``; decides the features of the channel. What the kind
-            implies if it is one of ``KNOWN_KINDS`` and nothing else is said; never ``None`` once
+            implies if it is one of ``KNOWN_KINDS`` and nothing else is given; never ``None`` once
             the channel is made.
 
     Raises:
         ValueError: if a name is no text, the kind is no single word, or how the channel adapts
-            is neither said nor known.
+            is neither given nor known.
 
     Example:
         >>> Channel("SG1", "SG", "index", "distal").adapting
@@ -180,9 +180,9 @@ class HandLayout:
             for finger in ("little", "ring", "middle", "index")
             for segment in ("distal", "middle", "proximal")
         ] + [("thumb", "distal"), ("thumb", "proximal")]
-        with_film = [place for place in places if place[0] == "thumb" or place[1] != "proximal"]
+        with_fast = [place for place in places if place[0] == "thumb" or place[1] != "proximal"]
         slow = [Channel(f"SG{i}", "SG", *place) for i, place in enumerate(places, 1)]
-        fast = [Channel(f"PVDF{i}", "PVDF", *place) for i, place in enumerate(with_film, 1)]
+        fast = [Channel(f"PVDF{i}", "PVDF", *place) for i, place in enumerate(with_fast, 1)]
         return cls(tuple(slow + fast))
 
     @classmethod

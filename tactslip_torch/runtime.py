@@ -296,7 +296,7 @@ def regular_file(path: str | os.PathLike[str], most_bytes: float = math.inf) -> 
 class SeenBatches(dict[str, str]):
     """Which batches a statistic holds: their ids, each with a digest of what the batch held.
 
-    None is in it twice, none is taken out unseen, none is mixed with another.
+    None is in it twice, none is mixed with another.
     """
 
     def add(self, batch_id: str, digest: str) -> None:
@@ -308,20 +308,6 @@ class SeenBatches(dict[str, str]):
         if batch_id in self:
             raise ValueError(f"batch {batch_id!r} is in these statistics already; add it once")
         self[batch_id] = digest
-
-    def remove(self, batch_id: str, digest: str) -> None:
-        """Strike a batch out.
-
-        Raises:
-            ValueError: if it was never added, or held something else.
-        """
-        if batch_id not in self:
-            raise ValueError(f"batch {batch_id!r} was never added to these statistics")
-        if self[batch_id] != digest:
-            raise ValueError(
-                f"batch {batch_id!r} was added with other content; remove what was added"
-            )
-        del self[batch_id]
 
     def merge(self, other: Mapping[str, str]) -> None:
         """Take over other batches.

@@ -1,6 +1,6 @@
 """Slow, plain references for every operator, to be read against the definitions.
 
-Written from REFERENCE.md sections 2 to 5 alone, in NumPy, SciPy and PyWavelets; nothing of the
+Written from the paper's formulas alone, in NumPy, SciPy and PyWavelets; nothing of the
 package is imported. One 1-D float64 signal at a time, loops welcome. Below the references: what
 the tests feed in, and how they compare.
 """

@@ -75,3 +75,12 @@ def test_what_never_happened_may_still_happen_and_nothing_is_none():
     )
     assert many.ratio([0] * 30, [3] * 30)["high"] == 0.0  # no count of independent events
     assert many.rate([1] * 30, [0] * 30) is Bootstrap(0).share([], []) is None
+
+
+def test_wilsons_lower_end_stays_below_one_where_every_recording_is_right():
+    """Draws of recordings alone would say 100 % without doubt."""
+    number = Bootstrap(30).share([3] * 30, [3] * 30)
+    assert number["low"] == pytest.approx(
+        stats.binomtest(90, 90).proportion_ci(method="wilson").low
+    )
+    assert number["high"] == number["value"] == 1.0

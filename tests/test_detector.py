@@ -1,14 +1,10 @@
-import math
-
 import numpy as np
 import pytest
 import torch
 
 from tactslip_torch import FeaturePool, HandLayout, SlipDetector
-from tactslip_torch.model.detector import FORMAT
 from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.package_files import load_table, save_table
 from tactslip_torch.signals.filtering import ChannelFilter
 
 PER_KIND = 3
@@ -118,46 +114,6 @@ def test_parts_that_disagree_are_refused(detector):
     ):
         with pytest.raises(ValueError, match=said):
             SlipDetector(**(parts | {part: other}))
-
-
-# Files -----------------------------------------------------------------------------------------
-
-
-NO_DETECTORS = [
-    ([], {}),
-    ({"selected": ...}, {}),  # left out
-    ({"selected": [0, 1, 2]}, {}),
-    ({"channels": []}, {}),
-    ({"window_lengths": [51] * 23}, {}),
-    ({"pool": {"bin_samples": 10**9}}, {}),
-    ({"info": {"calibration": {"kind": "platt", "slope": math.inf, "offset": 0}}}, {}),
-    ({"kernel": {"kind": "polynomial", "degree": 10**400, "offset": 0.5}}, {}),
-    ({}, {"scaler.minimum": torch.full((12,), torch.nan)}),
-    ({}, {"head.constant": torch.tensor(torch.nan)}),
-]
-
-
-@pytest.mark.parametrize(("metadata", "state"), NO_DETECTORS)
-def test_what_describes_no_detector_is_refused_in_one_line(metadata, state, detector, tmp_path):
-    """Whole files, so the digest fits; another program wrote them."""
-    path = tmp_path / "detector.pt"
-    detector.save(path)
-    own, kept = load_table(path, FORMAT)
-    if metadata != []:
-        whole = own | metadata | {"pool": own["pool"] | metadata.get("pool", {})}
-        metadata = {key: value for key, value in whole.items() if value is not ...}
-    save_table(path, FORMAT, metadata, kept | state)
-    with pytest.raises(ValueError, match="is damaged: "):
-        SlipDetector.load(path)
-
-
-@pytest.mark.parametrize("number", [1, 2, 3])
-def test_a_file_of_an_earlier_version_is_named_as_such(number, tmp_path):
-    format_ = f"tactslip_torch detector {number}"
-    old = {"format": format_, "config": "{}", "selected": torch.arange(3)}
-    torch.save(old, tmp_path / "old.pt")
-    with pytest.raises(ValueError, match=r"old\.pt was made by version 0\.2\.0 or .* make it"):
-        SlipDetector.load(tmp_path / "old.pt")
 
 
 @pytest.mark.parametrize("method", ["__call__", "score_raw", "predict", "predict_raw"])

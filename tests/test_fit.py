@@ -171,29 +171,12 @@ def test_many_bins_go_through_the_primal_and_few_do_not(kernel, crossover, rng):
         assert fit_machine(draw(rng, num_bins), 0.3, kernel, "dual").solved.size == num_bins
 
 
-@pytest.mark.parametrize("degree", [1, 2])
-def test_a_bin_that_weighs_1e14_does_not_drown_the_others(degree, rng, monkeypatch):
-    """X'WX holds bins of weight 1 to 2 % beside it; the dual holds all."""
-    bins, kernel = draw(rng, 40), Polynomial(degree, 0.5)
-    weights = torch.ones(40).double()
-    weights[3] = 1e14
-    bins = TrainingBins(bins.features, bins.is_slip, weights)
-    assert fit_machine(bins, 1.0, kernel).solved.size == 40
-    refused = r"weights from 1\.0e\+00 to 1\.0e\+14 .* loses [2-9]e-02 of the lightest bin"
-    with pytest.raises(ValueError, match=refused):
-        fit_machine(bins, 1.0, kernel, route="primal")
-    monkeypatch.setattr(fit, "_MOST_DUAL", 39)
-    with pytest.raises(ValueError, match=refused):
-        fit_machine(bins, 1.0, kernel)
-    assert fit_machine(bins, 1e-13, kernel, route="primal").solved.method == "cholesky"
-
-
 def test_few_bins_of_many_features_stay_a_sum_and_that_is_told(rng, caplog):
     bins = draw(rng, 60, num_features=1001)
     with caplog.at_level("INFO"):
         machine = fit_machine(bins, 0.3)
     assert isinstance(machine, KernelSum)
-    assert f"all 60 training bins are kept, {machine.cost}" in caplog.text
+    assert f"all 60 bins are kept, {machine.cost}" in caplog.text
     new = rng.uniform(-1, 1, (5, 1001))
     expected = ridge(bins, 0.3, PAPER_KERNEL, new)
     np.testing.assert_allclose(machine(torch.from_numpy(new)).numpy(), expected, rtol=1e-9)
@@ -277,11 +260,13 @@ def test_derivatives_are_right_once_and_twice(num_bins, num_features, route, rng
 def test_what_cannot_be_differentiated_is_refused(route, rng):
     z, targets, *_ = (tensor.detach() for tensor in drawn(rng, 12, 3))
     for penalty in (0.0, float("inf"), float("nan")):
-        with pytest.raises(ValueError, match=rf"positive and finite penalty .* C={penalty}; fit_"):
+        with pytest.raises(
+            ValueError, match=rf"positive and finite penalty .* got {penalty}; fit_"
+        ):
             fit_quadratic(z, targets, penalty)
     with pytest.raises(ValueError, match=r"one N, got \(12, 3\), \(11,\)"):
         fit_quadratic(z, targets[1:], 1.0)
-    with pytest.raises(ValueError, match=r"needs bins .* got 0 bins"):
+    with pytest.raises(ValueError, match="needs training bins, got none"):
         fit_quadratic(z[:0], targets[:0], 1.0)
     with pytest.raises(ValueError, match=r"offset .* at least 0, got -0.5"):
         fit_quadratic(z, targets, 1.0, -0.5)

@@ -12,6 +12,7 @@ from tactslip_torch.model.calibration import reliability
 from tactslip_torch.report.metrics import (
     bin_metrics,
     confusion_matrix,
+    merged_metrics,
     split_metrics,
     weights_at_share,
 )
@@ -59,6 +60,25 @@ def test_groups_are_scores_of_their_own_bins():
                                             "20+") if name in scores["per_position"]]  # fmt: skip
     assert json.loads(json.dumps(scores, allow_nan=False)) == scores
     assert not {"per_scene", "per_position"} & set(bin_metrics(truth, predicted, materials, speeds))
+
+
+@pytest.mark.parametrize("scenes", ["ppp ppp", "ppt ptt", "ppt ttt"])
+def test_folds_merged_count_the_scenes_that_all_bins_together_would(scenes):
+    """Of several kinds of scenes, tables of materials count the paper's alone, in folds as well."""
+    names = {"p": "paper", "t": "taps"}
+    of_fold, whole = [], ([], [], [], [])
+    for seed, kinds in enumerate(scenes.split()):
+        truth, predicted = random_bins(seed, 60)
+        materials = ["iron" if i % 4 else "wood" for i in range(60)]
+        own = [names[kinds[i % 3]] for i in range(60)]
+        of_fold.append(bin_metrics(truth, predicted, materials, [20.0] * 60, own))
+        for part, new in zip(whole, (truth, predicted, materials, own), strict=True):
+            part.extend(new.tolist() if isinstance(new, torch.Tensor) else new)
+    truth, predicted, materials, own = whole
+    together = bin_metrics(
+        torch.tensor(truth), torch.tensor(predicted), materials, [20.0] * 120, own
+    )
+    assert merged_metrics(of_fold) == together
 
 
 @pytest.mark.parametrize("slip", [True, False])

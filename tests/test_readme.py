@@ -35,7 +35,7 @@ ALL = "\n".join(text for name, text in PAGES.items() if not name.endswith("troub
 IN_ORDER = ("docs/quickstart.md", "docs/your_hand.md")  # pages whose commands follow one another
 BANNED = re.compile(
     r"\b(houses?|rooms?|rungs?|knobs?|ledgers?|rivals?|judg\w+|verdicts?|heard|fools?|never met"
-    r"|promis\w+|stand-ins?|behind the fit)\b",
+    r"|promis\w+|stand-ins?|behind the fit|(?:reference|design|findings|physics|style)\.md)\b",
     re.IGNORECASE,
 )
 

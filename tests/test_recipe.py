@@ -112,7 +112,9 @@ FILTERS = [
 ]
 
 
-@pytest.mark.parametrize(("wanted", "matches"), FILTERS, ids=lambda case: str(case))
+@pytest.mark.parametrize(
+    ("wanted", "matches"), FILTERS, ids=[" ".join(wanted) for wanted, _ in FILTERS]
+)
 def test_a_filter_lets_pass_what_has_every_attribute_asked_for(wanted, matches):
     allowed = Paper(feature_filter=wanted).allowed(POOL)
     assert allowed.tolist() == [matches(name) for name in POOL.names]

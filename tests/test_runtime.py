@@ -155,7 +155,7 @@ def tables():
         "double": torch.tensor(0.1, dtype=torch.float64),
         "long": torch.tensor([-(2**63), 2**63 - 1]),
         "bool": torch.tensor([[True], [False]]),
-        "half": torch.tensor([1.5, float("nan"), float("inf")], dtype=torch.bfloat16),
+        "half": torch.tensor([1.5, -2.0], dtype=torch.bfloat16),
         "empty": torch.zeros(0, 3, dtype=torch.int32),
     }
 
@@ -203,23 +203,8 @@ def test_a_flipped_byte_is_refused_in_one_line_wherever_it_counts(saved):
             num_refused += 1
             assert "\n" not in line
             assert str(saved) in line
-            assert "make it again" in line or "must be of format" in line
         assert line is not None or place not in certain
     assert num_refused > len(certain)
-
-
-MISFITS = [{"digest": "0" * 32}, {"metadata": "{}"}, {"tensors": [1, 2]}]
-MISFITS += [{"tensors": {3: torch.zeros(2), "a": torch.zeros(2)}}]
-MISFITS += [{"tensors": {"float": torch.zeros(3).to_sparse()}}]
-
-
-@pytest.mark.parametrize("change", MISFITS)
-def test_content_that_does_not_fit_its_digest_is_refused(saved, change):
-    content = torch.load(saved, weights_only=True) | change
-    without = {name: value for name, value in content.items() if name not in change}
-    for each in (content, without):
-        torch.save(each, saved)
-        assert refusal(saved) == f"{saved} is damaged or no file of ours; make it again"
 
 
 class Trap:
@@ -234,13 +219,19 @@ class Trap:
 
 def test_other_files_are_refused_and_nothing_in_them_is_executed(tmp_path):
     path, mark = tmp_path / "a.pt", tmp_path / "sprung"
-    trapped = {"format": FORM, "metadata": "{}", "tensors": {}, "digest": Trap(mark)}
-    for content in (torch.zeros(3), {"format": torch.zeros(3)}, [FORM], {}, None, trapped):
+    own = {"format": FORM, "metadata": "{}", "tensors": {"a": torch.zeros(3)}}
+    for content in (
+        *(torch.zeros(3), {"format": torch.zeros(3)}, [FORM], {}, None, own | {"x": Trap(mark)}),
+        *(own | {"metadata": "{"}, own | {"tensors": [1]}, {"format": FORM}),
+        *(
+            own | {"tensors": {"a": bad}}
+            for bad in (torch.tensor(torch.nan), torch.zeros(1).expand(9))
+        ),
+    ):
         torch.save(content, path)
-        assert refusal(path) == f"{path} is damaged or no file of ours; make it again"
+        assert (refusal(path) or "").startswith(f"{path} is damaged")
     path.write_bytes(pickle.dumps(Trap(mark)))
-    with pytest.raises(ValueError, match="no file of ours"):
-        load_table(path, FORM)
+    assert "no file of this package" in refusal(path)
     assert not mark.exists()
     pickle.loads(path.read_bytes())
     assert mark.exists(), "the trap is none"
@@ -252,14 +243,18 @@ def test_other_files_are_refused_and_nothing_in_them_is_executed(tmp_path):
         load_table(tmp_path / "nowhere.pt", FORM)
 
 
-@pytest.mark.parametrize("how", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA])
-def test_what_inflates_is_refused_before_it_does(tmp_path, how, saved):
-    """2 GB of zeros in some 2 MB took as much memory, and 27 s."""
+def test_what_unpacks_to_too_much_is_refused_before_it_does(tmp_path, saved):
     packed = tmp_path / "packed.pt"
-    with zipfile.ZipFile(saved) as whole, zipfile.ZipFile(packed, "w", how) as file:
+    with (
+        zipfile.ZipFile(saved) as whole,
+        zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file,
+    ):
         for member in whole.infolist():
             file.writestr(member.filename, whole.read(member))
-    assert refusal(packed) == f"{packed} is damaged or no file of ours; make it again"
+        file.writestr("a/data/zeros", bytes(10**6))
+    assert packed.stat().st_size < 10**5
+    with pytest.raises(ValueError, match="damaged or no file of this package"):
+        load_table(packed, FORM, 10**5)
 
 
 def test_what_is_no_file_is_refused_without_a_wait(tmp_path):
@@ -291,7 +286,7 @@ def test_what_a_killed_process_left_is_removed_and_what_is_being_written_is_not(
 # --- batches seen and digests -------------------------------------------------------------------
 
 
-def test_a_batch_is_seen_once_and_removed_as_it_was():
+def test_a_batch_is_seen_once():
     source = {"a": "1"}
     seen = SeenBatches(source)
     seen.add("b", "1")
@@ -299,13 +294,10 @@ def test_a_batch_is_seen_once_and_removed_as_it_was():
     assert seen == {"a": "1", "b": "1"}
     for refused, message in (
         (lambda: seen.add("a", "1"), r"'a' is in these statistics already; add it once"),
-        (lambda: seen.remove("c", "1"), r"'c' was never added"),
-        (lambda: seen.remove("a", "2"), r"'a' was added with other content"),
         (lambda: seen.merge(SeenBatches({"c": "1", "b": "2"})), r"^1 .*such as 'b'; merge each"),
     ):
         with pytest.raises(ValueError, match=message):
             refused()
         assert seen == {"a": "1", "b": "1"}
-    seen.remove("a", "1")
-    seen.merge(SeenBatches({"a": "2"}))
-    assert seen == {"b": "1", "a": "2"}
+    seen.merge(SeenBatches({"c": "2"}))
+    assert seen == {"a": "1", "b": "1", "c": "2"}

@@ -10,9 +10,14 @@ import pytest
 import torch
 
 from tactslip_torch.model import fit
-from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine, held_out_scores
+from tactslip_torch.model.fit import (
+    HeldOut,
+    TrainingBins,
+    fit_machine,
+    held_out_scores,
+    solve_symmetric,
+)
 from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial
-from tactslip_torch.model.solve import solve_symmetric
 
 
 def singular(rng, num, rank):
@@ -30,28 +35,32 @@ def close(actual, expected, tolerance):
     assert np.abs(actual.detach().numpy() - expected).max() <= tolerance * np.abs(expected).max()
 
 
-# Eigenvectors ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("penalty", [1e13, 1e308, np.inf])
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("num", [12, 120])
-def test_what_is_null_is_left_out(num, weighted, penalty, rng, caplog):
+def test_what_is_null_is_left_out_as_by_the_pseudo_inverse(num, weighted, penalty, rng, caplog):
     """Targets outside the span would fill the solution with rounding times C."""
     matrix, right = singular(rng, num, num // 3), rng.choice([-1.0, 1.0], num)
     weights = 10.0 ** rng.uniform(-2, 2, num) if weighted else np.ones(num)
     root = np.sqrt(weights)
-    x, report, factor, _ = solve_symmetric(*tensors(matrix, right), penalty, *tensors(weights))
-    assert (report.method, report.rank, factor) == ("eigen", num // 3, None)
-    across = root[:, None] * matrix * root
-    pseudo = np.linalg.pinv(across, rcond=1e-12, hermitian=True)
+    x, report, factor = solve_symmetric(*tensors(matrix, right), penalty, *tensors(weights))
+    assert (report.method, report.rank, factor) == ("pinv", num // 3, None)
+    across = torch.from_numpy(root[:, None] * matrix * root)
+    pseudo = torch.linalg.pinv(across, rtol=1e-12, hermitian=True).numpy()
     close(x, root * (pseudo @ (root * right)), 1e-8)
-    values = np.linalg.eigvalsh(across)[-(num // 3) :]
-    assert report.condition == pytest.approx(values[-1] / values[0], rel=1e-6)
-    assert (report.condition_bound is None) == (penalty > 1e300)
-    if np.isfinite(penalty):
-        assert {record.levelno for record in caplog.records} == {logging.WARNING}
-        assert str(report) in caplog.messages[-1]
+    assert report.error > 0.1  # targets outside the span: a training score may be off by as much
+    assert {record.levelno for record in caplog.records} == {logging.WARNING}
+    assert str(report) in caplog.messages[-1]
+
+
+@pytest.mark.parametrize("copies", [1, 25])
+def test_the_stated_error_grows_with_the_root_of_the_size(copies):
+    """Of one block many times over the condition is that of the block."""
+    block = np.array([[1.0, 1 - 1e-6], [1 - 1e-6, 1.0]])
+    matrix = np.kron(np.eye(copies), block)
+    _, report, _ = solve_symmetric(*tensors(matrix, np.ones(2 * copies)), 1e12)
+    assert report.condition == pytest.approx(2e6, rel=1e-3)
+    assert report.error == pytest.approx(np.sqrt(2 * copies) * 2.0**-52 * 2e6, rel=1e-3)
 
 
 # 80 digits ------------------------------------------------------------------------------------
@@ -79,8 +88,10 @@ def case(kind, spread):
     return z, targets, 10.0 ** rng.uniform(-spread, spread, 16)
 
 
-def exact_machine(z, targets, weights, penalty, others):
-    """Scores of training bins and of others, and coefficients: a, l and the triangle of Q."""
+@functools.cache
+def exact_scores(kind, spread, penalty):
+    """Scores of the training bins."""
+    z, targets, weights = case(kind, spread)
     with mpmath.workdps(80):
         rows = [[mpmath.mpf(float(x)) for x in row] for row in z]
         gram = mpmath.matrix([[(mpmath.fdot(u, v) + 0.5) ** 2 for v in rows] for u in rows])
@@ -88,58 +99,34 @@ def exact_machine(z, targets, weights, penalty, others):
         for i, weight in enumerate(weights):
             system[i, i] += 1 / (mpmath.mpf(float(penalty)) * mpmath.mpf(float(weight)))
         beta = mpmath.lu_solve(system, mpmath.matrix([mpmath.mpf(float(t)) for t in targets]))
-        points = [[mpmath.mpf(float(x)) for x in row] for row in others]
-        scores = [mpmath.fdot(beta, [(mpmath.fdot(u, v) + 0.5) ** 2 for u in rows]) for v in points]
-        variables = [[mpmath.mpf(1) / 2, *row] for row in rows]
-        pairs = zip(*np.triu_indices(len(variables[0])), strict=True)
-        products = [mpmath.fdot(beta, [x[i] * x[j] for x in variables]) for i, j in pairs]
-        found = (list(gram * beta), scores, products)
-        return [np.array([float(x) for x in each]) for each in found]
+        return np.array([float(x) for x in gram * beta])
 
 
-def coefficients_of(machine):
-    """``a``, ``l`` halved and the triangle of ``Q``, as ``exact_machine`` has them."""
-    linear = machine.linear.numpy()[None] / 2
-    whole = np.block([[machine.constant.numpy(), linear], [linear.T, machine.quadratic.numpy()]])
-    return whole[np.triu_indices(len(whole))]
-
-
+@pytest.mark.parametrize("route", ["dual", "primal"])
 @pytest.mark.parametrize("penalty", [1e-6, 1e3, 1e9, 1e15])
 @pytest.mark.parametrize("spread", [0, 4])
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_stated_errors_are_true_or_the_system_refused(kind, spread, penalty):
-    """Of scores of training bins, in the mean square by weight, by either route; of coefficients
-    and of scores elsewhere, unless it is said that those are not known.
-
-    Once a weighted system of nearly duplicate features was off by 84 % where 3e-7 was stated. Up
-    to a condition of 1e8 the error has a cap of its own.
-    """
+def test_the_stated_error_holds_to_80_digits_or_the_system_is_refused(kind, spread, penalty, route):
+    """Once a weighted system of nearly duplicate features was off by 84 % where 3e-7 was stated."""
     z, targets, weights = case(kind, spread)
+    exact = exact_scores(kind, spread, penalty)
     bins = TrainingBins(*tensors(z, targets > 0, weights))
-    others = np.random.default_rng(1).uniform(-1, 1, (12, z.shape[1]))
-    inside, outside, form = exact_machine(z, targets, weights, penalty, others)
-    for route in ("dual", "primal") if z.shape[1] == 3 else ("dual",):
-        try:
-            machine = fit_machine(bins, penalty, route=route)
-        except ValueError as error:
-            assert penalty >= 1e6
-            assert "\n" not in str(error)  # noqa: PT017
-            continue
-        report, scores = machine.solved, machine(bins.features).numpy()
-        wrong = np.sqrt((weights * (scores - inside) ** 2).sum() / weights.sum())
-        assert wrong <= report.error + 1e-14
-        assert report.error <= max(1e-2, report.left_out or 0.0)
-        if report.method == "cholesky" and report.condition <= 1e8:
-            assert max(wrong, report.elsewhere) <= 1e-5
-        if report.elsewhere == np.inf:
-            assert "scores of bins unlike those of training may be others" in str(report)
-            assert report.rank < min(report.size, len(form))
-        for found, exact in (
-            (coefficients_of(machine), form),
-            (machine(*tensors(others)).numpy(), outside),
-        ):
-            assert np.abs(found - exact).max() <= report.elsewhere * np.abs(exact).max() + 1e-300
-        json.dumps(report.metadata(), allow_nan=False)
+    try:
+        machine = fit_machine(bins, penalty, route=route)
+    except ValueError as error:
+        assert penalty >= 1e6
+        assert "\n" not in str(error)  # noqa: PT017
+        return
+    wrong = machine(bins.features).numpy() - exact
+    wrong = np.sqrt((weights * wrong**2).sum() / weights.sum())
+    report = machine.solved
+    assert wrong <= report.error + 1e-14
+    if report.method == "cholesky":
+        assert report.error <= 1e-2
+        assert wrong <= 1e-5 or report.condition > 1e8
+    else:
+        assert report.rank < report.size or penalty > 1e3
+    json.dumps(report.metadata(), allow_nan=False)
 
 
 # Refusals -------------------------------------------------------------------------------------
@@ -191,17 +178,6 @@ def test_a_condition_is_refused_beyond_its_limit_alone_and_float32_always():
     solve_symmetric(*tensors(KNOWN), right, 1e9, most_condition=1e8)
     with pytest.raises(ValueError, match=r"expected gram in float64, got torch.float32"):
         solve_symmetric(torch.eye(40), right, 1.0, name="gram")
-
-
-def test_a_light_bin_is_no_noise():
-    """Of weight 1e-20, beside one it has nothing to do with; in a singular system it is refused."""
-    eye, targets = torch.eye(2).double(), torch.tensor([1.0, -1.0]).double()
-    weights = torch.tensor([1e-20, 1.0]).double()
-    assert solve_symmetric(eye, targets, np.inf, weights).x.tolist() == [1.0, -1.0]
-    twice = torch.block_diag(eye[:1, :1], torch.ones(2, 2).double())
-    weights = torch.tensor([1e-20, 1.0, 1.0]).double()
-    with pytest.raises(ValueError, match=r"weights from 1\.0e-20 to 1\.0e\+00 too far apart"):
-        solve_symmetric(twice, torch.tensor([1.0, -1.0, 1.0]).double(), np.inf, weights)
 
 
 LINE = Polynomial(1, 0.7)

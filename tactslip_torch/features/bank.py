@@ -1,17 +1,8 @@
 """The features of a plan: rows are formed by linear maps, brought to order one, and described.
 
-``make_plan`` tells by names and places alone which channels, branches and spectra some features
-need; what none of them needs is not read, formed or sorted. ``Bank`` carries a plan out.
-
-A channel's samples go to a few coordinates of each row (51, 27, 15 or 9 of a branch of 100 samples)
-and to its mean, in float64; filter and wavelet are one matrix by then. Here what is rounding beside
-its bin becomes exactly constant, and every row gets the length one. From these coordinates rows go
-on to branches and spectra, which are then good to rounding in any precision, and which
-``descriptors.py`` describes without a thought of extremes. All constants are float64, made from
-``branch_matrix`` and ``spectrum_matrix``, so from ptwt and torch.fft evaluated on an identity.
-
-Everything is written in operations that tensors and values of an ONNX graph share: on tensors it is
-the reference, on values it writes the graph.
+``make_plan`` finds which channels, branches and spectra some features need; ``Bank`` computes them,
+on tensors as the reference, on values of an ONNX graph to write the graph. Filter and wavelet are
+one matrix in float64; what is rounding beside its bin becomes exactly constant.
 """
 
 from __future__ import annotations
@@ -54,12 +45,12 @@ from tactslip_torch.signals.wavelet import (
     spectrum_matrix,
 )
 
-RowKind = Literal["gauge", "time", "freq"]
-ROW_KINDS: tuple[RowKind, ...] = ("gauge", "time", "freq")
+RowKind = Literal["slow", "time", "freq"]
+ROW_KINDS: tuple[RowKind, ...] = ("slow", "time", "freq")
 
 
 def pool_names(hand: HandLayout, level: int) -> tuple[FeatureName, ...]:
-    """Names of all features of a hand, in the paper's order (REFERENCE.md section 4)."""
+    """Names of all features of a hand, in the paper's order."""
     names = [
         FeatureName(hand.names[i], "raw", "time", descriptor)
         for i in hand.slow
@@ -83,12 +74,12 @@ def pool_names(hand: HandLayout, level: int) -> tuple[FeatureName, ...]:
 
 
 class Row(NamedTuple):
-    """Values that are described together: a gauge's bin, a film's branch, or its spectrum.
+    """Values that are described together: a slow channel's bin, a fast one's branch or spectrum.
 
     Attributes:
         kind: which of the three.
         channel: index in the hand.
-        branch: index in ``branch_names``; -1 for a gauge.
+        branch: index in ``branch_names``; -1 for a slow channel.
     """
 
     kind: RowKind
@@ -105,7 +96,7 @@ class Wanted(NamedTuple):
 
 
 class Share(NamedTuple):
-    """A band energy ratio of a film, and the column it goes to."""
+    """A band energy ratio of a fast channel, and the column it goes to."""
 
     channel: int
     branch: int
@@ -118,10 +109,10 @@ class Plan:
 
     Args:
         channels: indices in the hand of the channels that are read, ascending.
-        rows: what is formed and described: gauges, branches, spectra, each by channel and branch.
+        rows: what is formed and described: bins, branches and spectra, each by channel and branch.
         wanted: descriptors, in the order of their columns.
         shares: band energy ratios, in the order of their columns. Their energies are of all
-            branches of the film, whether or not those are rows.
+            branches of the channel, whether or not those are rows.
         num_features: number of columns.
     """
 
@@ -133,7 +124,7 @@ class Plan:
 
     @property
     def share_channels(self) -> tuple[int, ...]:
-        """Films of which band energy ratios are wanted, ascending."""
+        """Fast channels of which band energy ratios are wanted, ascending."""
         return tuple(sorted({share.channel for share in self.shares}))
 
 
@@ -167,7 +158,7 @@ def make_plan(hand: HandLayout, level: int, names: Sequence[FeatureName | str]) 
     found: list[tuple[Row, str]] = []
     for name in (known[str(name)] for name in names):
         branch = branches[name.component]
-        kind: RowKind = "gauge" if branch < 0 else "time" if name.domain == "time" else "freq"
+        kind: RowKind = "slow" if branch < 0 else "time" if name.domain == "time" else "freq"
         found.append((Row(kind, channel_of[name.channel], branch), name.descriptor))
     is_share = [descriptor == "band_energy_ratio" for _, descriptor in found]
     rows = sorted(
@@ -185,7 +176,7 @@ def make_plan(hand: HandLayout, level: int, names: Sequence[FeatureName | str]) 
     return Plan(channels, tuple(rows), tuple(wanted), tuple(shares), len(found))
 
 
-RANK_TOLERANCE = 1e-12
+_RANK_TOLERANCE = 1e-12
 """Singular values below this part of the largest are rounding."""
 
 
@@ -321,7 +312,7 @@ def linear_maps(
 def _low_rank(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """``into [r, n]`` and ``out [n, r]``, orthonormal, whose product is ``matrix``."""
     left, sizes, right = torch.linalg.svd(matrix)
-    rank = max(1, int((sizes > RANK_TOLERANCE * sizes[0]).sum()))
+    rank = max(1, int((sizes > _RANK_TOLERANCE * sizes[0]).sum()))
     return (sizes[:rank, None] * right[:rank]).contiguous(), left[:, :rank].contiguous()
 
 
@@ -330,13 +321,13 @@ class Frame(NamedTuple):
 
     Attributes:
         channels: positions in the hand.
-        is_film: whether they adapt fast, so have branches.
+        is_fast: whether they adapt fast, so have branches.
         smooth: from their ``W`` samples to the ``n`` of a filtered bin, ``[n, W]``, float64; None:
             they are filtered.
     """
 
     channels: tuple[int, ...]
-    is_film: bool
+    is_fast: bool
     smooth: Tensor | None = None
 
 
@@ -381,7 +372,7 @@ class Bank:
         wanted: dict[Row, set[str]] = {row: set() for row in plan.rows}
         for each in plan.wanted:
             wanted[plan.rows[each.row]].add(each.descriptor)
-        families = (_Family(maps, wanted, frames, is_film) for is_film in (False, True))
+        families = (_Family(maps, wanted, frames, is_fast) for is_fast in (False, True))
         self._families = [family for family in families if family.blocks]
         self._sets: list[_RowSet] = []
         for is_freq in (False, True):
@@ -474,10 +465,10 @@ class _Family:
     """
 
     def __init__(
-        self, maps: LinearMaps, wanted: Iterable[Row], frames: Sequence[Frame], is_film: bool
+        self, maps: LinearMaps, wanted: Iterable[Row], frames: Sequence[Frame], is_fast: bool
     ) -> None:
         self.num = maps.num_samples
-        self.frames = [i for i, frame in enumerate(frames) if frame.is_film == is_film]
+        self.frames = [i for i, frame in enumerate(frames) if frame.is_fast == is_fast]
         own = [frames[i] for i in self.frames]
         self.channels = tuple(channel for frame in own for channel in frame.channels)
         self.blocks = sorted({row.branch for row in wanted if row.channel in self.channels})
@@ -534,7 +525,7 @@ class _Coordinates:
         self.length = {False: length, True: whole}
         self.mean = taken(x, family.sums, -1) / float(family.num) / length * mean_is_kept
 
-    def films(self, dtype: torch.dtype) -> Tensor:
+    def filtered(self, dtype: torch.dtype) -> Tensor:
         """Filtered bins less their mean, of order one, ``[*, c, n]``; 0 where that is rounding."""
         x = torch.cat(self._moving, dim=-2).double()
         x = x - x.mean(-1, keepdim=True)
@@ -569,7 +560,7 @@ class _RowSet:
         for number, family in enumerate(families):
             num_blocks = len(family.blocks)
             for place, branch in enumerate(family.blocks):
-                kind: RowKind = "freq" if is_freq else "gauge" if branch < 0 else "time"
+                kind: RowKind = "freq" if is_freq else "slow" if branch < 0 else "time"
                 own = [Row(kind, channel, branch) for channel in family.channels]
                 chosen = [i for i, row in enumerate(own) if row in wanted]
                 if not chosen:
@@ -604,9 +595,9 @@ class _RowSet:
             ]
             self.made += [(rows[i], name) for name in group for i in chosen]
             self._groups.append((group, _index(chosen, len(rows))))
-        of_film = families[-1].channels
+        of_fast = families[-1].channels
         correlated = [row.channel for row in rows if "correlation" in wanted[row]]
-        self._film = torch.tensor([of_film.index(channel) for channel in correlated])
+        self._correlated = torch.tensor([of_fast.index(channel) for channel in correlated])
 
     def __call__(self, families: Sequence[_Coordinates]) -> list[Tensor]:
         rows = self._rows(families)
@@ -614,7 +605,9 @@ class _RowSet:
         for names, index in self._groups:
             own = rows.take(index)
             if names == ["correlation"]:
-                own = replace(own, film=taken(families[-1].films(self._dtype), self._film, -2))
+                own = replace(
+                    own, filtered=taken(families[-1].filtered(self._dtype), self._correlated, -2)
+                )
             made += [DESCRIPTORS[name](own) for name in names]
         return made
 
@@ -660,7 +653,7 @@ class _RowSet:
 
 
 class _Ratios:
-    """Band energy ratios of the films of a frame."""
+    """Band energy ratios of the fast channels of a frame."""
 
     def __init__(self, maps: LinearMaps, plan: Plan, frame: Frame) -> None:
         own = [i for i, channel in enumerate(frame.channels) if channel in plan.share_channels]
@@ -676,7 +669,7 @@ class _Ratios:
         self._of_branch = _ones_of([each.rank + 1 for each in blocks])
 
     def __call__(self, samples: Samples, dtype: torch.dtype) -> Tensor:
-        """``[*, films of the frame * branches]``, float64."""
+        """``[*, channels of the frame * branches]``, float64."""
         x = taken(samples.shifted, self._index, -2).to(dtype)
         parts = (x @ like(self._into, x)).double()  # whose squares may leave float32
         ratios = band_energy_ratios((parts * parts) @ like(self._of_branch, parts))

@@ -1,18 +1,15 @@
-"""The paper's descriptors, each defined once (REFERENCE.md section 4).
+"""The paper's descriptors, each defined once, as short functions of ``Rows``.
 
-A descriptor is a short function of ``Rows``: bins, wavelet branches or spectra that were brought to
-order one before (``bank.py``), so that no definition has to know of extremes. It is written in
-ordinary tensor operations, which ``torch.Tensor`` and the values of an ONNX graph
-(``deploy/value.py``) both offer: the same functions are the reference on any device, with
-gradients, and write the graph.
+Rows are bins, wavelet branches or spectra that were brought to order one before (``bank.py``), so
+that no definition has to know of extremes. Only operations that ``torch.Tensor`` and the values of
+an ONNX graph (``deploy/value.py``) both offer are used: the same functions are the reference on any
+device, with gradients, and write the graph.
 
-Constants (our rules): a row that is constant is given as exact zeros around its mean. It then has
-std, cv, skewness, correlation and entropy 0 and kurtosis 3. A zero row has peak factor 0; a zero
-spectrum has centroid, spread and band energy ratios 0.
-
-Gradients of constant rows and of tied values are 0 or one-sided, never NaN. Those of ``median``,
-``iqr`` and ``mode`` depend on which of several nearly equal values is chosen, so two roundings of
-the same row may have different ones. ``entropy`` is a step function: no gradient flows.
+A row that is constant has std, cv, skewness, correlation and entropy 0 and kurtosis 3; a zero row
+has peak factor 0; a zero spectrum has centroid, spread and band energy ratios 0. Gradients of
+constant rows and of tied values are 0 or one-sided, never NaN. Those of ``median``, ``iqr`` and
+``mode`` depend on which of several nearly equal values is chosen. No gradient flows through
+``entropy``.
 """
 
 from __future__ import annotations
@@ -26,11 +23,11 @@ from torch import Tensor
 
 from tactslip_torch.features.ops import ascending, counted, like, looked_up, root, taken
 
-ENTROPY_LEVELS = 255
-RUN_TOLERANCE = {torch.float64: 1e-12, torch.float32: 2.0**-20}
-HALF_SLACK = {torch.float64: 1e-6, torch.float32: 2.0**-13}
-CV_FLOOR = 1e-6
-CV_ZERO = 1e-12
+_ENTROPY_LEVELS = 255
+_RUN_TOLERANCE = 1e-12
+_HALF_SLACK = 1e-6
+_CV_FLOOR = 1e-6
+_CV_ZERO = 1e-12
 _NEXT_TO_NOTHING = 1e-60  # instead of 0 in a divisor; variances of rows are 0 or far above
 
 
@@ -47,13 +44,13 @@ class Rows:
         num: values in a row.
         scale: largest magnitude of the bin that a row comes from, in the unit of the row; ``mode``
             decides by it which values are equal. No gradient.
-        film: what ``correlation`` correlates with: the filtered bin less its mean, of order one.
+        filtered: bin less its mean, of order one, with which ``correlation`` correlates.
         amplitude: of spectra, the values with their mean.
         frequency_hz: of the lines of spectra.
         is_sorted: whether ``ascending`` is asked for, so that ``ranked`` may take it.
 
     Shape:
-        - values, film, amplitude: ``[*, R, n]``; mean, unit, scale: ``[*, R]``;
+        - values, filtered, amplitude: ``[*, R, n]``; mean, unit, scale: ``[*, R]``;
           frequency_hz: ``[n]``
     """
 
@@ -62,7 +59,7 @@ class Rows:
     unit: Tensor
     num: int
     scale: Tensor
-    film: Tensor | None = None
+    filtered: Tensor | None = None
     amplitude: Tensor | None = None
     frequency_hz: Tensor | None = None
     is_sorted: bool = False
@@ -77,7 +74,7 @@ class Rows:
             mean=taken(self.mean, index, -1),
             unit=taken(self.unit, index, -1),
             scale=taken(self.scale, index, -1),
-            film=None if self.film is None else taken(self.film, index, -2),
+            filtered=None if self.filtered is None else taken(self.filtered, index, -2),
             amplitude=None if self.amplitude is None else taken(self.amplitude, index, -2),
         )
 
@@ -142,7 +139,7 @@ def mode(x: Rows) -> Tensor:
     because exact equality in branches is decided by rounding. The result is the first value of the
     longest run.
     """
-    tolerance = RUN_TOLERANCE[torch.float64] * x.scale
+    tolerance = _RUN_TOLERANCE * x.scale
     before = torch.cat([x.ascending[..., :1], x.ascending[..., :-1]], dim=-1)
     run = (x.ascending - before > tolerance[..., None]).long().cumsum(-1)
     longest = counted(run, x.num).argmax(-1, keepdim=True)  # the first of equals
@@ -171,8 +168,8 @@ def cv(x: Rows) -> Tensor:
     The mean's magnitude counts as at least 1e-6 of the rms, and a mean within 1e-12 of the rms, the
     sign of which is rounding, as positive (both ours); 0 for a zero row.
     """
-    floor = torch.maximum(x.mean.abs(), x.rms * CV_FLOOR)
-    is_negative = x.mean < x.rms * -CV_ZERO
+    floor = torch.maximum(x.mean.abs(), x.rms * _CV_FLOOR)
+    is_negative = x.mean < x.rms * -_CV_ZERO
     return x.std / torch.where(is_negative, -floor, floor)
 
 
@@ -218,12 +215,12 @@ def entropy(x: Rows) -> Tensor:
     values = x.values.detach()
     least = values.amin(-1, keepdim=True)
     span = values.amax(-1, keepdim=True) - least
-    levels = ENTROPY_LEVELS / span.clamp(min=_NEXT_TO_NOTHING)
-    level = ((values - least) * levels + (0.5 + HALF_SLACK[torch.float64])).floor()
+    levels = _ENTROPY_LEVELS / span.clamp(min=_NEXT_TO_NOTHING)
+    level = ((values - least) * levels + (0.5 + _HALF_SLACK)).floor()
     # the maximum always has the top level, which joins the second highest
-    second = torch.where(level < float(ENTROPY_LEVELS), level, 0.0).amax(-1, keepdim=True)
+    second = torch.where(level < float(_ENTROPY_LEVELS), level, 0.0).amax(-1, keepdim=True)
     cell = torch.where(level < second, level, second)  # of a NaN too one of the numbers
-    bits = looked_up(_entropy_terms(x.num), counted(cell.long(), ENTROPY_LEVELS)).sum(-1)
+    bits = looked_up(_entropy_terms(x.num), counted(cell.long(), _ENTROPY_LEVELS)).sum(-1)
     return bits * (span.squeeze(-1) > 0.0).double()
 
 
@@ -234,10 +231,10 @@ def peak_factor(x: Rows) -> Tensor:
 
 def correlation(x: Rows) -> Tensor:
     """Pearson correlation of a branch with the filtered bin; 0 if either is constant."""
-    if x.film is None:
-        raise ValueError("correlation needs the film that rows are branches of")
-    covariance = (x.values * x.film).mean(-1).double()
-    other = (x.film * x.film).mean(-1).double().clamp(min=_NEXT_TO_NOTHING)
+    if x.filtered is None:
+        raise ValueError("correlation needs the filtered bin that rows are branches of")
+    covariance = (x.values * x.filtered).mean(-1).double()
+    other = (x.filtered * x.filtered).mean(-1).double().clamp(min=_NEXT_TO_NOTHING)
     return covariance / (x.safe_variance * other).sqrt()
 
 
@@ -308,7 +305,5 @@ TIME_DESCRIPTORS = (*COMMON_DESCRIPTORS, "correlation")
 SPECTRUM_DESCRIPTORS = (*COMMON_DESCRIPTORS, *tuple(DESCRIPTORS)[14:])
 SORTED = ("median", "mode", "iqr")
 """Descriptors of sorted values."""
-ORDERED = (*SORTED, "entropy")
-"""Descriptors of the distribution of the values of a row."""
 STEPPED = ("mode", "entropy")
 """Descriptors that step where a value moves; of float64 values, whatever the dtype of others."""

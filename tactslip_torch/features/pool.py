@@ -1,8 +1,7 @@
-"""The pool: every descriptor of every channel, branch and spectrum (REFERENCE.md section 4).
+"""The pool: every descriptor of every channel, branch and spectrum.
 
-For the paper's hand 14 gauges x 13 descriptors + 10 films x (8 branches x (14 time + 15 frequency)
-+ 8 band energy ratios) = 2582 features of a 50 ms bin. Of any hand, a gauge is a channel that
-adapts slowly, a film one that adapts fast.
+For the paper's hand 14 slow channels x 13 descriptors + 10 fast ones x (8 branches x (14 time + 15
+frequency) + 8 band energy ratios) = 2582 features of a 50 ms bin.
 
 Two backends make the same features. ``"torch"`` is the definitions (``bank.py``): differentiable,
 on any device. ``"native"`` is ``native/engine.cpp``, for values on the CPU. float64 agrees to 1e-9
@@ -41,7 +40,6 @@ from tactslip_torch.features.ops import (
 )
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.native import BackendName
-from tactslip_torch.package_files import MOST_BIN_SAMPLES
 from tactslip_torch.runtime import check_choice, for_each
 from tactslip_torch.signals.filtering import check_samples
 from tactslip_torch.signals.wavelet import (
@@ -56,10 +54,12 @@ from tactslip_torch.signals.wavelet import (
 
 Arithmetic = Literal["double", "native"]
 NATIVE_SPAN = 2.0**-10
-"""Part of a film's magnitude; in float32 throughout, less may be lost in a branch."""
+"""Part of a fast channel's magnitude; in float32 throughout, less may be lost in a branch."""
 LEAST_SPAN = {torch.float32: 2.0**-17, torch.float64: 2.0**-22}
 """Part of the largest raw sample within reach that a filtered span must exceed, by the dtype of the
 raw samples: 64 roundings of float32; of float64, what leaves seven digits to a filtered sample."""
+MOST_BIN_SAMPLES = 1024
+"""Beyond it the constant matrices take gigabytes or minutes."""
 MOST_LEVELS = 4
 """Wavelet levels of the paper."""
 _FEW_BINS = 4  # so few are done here: another thread would take longer to start
@@ -249,8 +249,8 @@ class FeaturePool(nn.Module):
         x = self.widen(bins)
         if x.dtype not in self._banks:
             frames = [
-                Frame(tuple(sorted(own)), is_film)
-                for is_film, kind in ((False, self.hand.slow), (True, self.hand.fast))
+                Frame(tuple(sorted(own)), is_fast)
+                for is_fast, kind in ((False, self.hand.slow), (True, self.hand.fast))
                 if (own := set(kind).intersection(self.plan.channels))
             ]
             self._banks[x.dtype] = Bank(self.maps, self.plan, frames, x.dtype)
@@ -268,7 +268,11 @@ class FeaturePool(nn.Module):
         plan, steps = self.plan, wavelet_steps(self.bin_samples, self.wavelet, self.level)
         spectrum = spectrum_matrix(self.bin_samples, self.spectrum)
         num_branches = len(steps.out)
-        offset = {"gauge": 1, "time": 0, "freq": num_branches}  # a gauge is row 0 of its channel
+        offset = {
+            "slow": 1,
+            "time": 0,
+            "freq": num_branches,
+        }  # the bin of a slow channel is its row 0
         rows = [(row.channel, offset[row.kind] + row.branch) for row in plan.rows]
         wanted = [(*rows[w.row], tuple(DESCRIPTORS).index(w.descriptor), w.place)
                   for w in plan.wanted]  # fmt: skip
@@ -319,8 +323,8 @@ class FeaturePool(nn.Module):
             span = LEAST_SPAN[given] if is_raw else 64 * torch.finfo(given).eps
             least = [span] * len(self.hand)
             if self.arithmetic == "native" and given == torch.float32:
-                for film in self.hand.fast:
-                    least[film] = NATIVE_SPAN
+                for channel in self.hand.fast:
+                    least[channel] = NATIVE_SPAN
             with torch.inference_mode(False):  # it may be needed for a gradient later
                 inverse = torch.tensor(least, dtype=torch.float64, device="cpu").reciprocal()
             self._inverses[given, is_raw] = inverse

@@ -1,10 +1,6 @@
-"""Which features to keep: a t-test on class moments (paper section IV-D, REFERENCE.md section 5).
+"""Which features to keep: a t-test on class moments (paper section IV-D).
 
-Moments are gathered in passes over recordings and merge, so a ranking needs one look at each bin,
-and the ranking of a validation fold is a merge of what the other groups gathered.
-
-``rank_distinct``, ``rank_weighted`` and ``rank_per_cost`` know more than each feature's own score:
-what repeats, and what costs. Any number of threads gives the same ranking.
+Moments are gathered in passes over recordings and merge.
 """
 
 from __future__ import annotations
@@ -16,10 +12,6 @@ from torch import Tensor
 
 ScoreVariance = Literal["pooled", "welch"]
 CLASS_NAMES = ("non-slip", "slip")
-_BLOCK = 128  # features whose correlations are looked at together
-LARGEST_PRICE = 2**50
-"""So that sums of prices, and of their products with 0 and 1, are exact in float64."""
-_MOST_AT_ONCE = 4096  # features whose products fit into memory; of more, those with one at a time
 
 
 class ClassMoments:
@@ -151,72 +143,3 @@ def rank_features(scores: Tensor, num: int) -> Tensor:
         raise ValueError(f"num must lie in 1..{len(scores)}, got {num}")
     comparable = torch.where(scores.isnan(), -1.0, scores).float()
     return comparable.argsort(descending=True, stable=True)[:num]
-
-
-def rank_distinct(
-    scores: Tensor, features: Tensor, is_slip: Tensor, num: int, most_correlation: float
-) -> Tensor:
-    """The best features that do not repeat each other, best first.
-
-    Goes down the ranking and skips a feature whose correlation with one already taken exceeds
-    ``most_correlation``. Where fewer than ``num`` remain, the best of the skipped ones follow.
-    Correlation is the absolute one of Pearson within classes: of deviations from the mean of the
-    bin's class, over all bins; that of a constant is 0.
-
-    Args:
-        scores: of all features, as for ``rank_features``.
-        features: a sample of training bins, float32 and finite.
-        is_slip: their classes.
-        num: how many features to take.
-        most_correlation: in [0, 1]; 1 skips none.
-
-    Shape:
-        - scores: ``[F]``
-        - features: ``[n, F]``
-        - is_slip: ``[n]``
-        - output: ``[num]``, int64
-
-    Raises:
-        ValueError: if shapes disagree, or ``num`` or ``most_correlation`` is out of range.
-    """
-    if not 0 <= most_correlation <= 1:
-        raise ValueError(f"most_correlation must lie in 0..1, got {most_correlation}")
-    if features.shape != (len(is_slip), len(scores)):
-        raise ValueError(
-            f"expected features [{len(is_slip)}, {len(scores)}], got {tuple(features.shape)}"
-        )
-    best = rank_features(scores, num)
-    if most_correlation == 1:
-        return best
-    taken = torch.empty(num, len(features), dtype=torch.float64)
-    chosen: list[int] = []
-    skipped: list[int] = []
-    for block in rank_features(scores, len(scores)).split(_BLOCK):
-        units = unit_deviations(features[:, block], is_slip)
-        repeats = (_correlation(units, taken[: len(chosen)]) > most_correlation).any(-1)
-        is_near = _correlation(units, units) > most_correlation
-        for row, index in enumerate(block.tolist()):
-            if repeats[row]:
-                skipped.append(index)
-                continue
-            taken[len(chosen)] = units[row]
-            chosen.append(index)
-            if len(chosen) == num:
-                return torch.tensor(chosen)
-            repeats |= is_near[row]
-    return torch.tensor(chosen + skipped[: num - len(chosen)])
-
-
-def unit_deviations(features: Tensor, is_slip: Tensor) -> Tensor:
-    """Deviations from class means, of norm 1 or, of a constant, 0: ``[F, n]``, float64."""
-    moments = ClassMoments(features.shape[1])
-    moments.update(features, is_slip)
-    size = moments.sum_sq_dev.sum(0).sqrt()
-    deviations = features.cpu() - moments.mean[is_slip.cpu().long()]
-    return (deviations / torch.where(size == 0, 1.0, size)).T.contiguous()
-
-
-def _correlation(a: Tensor, b: Tensor) -> Tensor:
-    """Absolute correlations of unit deviations ``[A, n]`` and ``[B, n]``, at most 1, ``[A, B]``."""
-    size = a.square().sum(-1).sqrt()[:, None] * b.square().sum(-1).sqrt()
-    return torch.where(size == 0, 0.0, (a @ b.T).abs() / size).clamp(max=1)

@@ -385,7 +385,7 @@ class _Page:
 
 
 def _caller_class() -> Any:
-    """Connections of one server: of those that are no open page the oldest make room for others."""
+    """Connections of one server: the oldest that are no open page are closed for new ones."""
     from websockets.asyncio.server import ServerConnection
     from websockets.protocol import State
 

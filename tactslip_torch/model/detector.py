@@ -47,13 +47,14 @@ from tactslip_torch.model.prediction import (
 )
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName, Channels, Filters, Machine, backend_of
-from tactslip_torch.package_files import DAMAGE_ERRORS, load_table, save_table
 from tactslip_torch.package_files import DETECTOR as FORMAT
+from tactslip_torch.package_files import load_table, reading, save_table
 from tactslip_torch.runtime import PACKAGE
 from tactslip_torch.signals.filtering import ChannelFilter, check_samples
 
 MOST_BYTES = 2**30
 """Of a file."""
+_MOST_CHANNELS, _MOST_FRAME = 2048, 4001  # beyond, constant matrices take gigabytes or minutes
 
 
 class SlipDetector(nn.Module):
@@ -196,7 +197,7 @@ class SlipDetector(nn.Module):
     def look_ahead(self) -> int:
         """Samples after a bin that its score needs, by the filters of the channels in use.
 
-        What comes after them may be anything; so a stream that uses films alone waits for 5
+        What comes after them may be anything; so a stream of the paper's fast channels waits for 5
         samples, 2.5 ms, and fills up the rest.
         """
         return max(self.channel_filter.reaches[i][1] for i in self.extractor.plan.channels)
@@ -496,18 +497,12 @@ class SlipDetector(nn.Module):
             ValueError: if it is not a detector file, a damaged one, or of an earlier version.
         """
         backend_of(backend)
-        name = os.fspath(path)
         try:
             metadata, state = load_table(path, FORMAT, MOST_BYTES)
         except FileNotFoundError:
-            raise FileNotFoundError(f"no detector at {name}") from None
-        try:
-            with torch.inference_mode(False):  # it may be differentiated later
-                state = {key: value.clone() for key, value in state.items()}
-                return cls._from_table(metadata, state, backend)
-        except DAMAGE_ERRORS as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"{name} is damaged: {reason}") from error
+            raise FileNotFoundError(f"no detector at {os.fspath(path)}") from None
+        with reading(path), torch.inference_mode(False):  # it may be differentiated later
+            return cls._from_table(metadata, {k: v.clone() for k, v in state.items()}, backend)
 
     @classmethod
     def pretrained(cls, name: str = "paper24-sim", backend: BackendName = "auto") -> SlipDetector:
@@ -532,6 +527,11 @@ class SlipDetector(nn.Module):
         """What ``save`` wrote."""
         if odd := [name for name, value in state.items() if not value.is_floating_point()]:
             raise ValueError(f"{odd[0]} must hold floating-point numbers")
+        for name, most in (("channels", _MOST_CHANNELS), ("window_lengths", _MOST_CHANNELS)):
+            if len(metadata[name]) > most:
+                raise ValueError(f"{name} must be at most {most}, got {len(metadata[name])}")
+        if (longest := max(metadata["window_lengths"])) > _MOST_FRAME:
+            raise ValueError(f"window_lengths must be at most {_MOST_FRAME}, got {longest}")
 
         def part(name: str) -> dict[str, Any]:
             start = f"{name}."

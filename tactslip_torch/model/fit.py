@@ -1,25 +1,19 @@
-"""Fitting the machine to training bins by the cheaper route (REFERENCE.md section 5).
+"""The kernel machine fitted to training bins in closed form, and held-out scores without refitting.
 
 On targets of +-1 the kernel extreme learning machine (paper section IV-E) is kernel ridge
-regression with ``alpha = 1 / C``. Two routes to the same machine: dual, one unknown per training
-bin, and primal, one unknown per monomial of the features.
-
-What each training bin would score had its whole group been left out, without refitting.
-
-The weights of the machine are redone; features, scaling and bin weights stay. A group is a bin, a
-cycle, a material: whatever must not stand on both sides of a validation. With ``G = K +
-diag(1 / (C w))`` and ``beta = G^-1 t`` the residuals of a group under the machine without it are
-``e_g = ((G^-1)_gg)^-1 beta_g``; in the primal ``e_g = (I - H_gg)^-1 (t - Phi v)_g`` with the hat
-matrix ``H = Phi A^-1 Phi' W``. Either way one Cholesky factor serves all groups.
+regression with ``alpha = 1 / C``. Two routes to the same machine: *dual*, one unknown per training
+bin, and *primal*, one unknown per monomial of the features. Either is solved by Cholesky or, close
+to singular, by the pseudo-inverse.
 
 Reference:
-    Rasmussen and Williams, Gaussian Processes for Machine Learning, section 5.4.2, and An, Liu and
-    Venkatesh (2007), Pattern Recognition 40(8), 2154-2162, for blocks.
+    Huang, Zhou, Ding and Zhang (2012), IEEE Trans. SMC-B 42(2), 513-529, kernel form; Higham
+    (2002), Accuracy and Stability of Numerical Algorithms, 2nd ed., sections 10.1 (what counts is
+    the condition of the matrix scaled to a diagonal of ones) and 15.3 (its estimate, LAPACK's
+    ``dpocon``); Golub and Van Loan, Matrix Computations, 4th ed., section 5.5 (rank).
 """
 
 from __future__ import annotations
 
-import functools
 import logging
 import math
 from collections.abc import Iterator, Sequence
@@ -33,24 +27,238 @@ from torch.utils.checkpoint import checkpoint
 from tactslip_torch.model.kernels import (
     PAPER_KERNEL,
     Head,
+    KernelSum,
     Polynomial,
     QuadraticForm,
+    SolveReport,
     collapse,
-    gram_matrix,
-    machine_of,
-    solved_machine,
 )
-from tactslip_torch.model.moments import ProductSums
-from tactslip_torch.model.solve import check_weights, solve_symmetric
 
 log = logging.getLogger(__name__)
 
 Route = Literal["auto", "primal", "dual"]
-
+MOST_CONDITION = 1e10
+"""Of all bins; above it scores of a group left out lose their digits."""
+_MOST_CHOLESKY = 1e12  # condition of what Cholesky may solve, and of a fit that is differentiated
+_LARGEST_ERROR = 1e-2  # of a solution that is handed out
+_UNREPORTED_ERROR = 1e-3  # of a least-squares solution; a larger one is logged
+_EPS, _TINY = torch.finfo(torch.float64).eps, torch.finfo(torch.float64).tiny
+_GRAM_ROWS = 512
+_MOST_QUADRATIC = 1000  # features of a machine that always folds
 _CHUNK_BINS = 2048  # whose monomials are held at a time
-_MOST_CONDITION = 1e12  # of a fit that is differentiated
-_MOST_DUAL = 16_384  # bins whose Gram matrix (2 GiB) is worth keeping the light ones
-_LARGEST_LOSS = 1e-3  # of what the lightest bin says, in a sum with the heaviest
+_LEAST_EIGENVALUE = 1e-6  # of I - H_gg; below, the rounding of the factor shows in the scores
+_CHUNK = 256  # bins in whole groups that are treated together, unless one group is larger
+
+# Solve -------------------------------------------------------------------------------------------
+
+
+class Solution(NamedTuple):
+    """Of a system.
+
+    Attributes:
+        x: ``[n]``, float64.
+        report: on the solve.
+        factor: ``[n, n]``, float64, the lower Cholesky factor of ``A + diag(1 / (C w))``; ``None``
+            if the method was another.
+    """
+
+    x: Tensor
+    report: SolveReport
+    factor: Tensor | None
+
+
+def solve_symmetric(
+    matrix: Tensor,
+    right: Tensor,
+    penalty: float,
+    weights: Tensor | None = None,
+    *,
+    name: str = "matrix",
+    in_span: bool = False,
+    most_condition: float | None = None,
+) -> Solution:
+    """``(matrix + diag(1 / (penalty weights)))^-1 right`` in float64, and a report.
+
+    By Cholesky where the condition allows it. Closer to singular, eigenvalues of
+    ``sqrt(w) matrix sqrt(w)`` up to ``n eps`` of the largest count as null, which is
+    ``torch.linalg.pinv(hermitian=True)`` with a ridge: an infinite C gives the minimum-norm
+    (weighted) least-squares solution. Not differentiable.
+
+    Args:
+        matrix: symmetric, positive semi-definite; kept.
+        right: kept.
+        penalty: the paper's ``C``, positive; ``inf`` for minimum-norm (weighted) least squares.
+        weights: positive weight of each unknown; default 1.
+        name: of the matrix, for errors.
+        in_span: the right-hand side lies in the span of the matrix, as that of normal equations.
+        most_condition: raise an error instead of leaving Cholesky, or above this condition.
+
+    Shape:
+        - matrix: ``[n, n]``, float64; right, weights: ``[n]``
+
+    Raises:
+        ValueError: for another dtype, if a number is not finite, the matrix is not positive
+            semi-definite, its rounding drowns the solution, or the pseudo-inverse is needed and not
+            allowed.
+
+    Example:
+        >>> twice = torch.ones(2, 2, dtype=torch.float64)  # one bin, twice
+        >>> x, report, _ = solve_symmetric(twice, twice[0], penalty=1e30)
+        >>> x, report.method, report.rank
+        (tensor([0.5000, 0.5000], dtype=torch.float64), 'pinv', 1)
+    """
+    if matrix.dtype != torch.float64:
+        raise ValueError(f"expected {name} in float64, got {matrix.dtype}; promote it first")
+    matrix, right = matrix.detach(), right.detach().double()
+    weights = torch.ones_like(right) if weights is None else weights.detach().double()
+    ridge = 1 / (penalty * weights)
+    if not (penalty > 0 and bool(ridge.isfinite().all())):
+        raise ValueError(
+            f"penalty (the paper's C) must be positive, and so large that 1 / (C w) is finite, "
+            f"got {penalty}"
+        )
+    system = matrix.clone()
+    system.diagonal().add_(ridge)
+    diagonal = system.diagonal().clone()
+    scale = torch.where(diagonal > 0, diagonal, 1.0).sqrt()
+    system.div_(scale).div_(scale[:, None])
+    norm = float(torch.linalg.matrix_norm(system, 1))
+    if not (math.isfinite(norm) and bool(right.isfinite().all())):
+        _check_finite(matrix, right, name)
+        raise ValueError(f"{name} overflows float64; scale the features")
+    size, factor = len(right), system.mT  # column-major, so that LAPACK works within the copy
+    info = torch.empty((), dtype=torch.int32, device=matrix.device)
+    torch.linalg.cholesky_ex(factor, out=(factor, info))
+    condition = math.inf if info else _condition(factor, norm)
+    most = min(_MOST_CHOLESKY, 1 / (size * _EPS), most_condition or math.inf)
+    if condition <= most:
+        factor.mul_(scale[:, None])
+        x = torch.cholesky_solve(right[:, None], factor)[:, 0]
+        error = math.sqrt(size) * _EPS * condition
+        report = SolveReport("cholesky", size, penalty, condition, size, error)
+        return Solution(_finite(x, name), report, factor)
+    reason = f"{name} + I/C at penalty={penalty:g} has condition {condition:.1e}"
+    if most_condition is not None:
+        raise ValueError(f"{reason}, wanted up to {most_condition:.0e}; lower the penalty")
+    del system, factor
+    x, report = _pseudo_inverse(matrix, right, penalty, weights.sqrt(), in_span, name)
+    if not math.isinf(penalty) or report.error > _UNREPORTED_ERROR:
+        log.warning("%s, too much for Cholesky: solved by %s", reason, report)
+    return Solution(_finite(x, name), report, None)
+
+
+def _pseudo_inverse(
+    matrix: Tensor, right: Tensor, penalty: float, roots: Tensor, in_span: bool, name: str
+) -> tuple[Tensor, SolveReport]:
+    """The solution on what is above rounding; ``roots`` are of the weights.
+
+    Raises:
+        ValueError: if the matrix is not positive semi-definite, or its rounding drowns what is
+            kept.
+    """
+    values, vectors = torch.linalg.eigh(roots * matrix * roots[:, None])
+    top, low, num, ridge = float(values[-1]), float(values[0]), len(values), 1 / penalty
+    cutoff = num * _EPS * top
+    if low < -max(10 * cutoff, 0.0):
+        raise ValueError(
+            f"{name} is not positive semi-definite: it has the eigenvalue {low:.3g} beside "
+            f"{top:.3g}; it must be a sum of squares"
+        )
+    kept = values > cutoff
+    along = vectors.mT @ (roots * right)
+    solved = torch.where(kept, along / (values + ridge), 0.0)
+    least = float(values[kept][0]) + ridge if bool(kept.any()) else math.inf
+    condition = (top + ridge) / least
+    error = math.sqrt(num) * _EPS * max(top, -low) / least
+    if error > _LARGEST_ERROR:
+        raise ValueError(
+            f"{name} at penalty={penalty:g} has rank {int(kept.sum())} of {num} and a condition of "
+            f"{condition:.1e}, too much for its rounding ({error:.0e} of the scores); lower the "
+            "penalty, or leave out what is nearly duplicate"
+        )
+    lost = float(torch.linalg.vector_norm(along[~kept]))
+    scores = values.clamp(min=0).sqrt() * solved if in_span else along
+    most = 2 * math.sqrt(ridge) if in_span else 1.0  # sqrt(v) / (v + ridge) is largest at the ridge
+    if lost > 0:  # a v up to the cutoff adds v / (v + ridge) of what lies along it
+        left_out = lost / max(most * float(torch.linalg.vector_norm(scores)), _TINY)
+        error = max(error, min(left_out, 1.0))
+    report = SolveReport("pinv", num, penalty, condition, int(kept.sum()), error)
+    return roots * (vectors @ solved), report
+
+
+def _condition(factor: Tensor, norm: float) -> float:
+    """Estimate from a lower Cholesky factor, column-major, and the 1-norm of the matrix."""
+    from scipy.linalg.lapack import dpocon  # as long to import as a fifth of torch
+
+    reciprocal, _ = dpocon(factor.cpu().numpy(), norm, uplo="L")
+    return 1 / reciprocal if reciprocal > 0 else math.inf
+
+
+def _check_finite(matrix: Tensor, right: Tensor, name: str) -> None:
+    """Name the first number that is not."""
+    for what, values in ((name, matrix), (f"right-hand side of {name}", right)):
+        if not bool(values.isfinite().all()):
+            place = (~values.isfinite()).nonzero()[0].tolist()
+            raise ValueError(
+                f"{what} must be finite, got {float(values[tuple(place)])} at {place}; leave out "
+                "or mask the bin it comes from"
+            )
+
+
+def _finite(x: Tensor, name: str) -> Tensor:
+    """A solution as it is handed out: refused where it overflows float64."""
+    if not bool(x.isfinite().all()):
+        worst = float(x[~x.isfinite()][0])
+        raise ValueError(
+            f"the solution for {name} leaves float64: an entry is {worst:.3g}; scale the features "
+            "or the penalty"
+        )
+    return x
+
+
+def check_weights(weights: Tensor) -> None:
+    """Refuse weights of bins that are not positive and finite.
+
+    Raises:
+        ValueError: if there is one.
+    """
+    if len(wrong := (~((weights > 0) & weights.isfinite())).nonzero()):
+        place = int(wrong[0])
+        raise ValueError(
+            f"weights must be positive and finite, got {float(weights[place]):g} at bin {place}"
+        )
+
+
+def solve_normal_equations(
+    normal: Tensor,
+    moment: Tensor,
+    penalty: float,
+    kernel: Polynomial,
+    num_features: int,
+    most_condition: float | None = None,
+) -> tuple[QuadraticForm, Tensor | None]:
+    """The machine of normal equations in the monomials, and their Cholesky factor.
+
+    Args:
+        normal: ``X' W X``.
+        moment: ``X' W t``.
+        penalty: the paper's ``C``.
+        kernel: of the machine.
+        num_features: ``K``.
+        most_condition: as ``solve_symmetric``, like the errors and the factor.
+
+    Shape:
+        - normal: ``[P, P]``; moment: ``[P]``
+    """
+    x, report, factor = solve_symmetric(
+        normal, moment, penalty, name="X'WX", in_span=True, most_condition=most_condition
+    )
+    head = kernel.head(x, num_features)
+    head.solved = report
+    return head, factor
+
+
+# Fit ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -105,51 +313,257 @@ def fit_machine(
 ) -> Head:
     """Solve the kernel machine, and fold it into its quadratic form unless that is larger.
 
-    Through the primal or the dual, whichever ``takes_dual`` finds cheaper; both give the same
-    machine. The primal takes two matrices of monomials by monomials (7381 for 120 features)
-    whatever the number of bins; the dual takes two of bins by bins. In float64, and however close
-    to singular (``solve``); ``solved`` of the machine says how it went. Weights so far apart that
-    sums of the primal would lose the lightest bin take the dual up to 16384 bins.
+    The primal takes two matrices of monomials by monomials (7381 for 120 features) whatever the
+    number of bins; the dual takes two of bins by bins. ``solved`` of the machine says how it went.
 
     Args:
         bins: scaled training bins; float32 is promoted exactly.
         penalty: the paper's ``C``; ``inf`` for the pseudo-inverse.
         kernel: of the machine.
-        route: ``"auto"``, or the one to take.
+        route: ``"auto"`` for the cheaper, or the one to take.
 
     Raises:
-        ValueError: if a number is not finite, or the primal would lose the lightest bin to
-            rounding.
+        ValueError: if there is no bin, a number is not finite, or as ``solve_symmetric``.
     """
     if len(bins.features) == 0:
         raise ValueError("a machine needs training bins, got none; add bins of both classes")
     bins = bins.double()
-    if not _goes_dual(bins, penalty, kernel, route):
-        normal = _normal_matrix(kernel, bins.features, bins.sample_weight)
-        moment = kernel.sum_of_monomials(bins.features, bins.sample_weight * bins.targets)
-        return kernel.solve(normal, moment, penalty, bins.features.shape[1])[0]
-    gram = gram_matrix(kernel, bins.features)
-    solution = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
-    num_features = bins.features.shape[1]
-    most_rank = kernel.num_monomials(num_features)
-    make = functools.partial(machine_of, bins.features, kernel=kernel)
-    machine = solved_machine(solution, make, most_rank)
-    if not isinstance(machine, QuadraticForm):
-        log.info(
-            "%s of more features than bins: all %d training bins are kept, %s",
-            kernel,
-            len(bins.features),
-            machine.cost,
-        )
+    z, num_features = bins.features, bins.features.shape[1]
+    if not _is_dual(route, kernel, *z.shape):
+        normal = kernel.sums(z, bins.sample_weight)
+        moment = kernel.sum_of_monomials(z, bins.sample_weight * bins.targets)
+        return solve_normal_equations(normal, moment, penalty, kernel, num_features)[0]
+    gram = _gram_matrix(kernel, z)
+    beta, report, _ = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
+    machine = _machine_of(z, beta, kernel)
+    machine.solved = report
+    if isinstance(machine, KernelSum):
+        log.info("%s of more features than bins: all %d bins are kept, %s", kernel, len(z),
+                 machine.cost)  # fmt: skip
     return machine
 
 
-def _normal_matrix(kernel: Polynomial, z: Tensor, weights: Tensor) -> Tensor:
-    """``X' W X`` of the monomials of bins ``[N, K]``, by way of the sums that are distinct."""
-    layout = ProductSums(z.shape[1], kernel.degree)
-    total = z.new_zeros(layout.num_held)
-    layout.add_(total, z, weights)
-    return layout.normal_matrix(total, kernel.offset)
+def _machine_of(support: Tensor, beta: Tensor, kernel: Polynomial) -> Head:
+    """A kernel sum, folded unless it has fewer numbers: more than 1000 features, and fewer bins."""
+    is_wide = support.shape[1] > max(_MOST_QUADRATIC, len(support))
+    if is_wide and kernel.degree == 2:
+        return KernelSum(support, beta, kernel)
+    return collapse(support, beta, kernel)
+
+
+def _is_dual(route: Route, kernel: Polynomial, num_bins: int, num_features: int) -> bool:
+    """Whether the dual is asked for, or the cheaper route by the multiply-adds of both.
+
+    At degree 2 a Cholesky factorisation in as many unknowns as bins stands against one in as many
+    as monomials and the sums it is made of: for 120 features up to 9800 bins, not just 7381.
+
+    Raises:
+        ValueError: for an unknown route.
+    """
+    if route not in ("auto", "primal", "dual"):
+        raise ValueError(f"route must be 'auto', 'primal' or 'dual', got {route!r}")
+    num_monomials = kernel.num_monomials(num_features)
+    sums = math.comb(num_features + 4, 4) * num_bins if kernel.degree == 2 else 0
+    return route == "dual" or (route == "auto" and num_bins**3 <= num_monomials**3 + 6 * sums)
+
+
+def _gram_matrix(kernel: Polynomial, z: Tensor) -> Tensor:
+    """``kernel(z, z)``, not differentiable, in the memory of the result: ``[N, K] -> [N, N]``."""
+    gram = z.new_empty(len(z), len(z))
+    with torch.no_grad():
+        for rows, some in zip(gram.split(_GRAM_ROWS), z.split(_GRAM_ROWS), strict=True):
+            rows.copy_(kernel(some, z))
+    return gram
+
+
+# Held out ----------------------------------------------------------------------------------------
+#
+# What each training bin would score had its whole group been left out, without refitting. With
+# G = K + diag(1 / (C w)) and beta = G^-1 t the residuals of a group under the machine without it
+# are e_g = ((G^-1)_gg)^-1 beta_g; in the primal e_g = (I - H_gg)^-1 (t - Phi v)_g with the hat
+# matrix H = Phi A^-1 Phi' W. One Cholesky factor serves all groups. Rasmussen and Williams,
+# Gaussian Processes for Machine Learning, section 5.4.2; for blocks An, Liu and Venkatesh (2007),
+# Pattern Recognition 40(8), 2154-2162.
+
+
+class HeldOutFit(NamedTuple):
+    """A machine, and what its training bins would score without their groups.
+
+    Attributes:
+        head: the machine of all bins.
+        scores: ``[N]``, each from the machine without the bin's group.
+    """
+
+    head: Head
+    scores: Tensor
+
+
+class HeldOut:
+    """Exact leave-one-group-out scores for any number of values of C.
+
+    The matrix that does not depend on C is kept, ``[P, P]`` or ``[N, N]``, and ``at`` takes another
+    one of that size. Beyond the fit it costs about one and a half factorisations in the dual. In
+    the primal a bin costs ``P^2 / 2`` multiply-adds, and a group a factorisation in as many
+    unknowns as it has bins, at most ``P``.
+
+    Args:
+        bins: scaled training bins; float32 is promoted exactly.
+        groups: ``[N]``, whole numbers; bins of one group need not stand together.
+        kernel: of the machine.
+        route: as ``fit_machine``.
+
+    Raises:
+        ValueError: if shapes disagree, all bins are one group, leaving a group (named)
+            out leaves one class.
+    """
+
+    def __init__(
+        self,
+        bins: TrainingBins,
+        groups: Tensor,
+        kernel: Polynomial = PAPER_KERNEL,
+        route: Route = "auto",
+    ) -> None:
+        bins = bins.double()
+        self._order, self._groups = _in_groups(groups, bins.is_slip)
+        self._kernel, self._z = kernel, bins.features[self._order]
+        self._targets, self._weights = bins.targets[self._order], bins.sample_weight[self._order]
+        self._is_dual = _is_dual(route, kernel, *self._z.shape)
+        if self._is_dual:
+            self._system = _gram_matrix(kernel, self._z)
+        else:
+            self._system = kernel.sums(self._z, self._weights)
+
+    def at(self, penalty: float) -> HeldOutFit:
+        """The machine and the held-out scores for one value of C.
+
+        The scores are right to 100 eps times the condition of the system of all bins.
+
+        Args:
+            penalty: the paper's ``C``, positive and finite.
+
+        Raises:
+            ValueError: if the penalty is not that, the condition is above ``MOST_CONDITION``, or
+                the machine without a group (named) cannot be told in float64.
+        """
+        _check_penalty(penalty)
+        head, residuals = self._dual(penalty) if self._is_dual else self._primal(penalty)
+        scores = torch.empty_like(residuals)
+        scores[self._order] = self._targets - residuals
+        return HeldOutFit(head, scores)
+
+    def _dual(self, penalty: float) -> tuple[Head, Tensor]:
+        beta, report, factor = solve_symmetric(
+            self._system, self._targets, penalty, self._weights, name="gram",
+            most_condition=MOST_CONDITION,
+        )  # fmt: skip
+        assert factor is not None  # as most_condition is given
+        residuals = torch.empty_like(beta)
+        for groups, part in _chunks(self._groups):
+            unit = factor.new_zeros(len(beta) - part.start, part.stop - part.start)
+            unit.fill_diagonal_(1.0)
+            # columns of L^-1 are 0 above their diagonal: the later a group, the cheaper
+            columns = torch.linalg.solve_triangular(
+                factor[part.start :, part.start :], unit, upper=False
+            )
+            inverse = columns.mT @ columns
+            for _, own in groups:
+                within = slice(own.start - part.start, own.stop - part.start)
+                lower = torch.linalg.cholesky(inverse[within, within])
+                residuals[own] = torch.cholesky_solve(beta[own, None], lower)[:, 0]
+        head = _machine_of(self._z, beta, self._kernel)
+        head.solved = report
+        return head, residuals
+
+    def _primal(self, penalty: float) -> tuple[Head, Tensor]:
+        kernel, z, roots = self._kernel, self._z, self._weights.sqrt()
+        moment = kernel.sum_of_monomials(z, self._weights * self._targets)
+        head, factor = solve_normal_equations(
+            self._system, moment, penalty, kernel, z.shape[1], MOST_CONDITION
+        )
+        assert factor is not None  # as most_condition is given
+        errors = self._targets - head(z)
+        residuals = torch.empty_like(errors)
+        for groups, part in _chunks(self._groups):
+            scaled = kernel.monomials(z[part]) * roots[part, None]
+            columns = torch.linalg.solve_triangular(factor, scaled.mT, upper=False)
+            for name, own in groups:
+                # (I - b'b)^-1 right = right + b' (I - b b')^-1 b right: the smaller matrix of both
+                b = columns[:, own.start - part.start : own.stop - part.start]
+                is_long = b.shape[1] > b.shape[0]
+                hat = b @ b.mT if is_long else b.mT @ b
+                lower, info = torch.linalg.cholesky_ex(torch.eye(len(hat)).to(hat) - hat)
+                if info or bool((lower.diagonal().square() < _LEAST_EIGENVALUE).any()):
+                    raise ValueError(
+                        f"the machine without group {name} is too far from the machine of all bins "
+                        "to be told from it in float64; lower the penalty, or refit without the "
+                        "group"
+                    )
+                right = (roots * errors)[own, None]
+                if is_long:
+                    right = right + b.mT @ torch.cholesky_solve(b @ right, lower)
+                else:
+                    right = torch.cholesky_solve(right, lower)
+                residuals[own] = right[:, 0] / roots[own]
+        return head, residuals
+
+
+_Group = tuple[int, slice]  # its name, and its rows among ordered bins
+
+
+def _in_groups(groups: Tensor, is_slip: Tensor) -> tuple[Tensor, list[_Group]]:
+    """Which bin comes where when large groups come last, ``[N]``, and the groups in that order.
+
+    Raises:
+        ValueError: if there is one group, or without one of them a class has no bin.
+    """
+    if groups.shape != is_slip.shape or groups.is_floating_point():
+        raise ValueError(
+            f"expected a whole number for the group of each of {len(is_slip)} bins, got "
+            f"{tuple(groups.shape)} {groups.dtype}"
+        )
+    names, member, counts = torch.unique(groups, return_inverse=True, return_counts=True)
+    if len(names) < 2:
+        raise ValueError(
+            f"held-out scores need at least two groups, all {len(is_slip)} bins are in "
+            f"{names.tolist()}"
+        )
+    for kind, own in (("slip", is_slip), ("non-slip", ~is_slip)):
+        having = groups[own].unique()
+        if len(having) < 2:
+            name = int(having[0] if len(having) else names[0])
+            raise ValueError(
+                f"without group {name} no {kind} bin is left to train on; take smaller groups, or "
+                "other bins"
+            )
+    rank = counts.argsort(stable=True)
+    order = rank.argsort()[member].argsort(stable=True)
+    ends = counts[rank].cumsum(0).tolist()
+    rows = map(slice, [0, *ends[:-1]], ends)
+    return order, list(zip(names[rank].tolist(), rows, strict=True))
+
+
+def _chunks(groups: Sequence[_Group]) -> Iterator[tuple[list[_Group], slice]]:
+    """Whole groups and their bins: as many as fit a chunk, at least one."""
+    some: list[_Group] = []
+    for name, rows in groups:
+        if some and rows.stop - some[0][1].start > _CHUNK:
+            yield some, slice(some[0][1].start, some[-1][1].stop)
+            some = []
+        some.append((name, rows))
+    yield some, slice(some[0][1].start, some[-1][1].stop)
+
+
+def _check_penalty(penalty: float) -> None:
+    """That it is one for which groups can be left out in closed form."""
+    if not 0 < penalty < math.inf:
+        raise ValueError(
+            f"a closed form needs a positive and finite penalty (the paper's C), got {penalty}; "
+            "fit_machine takes an infinite one"
+        )
+
+
+# Derivatives -------------------------------------------------------------------------------------
 
 
 def fit_quadratic(
@@ -172,7 +586,7 @@ def fit_quadratic(
         offset: the kernel's ``c``, at least 0; likewise; positive if the primal is to
             have a derivative by it.
         weights: positive weight of each bin; default 1.
-        route: ``"auto"``, which is that of ``fit_machine``, or the one to take.
+        route: as ``fit_machine``.
 
     Shape:
         - z: ``[N, K]``; targets, weights: ``[N]``
@@ -195,13 +609,12 @@ def fit_quadratic(
     targets = targets.to(z)
     c, offset = (torch.as_tensor(x, dtype=z.dtype, device=z.device) for x in (penalty, offset))
     bins = TrainingBins(z.detach(), targets.detach() > 0, weights).double()
-    if len(z) == 0 or not 0 < c.item() < math.inf:
-        raise ValueError(
-            f"a fit to be differentiated needs bins and a positive and finite penalty (the paper's "
-            f"C), got {len(z)} bins and C={c.item()}; fit_machine takes an infinite one"
-        )
+    if len(z) == 0:
+        raise ValueError("a machine needs training bins, got none; add bins of both classes")
+    _check_penalty(c.item())
     weights = bins.sample_weight
-    is_dual = _goes_dual(bins, c.item(), Polynomial(2, offset.item()), route)
+    kernel = Polynomial(2, offset.item())
+    is_dual = _is_dual(route, kernel, *z.shape)
     kernel = Polynomial(2, offset)  # type: ignore[arg-type]  # a tensor, to be derived by
     if is_dual:
         system, right, ridge = kernel(z, z), targets, 1 / (c * weights)
@@ -221,178 +634,15 @@ def fit_quadratic(
             [checkpoint(normal, *chunk, offset, use_reentrant=False) for chunk in chunks]
         ).sum(0)
         right, ridge = kernel.sum_of_monomials(z, weights * targets), (1 / c).expand(len(system))
-    _, report, *_ = solve_symmetric(
-        system,
-        right,
-        c.item(),
-        weights if is_dual else None,
-        name="gram" if is_dual else "X'WX",
-        most_condition=_MOST_CONDITION,
-    )
+    weighted, name = (weights, "gram") if is_dual else (None, "X'WX")
+    report = solve_symmetric(
+        system, right, c.item(), weighted, name=name, most_condition=_MOST_CHOLESKY
+    ).report
     lower = torch.linalg.cholesky(system + ridge.diag())
     solved = torch.cholesky_solve(right[:, None], lower)[:, 0]
     machine = collapse(z, solved, kernel) if is_dual else kernel.head(solved, z.shape[1])
     machine.solved = report
     return machine
-
-
-def takes_dual(kernel: Polynomial, num_bins: int, num_features: int) -> bool:
-    """Whether the dual is the cheaper route, by the multiply-adds of both.
-
-    At degree 2 a Cholesky factorisation in as many unknowns as bins stands against one in as many
-    as monomials and the sums it is made of: for 120 features up to 9800 bins, not just 7381.
-    """
-    num_monomials = kernel.num_monomials(num_features)
-    if kernel.degree == 1:
-        return num_bins <= num_monomials
-    sums = math.comb(num_features + 4, 4) * num_bins
-    return num_bins**3 <= num_monomials**3 + 6 * sums
-
-
-def check_route(route: str) -> None:
-    """Refuse an unknown route.
-
-    Raises:
-        ValueError: if it is one.
-    """
-    if route not in ("auto", "primal", "dual"):
-        raise ValueError(f"route must be 'auto', 'primal' or 'dual', got {route!r}")
-
-
-def _goes_dual(bins: TrainingBins, penalty: float, kernel: Polynomial, route: Route) -> bool:
-    """Whether the dual is asked for, cheaper, or needed: sums would lose the lightest bin."""
-    check_route(route)
-    num_bins, num_features = bins.features.shape
-    if route == "dual" or (route == "auto" and takes_dual(kernel, num_bins, num_features)):
-        return True
-    longest = float(bins.features.square().sum(-1).max()) + kernel.offset
-    lightest, heaviest = (float(x) for x in bins.sample_weight.detach().aminmax())
-    light, heavy = (weight * longest**kernel.degree for weight in (lightest, heaviest))
-    lost = torch.finfo(torch.float64).eps * heavy / (light + 1 / penalty) if penalty > 0 else 0.0
-    if not lost > _LARGEST_LOSS:
-        return False
-    if route == "auto" and num_bins <= _MOST_DUAL:
-        return True
-    raise ValueError(
-        f"weights from {lightest:.1e} to {heaviest:.1e} are too far apart for X'WX: it "
-        f"loses {lost:.0e} of the lightest bin to rounding, wanted up to {_LARGEST_LOSS:.0e}; "
-        "take the dual, or lower the penalty"
-    )
-
-
-MOST_CONDITION = 1e10  # of all bins; above, the scores of a group left out lose their digits
-_LEAST_EIGENVALUE = 1e-6  # of I - H_gg; below, the rounding of the factor shows in the scores
-_CHUNK = 256  # bins in whole groups that are treated together, unless one group is larger
-
-
-class HeldOutFit(NamedTuple):
-    """A machine, and what its training bins would score without their groups.
-
-    Attributes:
-        head: the machine of all bins.
-        scores: ``[N]``, each from the machine without the bin's group.
-    """
-
-    head: Head
-    scores: Tensor
-
-
-class HeldOut:
-    """Exact leave-one-group-out scores for any number of values of C.
-
-    Through the primal or the dual as ``fit_machine``. The matrix that does not depend on C is kept,
-    ``[P, P]`` or ``[N, N]``, and ``at`` takes another one of that size. Beyond the fit it costs
-    about one and a half factorisations in the dual. In the primal a bin costs ``P^2 / 2``
-    multiply-adds, and a group a factorisation in as many unknowns as it has bins, at most ``P``.
-
-    Args:
-        bins: scaled training bins; float32 is promoted exactly.
-        groups: ``[N]``, whole numbers; bins of one group need not stand together.
-        kernel: of the machine.
-        route: ``"auto"``, or the one to take.
-
-    Raises:
-        ValueError: if shapes disagree, all bins are one group, leaving a group (named)
-            out leaves one class.
-    """
-
-    def __init__(
-        self,
-        bins: TrainingBins,
-        groups: Tensor,
-        kernel: Polynomial = PAPER_KERNEL,
-        route: Route = "auto",
-    ) -> None:
-        check_route(route)
-        bins = bins.double()
-        _check_groups(groups, bins.is_slip)
-        self._order, self._groups = ordered_groups(groups)
-        self._kernel, self._z = kernel, bins.features[self._order]
-        self._targets, self._weights = bins.targets[self._order], bins.sample_weight[self._order]
-        num_bins, num_features = self._z.shape
-        self._is_dual = route == "dual"
-        if route == "auto":
-            self._is_dual = takes_dual(kernel, num_bins, num_features)
-        if self._is_dual:
-            self._system = gram_matrix(kernel, self._z)
-        else:
-            self._system = _normal_matrix(kernel, self._z, self._weights)
-
-    def at(self, penalty: float) -> HeldOutFit:
-        """The machine and the held-out scores for one value of C.
-
-        The scores are right to 100 eps times the condition of the system of all bins.
-
-        Args:
-            penalty: the paper's ``C``, positive and finite.
-
-        Raises:
-            ValueError: if the penalty is not that, the condition is above ``MOST_CONDITION``, or
-                the machine without a group (named) cannot be told in float64.
-        """
-        _check_penalty(penalty)
-        head, residuals = self._dual(penalty) if self._is_dual else self._primal(penalty)
-        scores = torch.empty_like(residuals)
-        scores[self._order] = self._targets - residuals
-        return HeldOutFit(head, scores)
-
-    def _dual(self, penalty: float) -> tuple[Head, Tensor]:
-        beta, report, factor, _ = solve_symmetric(
-            self._system,
-            self._targets,
-            penalty,
-            self._weights,
-            name="gram",
-            most_condition=MOST_CONDITION,
-        )
-        assert factor is not None  # as most_condition is given
-        residuals = torch.empty_like(beta)
-        for groups, part in _chunks(self._groups):
-            unit = factor.new_zeros(len(beta) - part.start, part.stop - part.start)
-            unit.fill_diagonal_(1.0)
-            # columns of L^-1 are 0 above their diagonal: the later a group, the cheaper
-            columns = torch.linalg.solve_triangular(
-                factor[part.start :, part.start :], unit, upper=False
-            )
-            products = columns.mT @ columns
-            for own in groups:
-                block = own.within(products, part)
-                lower = torch.linalg.cholesky(block)
-                residuals[own.rows] = torch.cholesky_solve(beta[own.rows, None], lower)[:, 0]
-        head = machine_of(self._z, beta, self._kernel)
-        head.solved = report
-        return head, residuals
-
-    def _primal(self, penalty: float) -> tuple[Head, Tensor]:
-        kernel, weights = self._kernel, self._weights
-        moment = kernel.sum_of_monomials(self._z, weights * self._targets)
-        num_features = self._z.shape[1]
-        head, factor = kernel.solve(self._system, moment, penalty, num_features, MOST_CONDITION)
-        assert factor is not None  # as most_condition is given
-        residuals = self._targets - head(self._z)
-        return head, residuals_without(
-            self._groups, kernel, factor, self._z, weights.sqrt(), residuals
-        )
 
 
 def held_out_scores(
@@ -433,8 +683,7 @@ def held_out_scores(
         torch.Size([4, 1])
     """
     bins = TrainingBins(z, is_slip, weights).double()
-    _check_groups(groups, is_slip)
-    order, members = ordered_groups(groups)
+    order, members = _in_groups(groups, is_slip)
     c, offset = (
         torch.as_tensor(x, dtype=torch.float64, device=z.device) for x in (penalty, offset)
     )
@@ -447,122 +696,5 @@ def held_out_scores(
     )
     inverse = torch.linalg.inv(gram + (1 / (c * sample_weight)).diag())
     beta = inverse @ targets
-    residuals = [torch.linalg.solve(inverse[own.rows, own.rows], beta[own.rows]) for own in members]
+    residuals = [torch.linalg.solve(inverse[own, own], beta[own]) for _, own in members]
     return (targets - torch.cat(residuals))[order.argsort()]
-
-
-def residuals_without(
-    groups: Sequence[Group],
-    kernel: Polynomial,
-    factor: Tensor,
-    z: Tensor,
-    roots: Tensor,
-    residuals: Tensor,
-) -> Tensor:
-    """Residuals of each bin under the machine without its group; a group's monomials are in memory.
-
-    Args:
-        groups: ``ordered_groups`` of the bins.
-        kernel: of degree 1 or 2.
-        factor: the lower Cholesky factor of the normal equations of all bins.
-        z: scaled features.
-        roots: of the weights.
-        residuals: of the machine of all bins.
-
-    Shape:
-        - factor: ``[P, P]``; z: ``[N, K]``; roots, residuals, output: ``[N]``
-
-    Raises:
-        ValueError: if a group leaves too little.
-    """
-    found = torch.empty_like(residuals)
-    for some, part in _chunks(groups):
-        scaled = kernel.monomials(z[part]) * roots[part, None]
-        columns = torch.linalg.solve_triangular(factor, scaled.mT, upper=False)
-        for own in some:
-            # (I - b'b)^-1 right = right + b' (I - b b')^-1 b right: whichever matrix is smaller
-            b = columns[:, own.rows.start - part.start : own.rows.stop - part.start]
-            is_long = b.shape[1] > b.shape[0]
-            hat = b @ b.mT if is_long else b.mT @ b
-            lower, info = torch.linalg.cholesky_ex(torch.eye(len(hat)).to(hat) - hat)
-            if info or bool((lower.diagonal().square() < _LEAST_EIGENVALUE).any()):
-                raise ValueError(
-                    f"the machine without group {own.name} is too far from the machine of all bins "
-                    "to be told from it in float64; lower the penalty, or refit without the group"
-                )
-            right = (roots * residuals)[own.rows, None]
-            if is_long:
-                right = right + b.mT @ torch.cholesky_solve(b @ right, lower)
-            else:
-                right = torch.cholesky_solve(right, lower)
-            found[own.rows] = right[:, 0] / roots[own.rows]
-    return found
-
-
-class Group(NamedTuple):
-    """A group, and its rows among ordered bins."""
-
-    name: int
-    rows: slice
-
-    def within(self, products: Tensor, part: slice) -> Tensor:
-        """Its own block of a matrix over the bins of a part."""
-        own = slice(self.rows.start - part.start, self.rows.stop - part.start)
-        return products[own, own]
-
-
-def ordered_groups(groups: Tensor) -> tuple[Tensor, list[Group]]:
-    """Which bin comes where when large groups come last, and the groups in that order.
-
-    Shape:
-        - groups, order: ``[N]``, whole numbers
-    """
-    names, member, counts = torch.unique(groups, return_inverse=True, return_counts=True)
-    rank = counts.argsort(stable=True)
-    order = rank.argsort()[member].argsort(stable=True)
-    ends = counts[rank].cumsum(0).tolist()
-    slices = map(slice, [0, *ends[:-1]], ends)
-    return order, list(map(Group, names[rank].tolist(), slices))
-
-
-def _chunks(groups: Sequence[Group]) -> Iterator[tuple[list[Group], slice]]:
-    """Whole groups and their bins: as many as fit a chunk, at least one."""
-    some: list[Group] = []
-    for own in groups:
-        if some and own.rows.stop - some[0].rows.start > _CHUNK:
-            yield some, slice(some[0].rows.start, some[-1].rows.stop)
-            some = []
-        some.append(own)
-    if some:
-        yield some, slice(some[0].rows.start, some[-1].rows.stop)
-
-
-def _check_penalty(penalty: float) -> None:
-    """That it is one for which groups can be left out in closed form."""
-    if not 0 < penalty < math.inf:
-        raise ValueError(
-            f"held-out scores in closed form need a positive and finite penalty (the paper's "
-            f"C), got {penalty}; refit without each group for another"
-        )
-
-
-def _check_groups(groups: Tensor, is_slip: Tensor) -> None:
-    if groups.shape != is_slip.shape or groups.is_floating_point():
-        raise ValueError(
-            f"expected a whole number for the group of each of {len(is_slip)} bins, got "
-            f"{tuple(groups.shape)} {groups.dtype}"
-        )
-    names = groups.unique()
-    if len(names) < 2:
-        raise ValueError(
-            f"held-out scores need at least two groups, all {len(is_slip)} bins are in "
-            f"{names.tolist()}"
-        )
-    for kind, own in (("slip", is_slip), ("non-slip", ~is_slip)):
-        having = groups[own].unique()
-        if len(having) < 2:
-            name = int(having[0] if len(having) else names[0])
-            raise ValueError(
-                f"without group {name} no {kind} bin is left to train on; take smaller groups, or "
-                "other bins"
-            )

@@ -1,28 +1,23 @@
 """The kernel, its explicit features, and the heads that a sum over training bins becomes.
 
 The paper's is the polynomial of degree 2 (section IV-E). Polynomials of degree 1 and 2 in K
-features have few monomials, so their sum over the training bins folds into one quadratic form of
-fixed size:
-``sum_i beta_i (z_i . z + c)^2 = z' Q z + l' z + a`` with ``Q = Z' diag(beta) Z``,
-``l = 2 c Z' beta`` and ``a = c^2 sum(beta)``. Degree 1 likewise, with ``Q = 0`` (not stored),
-``l = Z' beta``, ``a = c sum(beta)``. Where there are far more features than bins, the sum stays.
+features have few monomials, so the sum over the training bins folds into one quadratic form of
+fixed size: of degree 2 ``sum_i beta_i (z_i . z + c)^2 = z' Q z + l' z + a`` with
+``Q = Z' diag(beta) Z``, ``l = 2 c Z' beta`` and ``a = c^2 sum(beta)``; of degree 1 with ``Q = 0``
+(not stored), ``l = Z' beta`` and ``a = c sum(beta)``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.model.solve import Solution, SolveReport, solve_symmetric
-
-_GRAM_ROWS = 512
-_MOST_QUADRATIC = 1000
+from tactslip_torch.model.products import ProductSums
 
 
 @dataclass(frozen=True)
@@ -120,34 +115,16 @@ class Polynomial:
         squares = upper[1:, 1:]
         return QuadraticForm((squares + squares.mT) / 2, upper[0, 1:], upper[0, 0])
 
-    def solve(
-        self,
-        normal: Tensor,
-        moment: Tensor,
-        penalty: float,
-        num_features: int,
-        most_condition: float | None = None,
-    ) -> tuple[QuadraticForm, Tensor | None]:
-        """The machine of normal equations in the monomials, and their Cholesky factor.
-
-        Args:
-            normal: ``X' W X``.
-            moment: ``X' W t``.
-            penalty: the paper's ``C``.
-            num_features: ``K``.
-            most_condition: as ``solve_symmetric``, like the errors and the factor.
+    def sums(self, z: Tensor, weights: Tensor) -> Tensor:
+        """``X' W X`` of the monomials of bins, by way of the sums that are distinct.
 
         Shape:
-            - normal: ``[P, P]``; moment: ``[P]``
+            - z: ``[N, K]``; weights: ``[N]``; output: ``[P, P]``, all float64
         """
-        solution = solve_symmetric(
-            normal, moment, penalty, name="X'WX", in_span=True, most_condition=most_condition
-        )
-
-        make = partial(self.head, num_features=num_features)
-        machine = solved_machine(solution, make, len(normal))
-        assert isinstance(machine, QuadraticForm)
-        return machine, solution.factor
+        layout = ProductSums(z.shape[1], self.degree)
+        total = z.new_zeros(layout.num_held)
+        layout.add_(total, z, weights)
+        return layout.normal_matrix(total, self.scale(z.shape[1]))
 
     def _pairs(self, num_features: int) -> tuple[Tensor, Tensor]:
         """The two variables of each monomial, of which 0 is the constant 1."""
@@ -190,43 +167,7 @@ def kernel_from_dict(values: Mapping[str, Any]) -> Polynomial:
         raise ValueError(f"{numbers} does not describe a polynomial kernel") from error
 
 
-def gram_matrix(kernel: Polynomial, z: Tensor) -> Tensor:
-    """``kernel(z, z)``, not differentiable, in the memory of the result.
-
-    Shape:
-        - z: ``[N, K]``; output: ``[N, N]``
-    """
-    gram = z.new_empty(len(z), len(z))
-    with torch.no_grad():
-        for rows, some in zip(gram.split(_GRAM_ROWS), z.split(_GRAM_ROWS), strict=True):
-            rows.copy_(kernel(some, z))
-    return gram
-
-
-def solved_machine(solution: Solution, make: Callable[[Tensor], Head], most_rank: int) -> Head:
-    """The machine of solved weights; its report has the error of a quadratic form's coefficients.
-
-    Args:
-        solution: of the weights.
-        make: a machine of weights.
-        most_rank: as many components as can differ from 0, those of the map.
-    """
-    machine, report = make(solution.x), solution.report
-    if isinstance(machine, QuadraticForm):
-        largest = float(_coefficients(machine).abs().max())
-        moved = max(float(_coefficients(make(move)).abs().max()) for move in solution.moves.mT)
-        elsewhere = math.inf
-        if report.rank >= min(report.size, most_rank):
-            elsewhere = moved / largest if largest > 0 else 0.0
-        report = replace(report, elsewhere=elsewhere)
-    machine.solved = report
-    return machine
-
-
-def _coefficients(machine: Head) -> Tensor:
-    assert isinstance(machine, QuadraticForm)
-    parts = (machine.dense_quadratic.flatten(), machine.linear, machine.constant[None])
-    return torch.cat(parts)
+# Heads -------------------------------------------------------------------------------------------
 
 
 class Cost(NamedTuple):
@@ -242,6 +183,45 @@ class Cost(NamedTuple):
         return (
             f"{self.multiply_adds / 1000:.1f} k multiply-adds a bin and "
             f"{self.num_bytes / 1000:.1f} kB"
+        )
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """How a system was solved, and how far rounding may reach.
+
+    Attributes:
+        method: by which factorisation.
+        size: number of unknowns.
+        penalty: the paper's ``C``.
+        condition: of the components kept; for ``"cholesky"`` an estimate, of the system scaled to a
+            diagonal of ones.
+        rank: components kept; all but for ``"pinv"``.
+        error: of the scores of training bins relative to the targets, in the mean square by weight,
+            to first order in the rounding of the matrix. For ``"pinv"`` it counts what the
+            components left out could add: nothing if they are null, as those of duplicates are.
+    """
+
+    method: Literal["cholesky", "pinv"]
+    size: int
+    penalty: float
+    condition: float
+    rank: int
+    error: float
+
+    def metadata(self) -> dict[str, Any]:
+        """All of it as JSON holds it; an infinite number is the string ``"inf"``."""
+        return {
+            name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in asdict(self).items()
+        }
+
+    def __str__(self) -> str:
+        kept = f", {self.rank} of them kept" if self.rank < self.size else ""
+        return (
+            f"{self.method} of {self.size} unknowns at C={self.penalty:g}{kept}: condition "
+            f"{self.condition:.1e}, relative error of training scores up to {self.error:.0e}"
+            f"{', unless what is left out is null' if self.rank < self.size else ''}"
         )
 
 
@@ -398,18 +378,3 @@ def collapse(support: Tensor, beta: Tensor, kernel: Polynomial = PAPER_KERNEL) -
         return QuadraticForm(support.new_zeros(0, 0), pull, kernel.offset * total)
     bend = support.mT @ (support * beta[:, None])
     return QuadraticForm(bend, 2 * kernel.offset * pull, kernel.offset**2 * total)
-
-
-def machine_of(support: Tensor, beta: Tensor, kernel: Polynomial) -> Head:
-    """A kernel sum, folded where that makes it smaller.
-
-    A quadratic form has a number for each pair of features: of more than 1000 features and fewer
-    bins than that, the sum over bins is the smaller one.
-
-    Shape:
-        - support: ``[N, K]``; beta: ``[N]``
-    """
-    is_wide = support.shape[1] > max(_MOST_QUADRATIC, len(support))
-    if is_wide and kernel.degree == 2:
-        return KernelSum(support, beta, kernel)
-    return collapse(support, beta, kernel)

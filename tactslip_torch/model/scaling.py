@@ -1,7 +1,7 @@
 """Scaling to [-1, 1], fitted on training bins, with a signed log before it on request.
 
-REFERENCE.md section 5 has the plain range of the training bins. Compression and ranges between
-quantiles are ours, for features whose tails are heavy on real recordings.
+The authors take the plain range of the training bins. Compression and ranges between quantiles are
+for features whose tails are heavy on real recordings.
 """
 
 from __future__ import annotations

@@ -181,10 +181,10 @@ def solve_line(solve: Mapping[str, Any]) -> str:
     """How the machine was solved for, in a line: ``SolveReport.metadata`` in words."""
     line = (
         f"solved by {solve['method']}: {solve['rank']} of {solve['size']} unknowns, condition "
-        f"{float(solve['condition']):.1e}, relative error of the weights about "
+        f"{float(solve['condition']):.1e}, relative error of training scores up to "
         f"{float(solve['error']):.0e}"
     )
-    return f"{line}, unless what is left out is null" if solve.get("left_out") else line
+    return f"{line}, unless what is left out is null" if solve["rank"] < solve["size"] else line
 
 
 @style.styled

@@ -1,4 +1,4 @@
-"""The Savitzky-Golay filter of a hand, the first step (paper IV-B, REFERENCE.md section 2).
+"""The Savitzky-Golay filter of a hand, the first step (paper section IV-B).
 
 Order 1 is a moving average: -3 dB at 81 Hz for the 11-sample frame of the PVDF channels and at
 17 Hz for the 51-sample frame of the SG channels. Where in its frame a sample lies is a choice of
@@ -12,7 +12,7 @@ but half a frame late.
 ``savgol_filter`` is the filter of one frame; ``ChannelFilter`` has a frame of its own for every
 channel, of whole recordings and of bins, with Savitzky-Golay's weights or others.
 
-Cutting recordings into bins, the paper's 50 ms analysis unit (REFERENCE.md section 2).
+Cutting recordings into bins, the paper's 50 ms analysis unit.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Edges(NamedTuple):
         if len(kernel) == 1:
             return x.clone()
         first, last = x[..., : len(kernel)] @ head.T, x[..., -len(kernel) :] @ tail.T
-        return torch.cat([first, convolve_valid(x, kernel), last], dim=-1)
+        return torch.cat([first, _convolve_valid(x, kernel), last], dim=-1)
 
 
 def _check_length(x: Tensor, window_length: int) -> None:
@@ -172,7 +172,7 @@ def _edges_of_kernel(weights: Sequence[float], polyorder: int, align: Align) -> 
     past = past_matrix(len(kernel), polyorder, align)
     future = past.flip(0, 1) if align == "centred" else past[:0]
     before, after = torch.cat([past, frame[:-1]]), torch.cat([frame[1:], future])
-    return Edges(convolve_valid(before.T, kernel).T, kernel, convolve_valid(after.T, kernel).T)
+    return Edges(_convolve_valid(before.T, kernel).T, kernel, _convolve_valid(after.T, kernel).T)
 
 
 def savgol_filter(
@@ -212,7 +212,7 @@ def savgol_filter(
     return _savgol_edges(window_length, polyorder, align).filtered(x)
 
 
-def convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
+def _convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
     """Correlate ``[*, T]`` with ``[W]``, keeping the ``T - W + 1`` full overlaps.
 
     A sum of shifted copies: in float64 over ten times faster than ``conv1d``, which unfolds, and
@@ -227,7 +227,7 @@ def convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
 
 
 def overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
-    """``convolve_valid`` as a matrix, for short signals: ``convolve_valid(x) = x @ matrix``.
+    """``_convolve_valid`` as a matrix, for short signals: ``_convolve_valid(x) = x @ matrix``.
 
     Gradients flow to the kernel.
 
@@ -473,7 +473,7 @@ class ChannelFilter(nn.Module):
         Raises:
             ValueError: if there are no axes of channels and time, or other channels.
         """
-        check_tensor(samples)
+        _check_tensor(samples)
         if samples.ndim < 2 or samples.shape[-2] != len(self.window_lengths):
             raise ValueError(
                 f"expected samples [*, {len(self.window_lengths)}, T] (channels, time), "
@@ -545,7 +545,7 @@ def past_of(
     return past
 
 
-def check_tensor(x: Any) -> None:
+def _check_tensor(x: Any) -> None:
     """Refuse what is no tensor, such as a NumPy array.
 
     Raises:
@@ -563,7 +563,7 @@ def check_samples(x: Tensor, what: str = "samples") -> None:
         TypeError: if it is no tensor.
         ValueError: for another dtype.
     """
-    check_tensor(x)
+    _check_tensor(x)
     if x.dtype not in (torch.float32, torch.float64):
         raise ValueError(
             f"expected float32 or float64 {what} in volts, got {x.dtype}; "

@@ -1,11 +1,11 @@
-"""Wavelet branches of a bin (paper section IV-C, REFERENCE.md section 3), through ptwt.
+"""Wavelet branches of a bin (paper section IV-C), through ptwt.
 
 A branch is a component *reconstructed to the bin's length*: all other coefficients are set to
 zero and the transform is inverted. Every step is linear in the bin, so ``branch_matrix`` says it
 all; features use the matrix, and ``wavelet_branches`` is what the matrix is made of. A wavelet is a
 name that PyWavelets knows or, of one without a name, its four filters (``WaveletFilters``).
 
-Amplitude spectra of branches (REFERENCE.md section 3), the authors' and a clean one.
+Amplitude spectra of branches, the authors' and a clean one.
 """
 
 from __future__ import annotations
@@ -240,7 +240,7 @@ def branch_matrix(
         return wavelet_branches(identity, wavelet, level, mode).movedim(0, -1).contiguous()
 
 
-class WaveletSteps(NamedTuple):
+class _WaveletSteps(NamedTuple):
     """``branch_matrix`` in steps through the coefficients, whose matrices are narrow bands.
 
     Args:
@@ -264,7 +264,7 @@ def wavelet_steps(
     wavelet: Wavelet = "rbio2.2",
     level: int = 4,
     mode: ExtensionMode = "symmetric",
-) -> WaveletSteps:
+) -> _WaveletSteps:
     """The steps from a bin to its branches, float64. Do not write into them.
 
     Raises:
@@ -285,7 +285,7 @@ def wavelet_steps(
         for kept in ([one, 0 * one], [0 * one, one]):
             branch = waverec([*kept, *finer], filters)[..., :num_samples]
             out.append(branch.T.contiguous())
-    return WaveletSteps(tuple(low), tuple(high), tuple(out))
+    return _WaveletSteps(tuple(low), tuple(high), tuple(out))
 
 
 SpectrumMethod = Literal["reference", "clean"]

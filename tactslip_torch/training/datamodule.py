@@ -148,7 +148,7 @@ class FeatureMaker:
             self._libraries.append(".".join(version("numpy").split(".")[:2]))
 
     def keep(self, made: RecordingFeatures) -> bool:
-        """Hold the features of a recording in memory, unless there is no room for them."""
+        """Hold the features of a recording in memory, up to the cap."""
         size = made.features.numel() * made.features.element_size()
         if has_room := self._kept_bytes + size <= self.memory_gib * 2**30:
             # a copy: tensors of a worker lie in shared memory, and each keeps a file open

@@ -260,7 +260,7 @@ def features_of(
 def feature_cache(setting: str | bool | None) -> Iterator[FeatureCache]:
     """The cache of ``cache=auto|off|FOLDER``; ``off`` keeps features for this run only.
 
-    What memory has no room for is read again, so even ``off`` holds features on disk, in a
+    What does not fit in memory is read again, so even ``off`` holds features on disk, in a
     temporary folder that goes with the run.
     """
     if setting in ("off", False, None):  # YAML reads a bare off as false

@@ -3,6 +3,8 @@
 import pytest
 import torch
 
+from tactslip_torch.package_files import DETECTOR, load_table, save_table
+
 from .names import SlipDetector
 from .recordings import bins_of, samples_of
 
@@ -51,6 +53,36 @@ def test_scores_have_gradients_to_the_volts(trained, bins):
     found = (slope * direction).sum()
     assert found.item() == pytest.approx(expected.item(), rel=1e-3, abs=1e-6)
     assert slope.abs().max() > 0
+
+
+NO_DETECTORS = {  # what is changed in metadata, or which tensor becomes what
+    "missing": lambda content, tensors: content.pop("selected"),
+    "no channels": lambda content, tensors: content.update(channels=[]),
+    "channels": lambda content, tensors: content.update(channels=content["channels"] * 10**3),
+    "selected": lambda content, tensors: content.update(selected=[0, 1, 2]),
+    "frames": lambda content, tensors: content.update(window_lengths=[10**6 + 1] * 4),
+    "bins": lambda content, tensors: content["pool"].update(bin_samples=10**9),
+    "text": lambda content, tensors: content["pool"].update(sample_rate_hz="fast"),
+    "shape": lambda content, tensors: tensors.update({"scaler.minimum": torch.zeros(3)}),
+    "dtype": lambda content, tensors: tensors.update({"head.constant": torch.tensor(1)}),
+    "number": lambda content, tensors: tensors.update({"head.constant": torch.tensor(torch.nan)}),
+}
+
+
+@pytest.mark.parametrize("change", NO_DETECTORS)
+def test_what_describes_no_detector_is_refused_in_one_line(change, trained, tmp_path):
+    metadata, tensors = load_table(trained.file, DETECTOR)
+    NO_DETECTORS[change](metadata, tensors)
+    save_table(tmp_path / "other.pt", DETECTOR, metadata, tensors)
+    with pytest.raises(ValueError, match=r"other\.pt is damaged: ") as caught:
+        SlipDetector.load(tmp_path / "other.pt")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_of_an_earlier_version_is_named_as_such(tmp_path):
+    save_table(tmp_path / "old.pt", "tactslip_torch detector 3", {}, {})
+    with pytest.raises(ValueError, match=r"old\.pt was made by version 0\.2\.0 or .* make it"):
+        SlipDetector.load(tmp_path / "old.pt")
 
 
 @pytest.mark.parametrize("kept", [0, 7, 0.5])
