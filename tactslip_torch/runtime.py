@@ -163,7 +163,7 @@ def check_share(name: str, value: Any) -> None:
     Raises:
         ValueError: that names it.
     """
-    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < value < 1:
+    if not isinstance(value, int | float) or not 0 < value < 1:
         raise ValueError(f"{name} must lie between 0 and 1, got {value!r}")
 
 

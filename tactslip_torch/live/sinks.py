@@ -332,7 +332,7 @@ class LineServer:
     Args:
         host: address to listen at.
         port: to listen at, 0 for any that is free.
-        tell: is given an ``Event`` where a program is refused or cannot be taken.
+        report: is given an ``Event`` where a program is refused or cannot be taken.
 
     Attributes:
         host: that it listens at.
@@ -343,13 +343,13 @@ class LineServer:
     """
 
     def __init__(
-        self, host: str, port: int, tell: Callable[[Event], object] = lambda event: None
+        self, host: str, port: int, report: Callable[[Event], object] = lambda event: None
     ) -> None:
         self._listener = listener_at(host, port)
         self._listener.setblocking(False)
         self.host, self.port = host, int(self._listener.getsockname()[1])
         self._readers: dict[socket.socket, _Reader] = {}
-        self._refused, self._tell = Notices("refused", "program"), tell
+        self._refused, self._report = Notices("refused", "program"), report
 
     def write(self, text: str) -> None:
         """Send lines to all that are connected, as far as they take them now."""
@@ -388,7 +388,7 @@ class LineServer:
         except OSError as error:  # of this one, or there is no room for any; asked again
             self._refused.add(1, f"could not be taken: {error.strerror or error}")
         for event in self._refused.events():
-            self._tell(event)
+            self._report(event)
 
     def close(self) -> None:
         """No more lines."""

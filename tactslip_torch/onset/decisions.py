@@ -425,7 +425,7 @@ class _StreamRule:
     def _begin(self) -> None:
         """Forget all that the rule gathered."""
         if self._rule is not None:
-            self._memory = self._rule.start(torch.zeros(()).double()).tolist()
+            self._memory = self._rule.start()
 
 
 class Decider:
@@ -672,7 +672,7 @@ def stream_statistic(
         found.is_valid.reshape(-1, llr.shape[-1]),
         strict=True,
     ):
-        known, _ = settings.rule.scan(own[valid], settings.rule.start(own.new_zeros(())))
+        known = settings.rule.scan(own[valid])
         rows.append(torch.full_like(own, torch.nan).masked_scatter(valid, known))
     statistic = torch.stack(rows).reshape(llr.shape)
     llr = torch.where(found.is_valid, llr, torch.nan)

@@ -221,9 +221,9 @@ class OnsetEvidence:
         x = samples.double()
         hop, context = self.hop_samples, self.context
         frames = x[list(self.hand.fast)].unfold(-1, context + hop, hop)  # [F, k, context + hop]
-        heard = (frames - frames[..., :1]) @ torch.from_numpy(self.filter_matrix).flatten(1)
+        filtered = (frames - frames[..., :1]) @ torch.from_numpy(self.filter_matrix).flatten(1)
         square = (
-            heard.unflatten(-1, (len(self.fast_compression), hop)).square().mean(-1)
+            filtered.unflatten(-1, (len(self.fast_compression), hop)).square().mean(-1)
         )  # [F, k, B]
         power = square.mT + torch.from_numpy(np.square(self.fast_compression))[:, None]
         mean = x[list(self.hand.slow), context:].unfold(-1, hop, hop).mean(-1)
@@ -245,7 +245,7 @@ class OnsetEvidence:
 
         Args:
             blocks: of ``memory - 1`` hops before the first and of k more.
-            masked: channels that are not to be listened to.
+            masked: channels to leave out.
 
         Shape:
             - masked: ``[C]``, bool
@@ -258,13 +258,13 @@ class OnsetEvidence:
         floor = _moving_mean(logs, self.memory - windows[-1])
         rows = mean.unfold(-1, len(self.step_matrix), 1)[:, -num:]
         steps = (rows - rows[..., :1]) @ self.step_matrix  # [S, k, D]
-        heard = torch.ones(len(self.hand), dtype=torch.bool) if masked is None else ~masked
+        used = torch.ones(len(self.hand), dtype=torch.bool) if masked is None else ~masked
         return self.pooled(
             level.permute(2, 3, 1, 0),
             floor.permute(2, 1, 0),
             steps.permute(1, 2, 0),
-            heard[list(self.hand.fast)],
-            heard[list(self.hand.slow)],
+            used[list(self.hand.fast)],
+            used[list(self.hand.slow)],
         )
 
     def pooled(
@@ -276,7 +276,7 @@ class OnsetEvidence:
             level: mean power in each window and of each filter.
             floor: mean of half the log power over the last second.
             steps: of the slow channels.
-            fast: fast channels that are listened to.
+            fast: fast channels in use.
             slow: slow ones.
 
         Shape:
