@@ -142,7 +142,7 @@ def _page(
         host=str(config.host),
         port=port,
         token=None if config.token is None else str(config.token),
-        tell=events.put,
+        report=events.put,
     )
 
 
