@@ -23,17 +23,17 @@ from tactslip_torch.commands.configuration import (
     with_lists,
 )
 from tactslip_torch.commands.stopping import Stopped, errors_in_one_line
-from tactslip_torch.runtime import is_first_process, whole_file, write_json
+from tactslip_torch.runtime import is_first_process, whole_file
 
 log = logging.getLogger(__name__)
 
-NOTHING_SAVED = "no result is written (features made so far stay in the cache); start it again"
+_NOTHING_SAVED = "no result is written (features made so far stay in the cache); start it again"
 
 
 def entry_point(
     command: str,
     run: Callable[[DictConfig, Path], Any],
-    saved: Callable[[DictConfig, Path, str], str] = lambda config, folder, again: NOTHING_SAVED,
+    saved: Callable[[DictConfig, Path, str], str] = lambda config, folder, again: _NOTHING_SAVED,
 ) -> Callable[[CommandLine | None], None]:
     """A command as a function of the command line, by default that of the process.
 
@@ -107,19 +107,6 @@ def save_config(config: DictConfig, folder: Path) -> None:
     """Write the resolved configuration."""
     with whole_file(folder / "config.yaml") as temporary:
         temporary.write_text(OmegaConf.to_yaml(config, resolve=True))
-
-
-def leave_results(
-    folder: Path,
-    name: str,
-    content: Mapping[str, Any],
-    figure: Callable[[Mapping[str, Any], Path], None],
-    *texts: str,
-) -> None:
-    """Write ``NAME.json`` and ``NAME.png``, print tables, and say where the files are."""
-    write_json(folder / f"{name}.json", content)
-    figure(content, folder / f"{name}.png")
-    print("\n" + "\n\n".join([*texts, f"results in {folder}"]))
 
 
 @contextmanager

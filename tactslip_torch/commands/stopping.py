@@ -21,7 +21,7 @@ from hydra.utils import get_object
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-EXIT_BAD_INPUT = 2
+_EXIT_BAD_INPUT = 2
 BAD_INPUT = (
     ValueError,
     LookupError,
@@ -125,7 +125,7 @@ def fail(message: str) -> None:
     """
     who = f" in process {rank}" if (rank := _rank()) else ""
     print(f"error{who}: {' '.join(message.split())}", file=sys.stderr, flush=True)
-    raise SystemExit(EXIT_BAD_INPUT)
+    raise SystemExit(_EXIT_BAD_INPUT)
 
 
 def one_line(error: BaseException) -> str:

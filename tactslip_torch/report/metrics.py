@@ -13,7 +13,7 @@ from tactslip_torch.runtime import check_share
 
 _Label = TypeVar("_Label", str, int)
 _FIRST, _LAST = -20, 19
-POSITIONS = (f"<{_FIRST}", *map(str, range(_FIRST, _LAST + 1)), f"{_LAST + 1}+")
+_POSITIONS = (f"<{_FIRST}", *map(str, range(_FIRST, _LAST + 1)), f"{_LAST + 1}+")
 """Places beside an onset that ``bin_metrics`` counts, earliest first."""
 
 
@@ -138,7 +138,7 @@ def bin_metrics(
         is_right = is_slip_true == is_slip_predicted
         places = [p if p is None else min(max(p, _FIRST - 1), _LAST + 1) for p in positions]
         groups["per_position"] = {
-            POSITIONS[place - _FIRST + 1]: _recall(int(is_right[rows].sum()), len(rows))
+            _POSITIONS[place - _FIRST + 1]: _recall(int(is_right[rows].sum()), len(rows))
             for place, rows in sorted(_members(places, counted).items())
         }
     return {**whole, **groups}
@@ -175,7 +175,7 @@ def merged_metrics(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
                     sum(place["num_right"] for place in by_label[label]),
                     sum(place["num_bins"] for place in by_label[label]),
                 )
-                for label in POSITIONS
+                for label in _POSITIONS
                 if label in by_label
             }
         else:

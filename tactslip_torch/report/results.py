@@ -22,7 +22,7 @@ from tactslip_torch.report import published, style
 from tactslip_torch.runtime import write_json
 
 PAPER_LINE = f"paper: {published.PAPER}; real hand, random split over bins"
-PAPER_SCENE_LINE = "of several scenes: materials and speeds are of the paper's scene alone"
+_PAPER_SCENE_LINE = "of several scenes: materials and speeds are of the paper's scene alone"
 BASELINES = {
     "best_pooled_number": "best pooled number",
     "logistic_regression": "logistic regression, same features",
@@ -82,13 +82,13 @@ def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> N
     if _scene_rows(metrics):
         texts.append(confound_table(metrics))
     if selected:
-        texts.append(selected_table(selected))
+        texts.append(_selected_table(selected))
     if metrics.get("validation"):
-        texts.append(validation_table(metrics))
+        texts.append(_validation_table(metrics))
     if metrics.get("solve"):
-        texts.append(solve_line(metrics["solve"]))
+        texts.append(_solve_line(metrics["solve"]))
     if metrics.get("timing_s"):
-        texts.append(timing_table(metrics["timing_s"]))
+        texts.append(_timing_table(metrics["timing_s"]))
     print("\n" + "\n\n".join(texts))
 
 
@@ -139,7 +139,7 @@ def materials_table(metrics: _Metrics) -> str:
         for speed, scores in split.get("per_speed", {}).items():
             groups["no stroke" if speed == "0" else f"{speed} mm/s"] = scores
         if len(scenes := split.get("per_scene", {})) > 1:
-            head = [PAPER_SCENE_LINE]
+            head = [_PAPER_SCENE_LINE]
             groups |= {f"scene {scene}": scores for scene, scores in scenes.items()}
         rows += [{"split": name, "group": group} | _score_cells(of) for group, of in groups.items()]
     return style.marked(metrics["simulated"], *head, style.table(rows, num_left=2, merged=1))
@@ -155,14 +155,14 @@ def _trained_on_lines(metrics: _Metrics) -> list[str]:
     return ["\n".join(lines)] if lines else []
 
 
-def timing_table(timing_s: Mapping[str, float]) -> str:
+def _timing_table(timing_s: Mapping[str, float]) -> str:
     """Seconds of each stage and its fraction of the whole.
 
     Args:
         timing_s: seconds by stage. ``total`` is the whole if given, else their sum is.
 
     Example:
-        >>> print(timing_table({"features": 30.0, "solve": 10.0}))
+        >>> print(_timing_table({"features": 30.0, "solve": 10.0}))
         stage     seconds  of all %
         features    30.00     75.00
         solve       10.00     25.00
@@ -177,7 +177,7 @@ def timing_table(timing_s: Mapping[str, float]) -> str:
     return style.table(rows)
 
 
-def solve_line(solve: Mapping[str, Any]) -> str:
+def _solve_line(solve: Mapping[str, Any]) -> str:
     """How the machine was solved for, in a line: ``SolveReport.metadata`` in words."""
     line = (
         f"solved by {solve['method']}: {solve['rank']} of {solve['size']} unknowns, condition "
@@ -250,7 +250,7 @@ def _confusion_panel(
 
 
 # Selected features -------------------------------------------------------------------------------
-def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
+def _selected_table(selected: Sequence[Mapping[str, str]]) -> str:
     """How many selected features come from each kind, component, finger, domain, descriptor.
 
     The paper's counts stand beside where it prints them; for descriptors it gives only an order,
@@ -384,7 +384,7 @@ def _counts(
 
 
 # Choice of the model -----------------------------------------------------------------------------
-def validation_table(metrics: _Metrics) -> str:
+def _validation_table(metrics: _Metrics) -> str:
     """The mean balanced accuracy of choices and of their worst group.
 
     Of a nested choice the best penalty of each structure, the chosen row, the worst group at its
@@ -792,7 +792,7 @@ _STREAMS = {"test": ("seen materials", style.BLUE), "unseen": ("unseen materials
 _LEAST_RATE = 0.1  # an hour: where the figure's axis begins, and rates of 0 are drawn
 
 
-def rate_rows(metrics: _Metrics) -> list[_Row]:
+def _rate_rows(metrics: _Metrics) -> list[_Row]:
     """The false-alarm rate that was reached: a row for each method on each stream.
 
     Rates are false alarms an hour on recordings without slip, in brackets their intervals: *as
@@ -829,7 +829,7 @@ def _quiet_rates(metrics: _Metrics, role: str) -> dict[str, tuple[Mapping[str, f
     return rates
 
 
-def target_line(metrics: _Metrics) -> str:
+def _target_line(metrics: _Metrics) -> str:
     """The budget, and what calibration had of it."""
     alarm = metrics["alarm"]
     metadata = alarm["settings"]["metadata"]
@@ -868,10 +868,10 @@ def budget_rows(metrics: _Metrics) -> list[_Row]:
 
 
 def alarm_table(metrics: _Metrics) -> str:
-    """``target_line``, ``rate_rows`` and ``budget_rows`` for the terminal."""
-    rows = style.table(rate_rows(metrics), num_left=2, merged=1)
+    """``_target_line``, ``_rate_rows`` and ``budget_rows`` for the terminal."""
+    rows = style.table(_rate_rows(metrics), num_left=2, merged=1)
     budget = style.table(budget_rows(metrics), num_left=3)
-    return style.marked(metrics["simulated"], target_line(metrics), rows, budget)
+    return style.marked(metrics["simulated"], _target_line(metrics), rows, budget)
 
 
 def scene_rows(metrics: _Metrics) -> list[_Row]:
