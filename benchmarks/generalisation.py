@@ -32,7 +32,6 @@ from benchmarks.tables import Report, Table, lines, mean_sd
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decisions import calibration_of
 from tactslip_torch.report.results import BASELINES, splits_table
 from tactslip_torch.training.bins import bin_keys
 from tactslip_torch.training.datamodule import RecordingFeatures
@@ -187,7 +186,7 @@ def _scored(detector: SlipDetector, made: RecordingFeatures, *, half: bool) -> _
         rank = bin_keys(f"{made.recording} missing", num).argsort().argsort()
         is_missing = (rank < num // 2).expand(len(features), num)
     score = detector.head(detector.scaler(detector.columns(features, is_missing)))
-    calibrated = calibration_of(detector)
+    calibrated = detector.calibration
     assert calibrated is not None  # as trained
     calibration, slip_share = calibrated
     stated = probability(calibration.llr(score), slip_share)

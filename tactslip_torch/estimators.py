@@ -32,7 +32,6 @@ from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, 
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.calibration import Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
-from tactslip_torch.onset.decisions import calibration_of
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.training.bins import RecordingBins
 from tactslip_torch.training.recipe import Fit, General
@@ -446,7 +445,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         features._set(pool, layer)
         made = cls(features, slip_label=labels[1])
         made.classes_, made.slip_label_ = np.unique(np.array(labels)), np.array(labels)[1]
-        found = calibration_of(detector)
+        found = detector.calibration
         made._slope = _UNCALIBRATED if found is None else found[0]
         made._set(detector, features)
         return made

@@ -157,6 +157,16 @@ def check_number(name: str, value: Any, *, least: float | None = None, whole: bo
     raise ValueError(f"{name} must be {wanted}, got {value!r}")
 
 
+def check_share(name: str, value: Any) -> None:
+    """Refuse what does not lie between 0 and 1, these left out.
+
+    Raises:
+        ValueError: that names it.
+    """
+    if not isinstance(value, int | float) or not 0 < value < 1:
+        raise ValueError(f"{name} must lie between 0 and 1, got {value!r}")
+
+
 def check_choice(name: str, value: Any, known: Iterable[Any]) -> None:
     """Refuse a value that is none of those known.
 

@@ -34,27 +34,20 @@ class Sent:
         return STORE.generate_msgdef(self.kind, ros_version=2)[0]
 
 
-@dataclass
-class How:
-    """How an MCAP file is written."""
-
-    packing: str = "zstd"
-    is_chunked: bool = True
-    is_indexed: bool = True
-
-
-def write_mcap(path: Path, topics: list[Sent], how: How = How()) -> Path:  # noqa: B008
+def write_mcap(
+    path: Path, topics: list[Sent], packing: str = "zstd", chunked: bool = True, index: bool = True
+) -> Path:
     """All topics, their messages by turns, in the order they are given."""
     with path.open("wb") as file:
         writer = Writer(
             file,
             chunk_size=4096,
-            compression=PACKINGS[how.packing],
-            use_chunking=how.is_chunked,
-            index_types=IndexType.ALL if how.is_indexed else IndexType.NONE,
-            use_statistics=how.is_indexed,
-            repeat_channels=how.is_indexed,
-            repeat_schemas=how.is_indexed,
+            compression=PACKINGS[packing],
+            use_chunking=chunked,
+            index_types=IndexType.ALL if index else IndexType.NONE,
+            use_statistics=index,
+            repeat_channels=index,
+            repeat_schemas=index,
         )
         writer.start()
         channels = []
@@ -92,10 +85,14 @@ def times(count: int) -> list[int]:
 def wrench(values, nanoseconds: int) -> bytes:
     vector = STORE.types["geometry_msgs/msg/Vector3"]
     whole = STORE.types["geometry_msgs/msg/Wrench"](vector(*values[:3]), vector(*values[3:]))
-    stamp = STORE.types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, 10**9))
-    header = STORE.types["std_msgs/msg/Header"](stamp, "hand")
-    message = STORE.types[WRENCH](header, whole)
-    return bytes(STORE.serialize_cdr(message, WRENCH, little_endian=True))
+    return stamped(WRENCH, nanoseconds, whole)
+
+
+def stamped(kind: str, nanoseconds: int, *fields, store=STORE) -> bytes:
+    """A message of a type whose first field is a header."""
+    stamp = store.types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, 10**9))
+    header = store.types["std_msgs/msg/Header"](stamp, "hand")
+    return bytes(store.serialize_cdr(store.types[kind](header, *fields), kind))
 
 
 def array(values, labels=(), sizes=()) -> bytes:

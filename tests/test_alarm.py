@@ -159,7 +159,7 @@ REFUSED = [
     (stage, {"hop_ms": 0.3}, r"onset\.hop_ms=0\.3 is 0\.6 samples at 2000 Hz"),
     (OnsetTraining, {"cycles": 0}, "cycles must be a positive whole number, got 0"),
     (stage, {"rule": {"name": "sum"}}, "no sequential rule is called 'sum'"),
-    (stage, {"rearm_s": -1.0}, "onset.rearm_s must be a finite number of at least 0, got -1"),
+    (stage, {"rearm_s": -1.0}, "rearm_s must be a finite number of at least 0, got -1"),
     (stage, {"slip_free": "heldd"}, "no scene 'heldd', it has held, paper, taps; take it out"),
     (stage, {"budget": BARE | {"tap": 1.0}}, "onset.streams has no scene 'tap'"),
     (stage, {"budget": BARE | {"taps": 0.0}}, "onset.budget of taps must be positive, got 0"),

@@ -210,8 +210,8 @@ def test_nothing_to_say_is_none_and_never_a_quotient_of_zeros():
     assert metrics["found"]["value"] == 1.0
     metrics = metrics_of(events_of(watched([1.1, 2.2], ())))  # without an onset
     names = ("found", "early", "missed", "alarms_per_slip", "delay_ms", "latency_ms")
-    names += ("onset_error_ms", "delay_first_ms", "slid_mm")
-    assert [metrics[name] for name in names] == [None] * 9
+    names += ("delay_first_ms", "slid_mm")
+    assert [metrics[name] for name in names] == [None] * 8
     assert metrics["false_alarms_per_minute"]["value"] == pytest.approx(12.0)
     assert metrics["per_speed"] == {}
     missed = metrics_of(events_of(watched()))

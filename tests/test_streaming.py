@@ -349,12 +349,13 @@ def test_an_hour_needs_no_more_memory_than_a_second():
     assert int(found.number[-1]) == 3599
 
 
-def test_gradients_of_a_stream_are_slopes(rng):
+@pytest.mark.parametrize("rule", [KOfN(2, 3), Cusum(-0.5, 0.4)], ids=lambda rule: rule.name)
+def test_gradients_of_a_stream_are_slopes(rule, rng):
     """Along random directions of some volts each, against a central difference."""
     samples = signal(300, 5).requires_grad_()
 
     def statistic(samples):
-        return stream_statistic(DETECTOR, settings_of(Cusum(-0.5, 0.4)), samples).statistic[-1]
+        return stream_statistic(DETECTOR, settings_of(rule), samples).statistic[-1]
 
     (pull,) = torch.autograd.grad(statistic(samples), samples)
     for _ in range(3):

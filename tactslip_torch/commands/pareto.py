@@ -21,7 +21,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decisions import calibration_of
 from tactslip_torch.pareto import (
     Candidate,
     choose,
@@ -79,7 +78,7 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
     print(f"\n{pareto_table(content)}\n\nresults in {folder}")
     if chosen:
         detector = SlipDetector.load(Path(chosen.folder) / "detector.pt")
-        if calibration_of(detector) is not None and config.onset:
+        if detector.calibration is not None and config.onset:
             instantiate(config.onset, hop_ms=chosen.hop_ms, _convert_="all")(detector)
         detector.save(folder / "detector.pt")
         return content

@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -82,7 +83,7 @@ def stream(config: DictConfig, folder: Path) -> Counts:
                 "sample_rate_hz": detector.pool.sample_rate_hz,
             }
             if config.output == "stdout":
-                sinks.append(JsonLines.to_file(sys.stdout, **options))
+                sinks.append(JsonLines(partial(print, end="", flush=True), **options))
             else:
                 lines = LineServer(*address_of(str(config.output), "output="), events.put)
                 stack.callback(lines.close)
@@ -141,7 +142,7 @@ def _page(
         host=str(config.host),
         port=port,
         token=None if config.token is None else str(config.token),
-        tell=events.put,
+        report=events.put,
     )
 
 

@@ -22,7 +22,7 @@ from tactslip_torch.deploy.check import GraphKind
 from tactslip_torch.deploy.export import export_detector, read_sidecar
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
-from tactslip_torch.onset.decisions import KEY, Scorer, calibration_of
+from tactslip_torch.onset.decisions import KEY, Scorer
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
@@ -131,7 +131,7 @@ def _set_alarm(
             for name in names
         }
         return alarm(detector, baselines, num_workers)
-    if calibration_of(detector) is None:
+    if detector.calibration is None:
         log.warning(
             "no alarm is set, so that detect and stream.onnx do not work on this detector: "
             "onset=debounced needs scores of validation; give several recipe.penalties"

@@ -225,11 +225,12 @@ _BETWEEN = r"[-_. ]"
 
 
 def guessed(file: str, pattern: str) -> dict[str, str]:
-    """What a pattern tells of a file by its name, or by its path if the pattern has a stroke.
+    """What a pattern tells of a file by its name, and by its folders if the pattern has strokes.
 
-    A trial is a whole number. A material, scene or label is any text, or one of those listed:
-    ``{scene:taps|held}``. A ``*`` stands for any text, and the ending is no part of a name.
-    Blanks, dots, strokes and underlines around a material or scene are no part of it.
+    As many folders are looked at as the pattern has strokes. Capitals do not matter. A trial is a
+    whole number. A material, scene or label is any text, or one of those listed:
+    ``{scene:taps|held}``. A ``*`` stands for any text, and the ending is no part of a name. Blanks,
+    dots, strokes and underlines around a material or scene are no part of it.
 
     Raises:
         ValueError: if the pattern names nothing, one twice, or something else than material,
@@ -250,9 +251,8 @@ def guessed(file: str, pattern: str) -> dict[str, str]:
             f"once, as {{material}}_{{trial}}, got {pattern!r}"
         )
     path = Path(file)
-    text = path.with_suffix("").as_posix() if "/" in pattern else path.stem
-
-    expression = _literal(fixed[0])
+    text = Path(*path.parts[-1 - pattern.count("/") : -1], path.stem).as_posix()
+    expression = "(?i)" + _literal(fixed[0])
     for name, behind in zip(names, fixed[1:], strict=True):
         expression += _field(name, words[name]) + _literal(behind)
     read = re.fullmatch(expression, text)

@@ -74,7 +74,9 @@ def truth_of(cells: Mapping[str, str]) -> tuple[Timeline | None, list[str]]:
     for name, cell in given.items():
         try:
             if name == "label":
-                values[name] = _label(cell)
+                if (label := label_of(cell)) is None:
+                    raise ValueError(f"must be slip, non-slip or empty, got {cell[:40]!r}")
+                values[name] = label
             else:
                 parse = _number if name in MOMENTS else _stretch
                 values[name] = tuple(map(parse, _items(cell)))
@@ -151,11 +153,9 @@ def _overlaps(truth: Timeline) -> list[str]:
     return found
 
 
-def _label(cell: str) -> Label:
-    known = _LABELS.get(re.sub(r"[\s_-]", "", cell.lower()))
-    if known is None:
-        raise ValueError(f"must be slip, non-slip or empty, got {cell[:40]!r}")
-    return known
+def label_of(word: str) -> Label | None:
+    """The label that a word is, as people spell it: ``slip``, ``Non-slip``, ``no_slip``."""
+    return _LABELS.get(re.sub(r"[\s_-]", "", word.lower()))
 
 
 def _items(cell: str) -> list[Any]:

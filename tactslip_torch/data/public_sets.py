@@ -1,13 +1,7 @@
-"""Sets whose file names say what they are, of any layout or of the authors' raw files.
-
-Where a set is laid out as ``<class>/<object><trial>.csv``, a regular expression with named groups
-reads material, trial, scene and label from each path.
-"""
+"""Sets whose file names say what they are, of any layout or of the authors' raw files."""
 
 from __future__ import annotations
 
-import difflib
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -15,20 +9,20 @@ from pathlib import Path
 from typing import Any
 
 from tactslip_torch.data.file_recordings import FileRecordings
+from tactslip_torch.data.folder import guessed, recording_files
 from tactslip_torch.data.manifest import (
     Entry,
     Listing,
     Problem,
+    label_of,
     manifest_of,
     read_manifest,
     twice,
     with_manifest,
 )
-from tactslip_torch.data.recording import Label, RecordingId, Timeline
+from tactslip_torch.data.recording import RecordingId, Timeline
 from tactslip_torch.hand import HandLayout
 
-_GROUPS = ("material", "trial", "scene", "label")
-_LABELS: Mapping[str, Label] = {"slip": "slip", "non-slip": "non-slip"}
 STEMS: Mapping[str, str] = {
     "abs": "M1",
     "lb": "M2",
@@ -42,7 +36,6 @@ STEMS: Mapping[str, str] = {
     "wood": "wood",
 }
 """What stands in names of the authors' files for each material; capitals do not matter."""
-_AUTHORS_NAME = r"(?i)(?:.*/)?(?P<material>[^/]+)-slip(?P<trial>\d{1,9})\.txt"
 
 
 def named_recordings(
@@ -58,12 +51,11 @@ def named_recordings(
 
     Args:
         root: the folder.
-        pattern: a regular expression that a path relative to the folder, with ``/`` between its
-            parts, must match as a whole. Its group ``material`` must be there; ``trial`` (a
-            number), ``scene`` and ``label`` may be.
-        labels: ``slip`` or ``non-slip`` for each text of the group ``label``, or of ``scene`` if
-            there is no such group; ``None``: the text is one of the two, or nothing is known.
-        rename: materials that names spell otherwise.
+        pattern: of a file's name, or of the end of its path, as ``folder.guessed`` reads it; it
+            names ``{material}``, and may name ``{trial}``, ``{scene}`` and ``{label}``.
+        labels: ``slip`` or ``non-slip`` for each text of ``{label}``, or of ``{scene}`` if
+            the pattern has no label; ``None``: the text is one of the two, or nothing is known.
+        rename: materials that names spell otherwise, in capitals or not.
         manifest: a file that says of some or all files what names do not, relative to the folder;
             ``None`` for none.
         options: further ones of ``FileRecordings``.
@@ -73,8 +65,6 @@ def named_recordings(
         ValueError: if the pattern is none or no path matches it, or as ``FileRecordings``.
     """
     listing = _listed(Path(root), pattern, labels, rename or {})
-    if not listing.entries and not listing.problems:
-        raise ValueError(f"no file in {root} has a path that matches data.pattern={pattern!r}")
     return _set_of(listing, root, manifest, options)
 
 
@@ -107,26 +97,14 @@ def authors_raw(
         ValueError: if no file is named so, or as ``FileRecordings``.
     """
     truth = nominal(speeds_mm_s, distance_mm, pause_s)
-    found = _listed(Path(root), _AUTHORS_NAME)
-    if not found.entries and not found.problems:
-        raise ValueError(
-            f"no file in {root} is named as the authors' are, such as {next(iter(stems))}-slip1"
-            ".txt; for other names use data=files"
-        )
-    materials = {stem.lower(): material for stem, material in stems.items()}
+    found = _listed(Path(root), "{material}-slip{trial}", None, stems)
     entries, problems = [], list(found.problems)
     for entry in found.entries:
-        stem = entry.recording.material
-        if stem.lower() in materials:
-            recording = replace(entry.recording, material=materials[stem.lower()])
-            entries.append(replace(entry, recording=recording, truth=truth, is_nominal=True))
-            continue
-        close = difflib.get_close_matches(stem, stems, 1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        what = f"its name begins with none of {', '.join(stems)}{hint}; data.stems names more"
-        problems.append(Problem(entry.file, what))
-    order = list(stems.values())
-    entries.sort(key=lambda entry: (order.index(entry.recording.material), entry.recording))
+        if entry.recording.material in stems.values():
+            entries.append(replace(entry, truth=truth, is_nominal=True))
+        else:
+            what = f"its name begins with none of {', '.join(stems)}; data.stems names more"
+            problems.append(Problem(entry.file, what))
     listing = Listing(tuple(entries), tuple(problems))
     rows = HandLayout.paper24().to_rows() if channels is None else channels
     return _set_of(listing, root, manifest, {"channels": rows, **options})
@@ -153,46 +131,43 @@ def nominal(speeds_mm_s: Sequence[float], distance_mm: float, pause_s: float) ->
 
 
 def _listed(
-    root: Path,
-    pattern: str,
-    labels: Mapping[str, str] | None = None,
-    rename: Mapping[str, str] | None = None,
+    root: Path, pattern: str, labels: Mapping[str, str] | None, rename: Mapping[str, str]
 ) -> Listing:
-    """The files below a folder whose paths match as a whole, and what is wrong with their names.
+    """The recordings below a folder that a pattern names, by path, and what is wrong with names.
 
-    Sorted by path; hidden ones are left out. Arguments and errors as of ``named_recordings``.
+    Arguments and errors as of ``named_recordings``.
     """
-    expression = _checked(pattern)
-    if wrong := [word for word in (labels or {}).values() if word not in _LABELS]:
+    if "{material" not in pattern:
+        raise ValueError(f"data.pattern must name {{material}}, got {pattern!r}")
+    if wrong := [word for word in (labels or {}).values() if label_of(word) is None]:
         raise ValueError(f"data.labels must be of slip and non-slip, got {wrong[0]!r}")
-    if not root.is_dir():
-        raise FileNotFoundError(f"no folder at {root}")
-    group = next((name for name in ("label", "scene") if name in expression.groupindex), None)
+    renamed = {old.lower(): new for old, new in rename.items()}
     entries: list[Entry] = []
     problems: list[Problem] = []
     counts: Counter[tuple[str, str]] = Counter()
-    for path in sorted(root.rglob("*")):
+    for path in sorted(recording_files(root, in_folders=True)):
         file = path.relative_to(root).as_posix()
-        found = expression.fullmatch(file)
-        if found is None or any(part.startswith(".") for part in file.split("/")):
+        found = guessed(file, pattern)
+        if not found:
             continue
-        groups = found.groupdict()
-        material = (rename or {}).get(groups["material"], groups["material"])
-        scene = groups.get("scene") or RecordingId.scene
-        trial = groups.get("trial") or str(counts[material, scene])
+        material = renamed.get(found["material"].lower(), found["material"])
+        scene = found.get("scene", RecordingId.scene)
+        trial = found.get("trial", str(counts[material, scene]))
         counts[material, scene] += 1
-        word = groups.get(group) if group else None
-        label = _LABELS.get((labels or _LABELS).get(word or "", ""))
+        word = found.get("label", scene)
+        label = label_of(word if labels is None else labels.get(word, ""))
         if not path.resolve().is_relative_to(root.resolve()):
             problems.append(Problem(file, "is a link out of the folder; copy it there"))
         elif not trial.isdecimal():
             problems.append(Problem(file, f"trial {trial!r} is no number"))
         elif labels is not None and label is None:
             known = ", ".join(labels)
-            problems.append(Problem(file, f"{group} {word!r} is none of data.labels: {known}"))
+            problems.append(Problem(file, f"{word!r} is none of data.labels: {known}"))
         else:
             truth = Timeline(label=label) if label else None
             entries.append(Entry(file, file, RecordingId(material, int(trial), scene), truth))
+    if not entries and not problems:
+        raise ValueError(f"no file in {root} has a path that matches data.pattern={pattern!r}")
     return Listing(tuple(entries), tuple(problems))
 
 
@@ -206,17 +181,3 @@ def _set_of(
             listing, read_manifest(manifest_of(Path(root), manifest), Path(root))
         )
     return FileRecordings(root, manifest=listing, **options)
-
-
-def _checked(pattern: str) -> re.Pattern[str]:
-    try:
-        compiled = re.compile(pattern)
-    except re.error as error:
-        raise ValueError(f"data.pattern={pattern!r} is no regular expression: {error}") from None
-    unknown = sorted(set(compiled.groupindex) - set(_GROUPS))
-    if unknown or "material" not in compiled.groupindex:
-        raise ValueError(
-            "data.pattern must have a group (?P<material>...) and may have "
-            f"{', '.join(_GROUPS[1:])}, got {', '.join(compiled.groupindex) or 'none'}"
-        )
-    return compiled

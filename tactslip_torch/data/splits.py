@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.runtime import check_share
 
 ROLES = ("train", "test", "unseen")
 PAPER_SCENE = RecordingId.scene
@@ -109,7 +110,7 @@ def random_bins(
     Raises:
         ValueError: if a material is not in the set or the fraction is not in (0, 1).
     """
-    _check_fraction(train_fraction)
+    check_share("split.train_fraction", train_fraction)
     roles = {
         recording: "train" for material in seen for recording in _cycles_of(recordings, material)
     }
@@ -248,7 +249,7 @@ def _by_cycle(
     cycles that are there in different scenes are drawn apart, each kind as above, so that each
     scene has its part. A session's only cycle falls by the fraction alone.
     """
-    _check_fraction(train_fraction)
+    check_share("split.train_fraction", train_fraction)
     roles: dict[RecordingId, str] = {}
     mountings: dict[str, dict[int, list[RecordingId]]] = {}
     for material in materials:
@@ -279,11 +280,6 @@ def _cycles_of(recordings: Sequence[RecordingId], material: str) -> list[Recordi
         known = ", ".join(sorted({recording.material for recording in recordings}))
         raise ValueError(f"no recording of material {material!r}; the set has {known or 'none'}")
     return cycles
-
-
-def _check_fraction(train_fraction: float) -> None:
-    if not 0 < train_fraction < 1:
-        raise ValueError(f"split.train_fraction must lie between 0 and 1, got {train_fraction}")
 
 
 def _checked(split: Split, needed: Sequence[str]) -> Split:

@@ -26,7 +26,7 @@ from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import Head, KernelSum
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
+from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetEvidence
 from tactslip_torch.onset.rules import NOTHING_YET, KOfN, Rule
 from tactslip_torch.package_files import SIDECAR as FORMAT
@@ -179,7 +179,7 @@ def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph
     graph, raw, dtype = Graph(), RawBin.of(detector), dtype_of(precision)
     num_channels = len(detector.pool.hand)
     samples = graph.input("samples", dtype, ("batch", num_channels, raw.length))
-    calibrated = calibration_of(detector)
+    calibrated = detector.calibration
     outputs = dict(zip(Scored._fields, (dtype, BOOL, BOOL, BOOL), strict=True))
     if calibrated is not None:
         outputs["probability"] = dtype
@@ -299,7 +299,7 @@ def _samples(windows: Value, detector: SlipDetector, frame: Frame) -> tuple[Samp
 def host_metadata(detector: SlipDetector, kind: str, precision: Precision) -> dict[str, Any]:
     """All that a host must know of a graph."""
     hand, info, raw = detector.pool.hand, detector.info, RawBin.of(detector)
-    calibrated = calibration_of(detector)
+    calibrated = detector.calibration
     metadata = {
         "format": FORMAT,
         "version": __version__,

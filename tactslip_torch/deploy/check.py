@@ -23,7 +23,7 @@ from tactslip_torch.deploy.bins import Precision, RawBin, Timing
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
+from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.runtime import PACKAGE
@@ -79,7 +79,7 @@ def compare(
     exact = copy.deepcopy(detector).double()
     samples = _kept_samples(detector, kind).to(getattr(torch, precision))
     both = _bins_by_both if kind == "bin" else _stream_by_both
-    calibrated = calibration_of(exact)
+    calibrated = exact.calibration
     worst, sd = 0.0, 1.0
     for what, given in {"whole": samples, "losses": _with_losses(samples, exact)}.items():
         found, expected = both(run, exact, given, is_whole=what == "whole")
@@ -155,7 +155,7 @@ def _bins_by_both(
     with torch.no_grad():  # a channel is alive by what its samples resolve as they are given
         found = exact.predict_raw(pad(bins.double(), ends), given=bins.dtype)
     expected = dict(zip(("score", "valid", "in_range", "channels_lost"), found, strict=False))
-    if calibration_of(exact) is not None:
+    if exact.calibration is not None:
         expected["probability"] = found.score
     return run({"samples": bins.numpy()}), {k: v.numpy() for k, v in expected.items()}
 

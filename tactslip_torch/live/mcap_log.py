@@ -39,7 +39,7 @@ from tactslip_torch.data.formats._messages import HEADER, RECORDING, TOPIC, Type
 from tactslip_torch.data.formats._reading import header_of, needs, text_of
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.live.sinks import Array, Block, Sink, alarm_text, truth_changes
+from tactslip_torch.live.sinks import Block, Sink
 from tactslip_torch.onset.decisions import AlarmSettings, Decisions
 from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.runtime import whole_file
@@ -123,18 +123,12 @@ class McapLog(Sink):
         layout = _foxglove_layout(hand, settings, known.units)
         with whole_file(path.with_suffix(".foxglove.json")) as beside:
             beside.write_text(json.dumps(layout, indent=1) + "\n", encoding="utf-8")
-        for time_s, is_slip in truth_changes(recording):
-            self._write("truth", time_s, data=is_slip)
-
-    def _times_of(self, first: int, block: Block) -> Array:
-        """When the samples of a block were taken, ``[n]``, on the clock of the stream."""
-        times_s = block.time_s
-        if times_s is None:
-            times_s = (first + np.arange(len(block.samples))) / self._rate
-            if self._is_live and self._start_s is None:
-                self._start_s = time.time()
-        self._last_s = float(times_s[-1]) if len(times_s) else self._last_s
-        return times_s
+        if recording is not None and recording.has_truth:
+            slides = sorted((*recording.sliding_s, *recording.slip_s))
+            self._write("truth", 0.0, data=any(start <= 0 for start, _ in slides))
+            for start_s, end_s in slides:
+                self._write("truth", start_s, data=True)
+                self._write("truth", end_s, data=False)
 
     def __enter__(self) -> Self:
         return self
@@ -149,7 +143,12 @@ class McapLog(Sink):
 
     def samples(self, first: int, block: Block) -> None:
         """Write a message for each sample."""
-        times_s = self._times_of(first, block)
+        times_s = block.time_s
+        if times_s is None:
+            times_s = (first + np.arange(len(block.samples))) / self._rate
+            if self._is_live and self._start_s is None:
+                self._start_s = time.time()
+        self._last_s = float(times_s[-1]) if len(times_s) else self._last_s
         self._is_even &= first == self._num and block.time_s is None
         self._num = first + len(block.samples)
         rows = np.asarray(block.samples, self._stored, order="C")
@@ -180,7 +179,10 @@ class McapLog(Sink):
             self._write(
                 "onset", alarm.alarm_s, header=header, time_ref=began, source=alarm.raised_by
             )
-            self._log(_WARN, alarm.alarm_s, alarm_text(alarm))
+            known = "-" if math.isnan(alarm.probability) else f"{alarm.probability:.3f}"
+            ago_s = alarm.alarm_s - alarm.onset_s
+            text = f"slip alarm by {alarm.raised_by}; slip began {ago_s:.3f} s before; "
+            self._log(_WARN, alarm.alarm_s, f"{text}probability {known}")
 
     def event(self, kind: str, text: str) -> None:
         """Write it at the time of the last sample."""
@@ -251,7 +253,10 @@ def _foxglove_layout(hand: HandLayout, settings: AlarmSettings, units: str = "V"
     panels["Plot!probability"] = _plot(
         "Probability of slip", [("/slip/probability.data", "probability")], least=0, most=1
     )
-    for name, threshold in settings.thresholds.items():
+    thresholds = {"statistic": settings.threshold}
+    if settings.onset is not None:
+        thresholds["onset_score"] = settings.onset.threshold
+    for name, threshold in thresholds.items():
         lines = [(f"/slip/{name}.data", name.replace("_", " "))]
         lines += [(repr(float(threshold)), "threshold")] if math.isfinite(threshold) else []
         panels[f"Plot!{name}"] = _plot(name.replace("_", " ").capitalize(), lines)

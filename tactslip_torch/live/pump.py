@@ -14,7 +14,7 @@ import numpy as np
 
 from tactslip_torch.live.sinks import Block, Counts, Event, Placed, Sink, Source, counted, merged
 from tactslip_torch.onset.decisions import Decisions
-from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.onset.streaming import StreamingDetector, listed
 from tactslip_torch.runtime import one_thread
 
 _LONGER_S = 0.01  # than what StreamingDetector fills: begins a stream anew
@@ -310,7 +310,7 @@ class _Losses:
         for start in np.unique(self._start[is_long & ~self._is_reported]).tolist():
             mine = self._start == start
             self._is_reported |= mine
-            channels = self._named(np.flatnonzero(mine).tolist())
+            channels = listed(self._names, mine, _MOST_NAMES)
             yield Event("missing", f"samples of {channels} since {self._time(start)}")
 
     def _reported(self) -> Iterator[Event]:
@@ -323,7 +323,9 @@ class _Losses:
             (start, _), _ = several[0]
             stop = max(stop for (_, stop), _ in several)
             num = sum(stop - start for (start, stop), _ in several)
-            channels = self._named(sorted({one for _, each in several for one in each}))
+            lacking = [one for _, each in several for one in each]
+            is_lacking = np.isin(np.arange(len(self._names)), lacking)
+            channels = listed(self._names, is_lacking, _MOST_NAMES)
             where, num_parts = f"from {self._time(start)} on", len(several)
             if num_parts > 1:
                 where = f"in {num_parts} stretches from {self._time(start)} to {self._time(stop)}"
@@ -333,10 +335,3 @@ class _Losses:
 
     def _time(self, place: int) -> str:
         return f"{place / self._rate + self._shift_s:.4f} s"
-
-    def _named(self, channels: Sequence[int]) -> str:
-        if len(channels) == len(self._names) > 1:
-            return f"all {len(channels)} channels"
-        more = len(channels) - _MOST_NAMES
-        named = ", ".join(self._names[channel] for channel in channels[:_MOST_NAMES])
-        return named + (f" and {more} more" if more > 0 else "")

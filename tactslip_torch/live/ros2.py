@@ -51,7 +51,7 @@ _QUEUE = 2000  # messages
 class TopicMessages:
     """The messages of a topic as blocks of samples.
 
-    A stamp is the time of its message's first sample. One that is up to ``jitter_s`` early or late
+    A stamp is the time of its message's first sample. One that is up to 2 ms early or late
     is taken to follow the message before, as the clock of a sender does; later, samples are
     missing. Messages without stamps follow one another: what is lost of these is not noticed.
 
@@ -59,17 +59,12 @@ class TopicMessages:
         topic: its name and the type of its messages.
         detector: whose channels and rate they have.
         reading: which numbers are channels, as of a recording of the topic.
-        jitter_s: of stamps.
     """
 
     def __init__(
-        self,
-        topic: Topic,
-        detector: SlipDetector,
-        reading: Reading | None = None,
-        jitter_s: float = _JITTER_S,
+        self, topic: Topic, detector: SlipDetector, reading: Reading | None = None
     ) -> None:
-        self._topic, self._how, self._jitter_s = topic, reading or Reading(), jitter_s
+        self._topic, self._how = topic, reading or Reading()
         self._hand, self._rate = detector.pool.hand.names, detector.pool.sample_rate_hz
         self._columns: TopicColumns | None = None
         self._order: list[int] = []
@@ -108,11 +103,11 @@ class TopicMessages:
 
     def _followed(self, time_s: float) -> float | None:
         """The time of a message that has this stamp; ``None``: it was before the last one."""
-        if self._due_s is None or time_s - self._due_s > self._jitter_s:
+        if self._due_s is None or time_s - self._due_s > _JITTER_S:
             return time_s
         late = time_s - self._due_s
         most = _FOLLOWED / self._rate
-        return None if late < -self._jitter_s else self._due_s + min(max(late, -most), most)
+        return None if late < -_JITTER_S else self._due_s + min(max(late, -most), most)
 
     def _first(self, content: bytes) -> TopicColumns:
         name = self._topic.name
@@ -257,7 +252,7 @@ class _Publisher(Sink):
     def decisions(self, decisions: Decisions) -> None:
         """Publish them."""
         for topic, fields in decision_messages(decisions):
-            self._publishers[topic].publish(filled(self._kinds[topic](), fields))
+            self._publishers[topic].publish(_filled(self._kinds[topic](), fields))
 
     def event(self, kind: str, text: str) -> None:
         """Log it, as nodes do."""
@@ -268,11 +263,11 @@ class _Publisher(Sink):
         self._node.destroy_node()
 
 
-def filled(message: Any, fields: Mapping[str, Any]) -> Any:
+def _filled(message: Any, fields: Mapping[str, Any]) -> Any:
     """A message with its fields set, those of messages in it as well."""
     for name, value in fields.items():
         if isinstance(value, Mapping):
-            filled(getattr(message, name), value)
+            _filled(getattr(message, name), value)
         else:
             setattr(message, name, value)
     return message

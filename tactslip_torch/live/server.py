@@ -112,7 +112,7 @@ class PageServer(Sink):
         host: address to listen at; beyond loopback there is always a token.
         port: to listen at, 0 for any that is free.
         token: that a page must give; ``None``: on loopback none, else one at random.
-        tell: is given an ``Event`` where a connection cannot be taken.
+        report: is given an ``Event`` where a connection cannot be taken.
 
     Attributes:
         address: of the page, with the token.
@@ -134,7 +134,7 @@ class PageServer(Sink):
         host: str = "127.0.0.1",
         port: int = 0,
         token: str | None = None,
-        tell: Callable[[Event], object] = lambda event: None,
+        report: Callable[[Event], object] = lambda event: None,
     ) -> None:
         needs("websockets", "serve=true", "live")
         self._is_loopback = _is_loopback_name(host)
@@ -155,7 +155,7 @@ class PageServer(Sink):
         self._pending: deque[Placed | str] = deque()
         self._lock = threading.Lock()
         self._pages: set[_Page] = set()
-        self._refused, self._tell = Notices("refused", "connection"), tell
+        self._refused, self._report = Notices("refused", "connection"), report
         self._one_wrong_token = asyncio.Lock()
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._not_taken)
@@ -303,7 +303,7 @@ class PageServer(Sink):
         reason = (isinstance(error, OSError) and error.strerror) or error or context["message"]
         self._refused.add(1, f"of the page failed: {reason}")
         for event in self._refused.events():
-            self._tell(event)
+            self._report(event)
 
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Files of the page, or a refusal; ``None`` for a socket that may open."""

@@ -11,12 +11,11 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol, TextIO, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.recording import Recording
 from tactslip_torch.onset.decisions import Alarm, Decisions
 from tactslip_torch.onset.rules import NOTHING_YET
 
@@ -253,16 +252,6 @@ class JsonLines(Sink):
         self._rate, self._end = sample_rate_hz, 0
         self._num_decisions = self._num_alarms = 0
 
-    @classmethod
-    def to_file(cls, file: TextIO, **options: Any) -> JsonLines:
-        """Lines to an open text file, flushed at each write."""
-
-        def write(text: str) -> None:
-            file.write(text)
-            file.flush()
-
-        return cls(write, **options)
-
     def samples(self, first: int, block: Block) -> None:
         """Count them."""
         self._end = first + len(block.samples)
@@ -343,7 +332,7 @@ class LineServer:
     Args:
         host: address to listen at.
         port: to listen at, 0 for any that is free.
-        tell: is given an ``Event`` where a program is refused or cannot be taken.
+        report: is given an ``Event`` where a program is refused or cannot be taken.
 
     Attributes:
         host: that it listens at.
@@ -354,13 +343,13 @@ class LineServer:
     """
 
     def __init__(
-        self, host: str, port: int, tell: Callable[[Event], object] = lambda event: None
+        self, host: str, port: int, report: Callable[[Event], object] = lambda event: None
     ) -> None:
         self._listener = listener_at(host, port)
         self._listener.setblocking(False)
         self.host, self.port = host, int(self._listener.getsockname()[1])
         self._readers: dict[socket.socket, _Reader] = {}
-        self._refused, self._tell = Notices("refused", "program"), tell
+        self._refused, self._report = Notices("refused", "program"), report
 
     def write(self, text: str) -> None:
         """Send lines to all that are connected, as far as they take them now."""
@@ -399,7 +388,7 @@ class LineServer:
         except OSError as error:  # of this one, or there is no room for any; asked again
             self._refused.add(1, f"could not be taken: {error.strerror or error}")
         for event in self._refused.events():
-            self._tell(event)
+            self._report(event)
 
     def close(self) -> None:
         """No more lines."""
@@ -413,23 +402,3 @@ class _Reader:
 
     since_s: float
     content: bytearray = field(default_factory=bytearray)
-
-
-def truth_changes(recording: Recording | None) -> list[tuple[float, bool]]:
-    """Whether a recording slips from 0 s on, and from each change on; empty if it is not known."""
-    if recording is None or not recording.has_truth:
-        return []
-    slides = sorted((*recording.sliding_s, *recording.slip_s))
-    changes = [(0.0, any(start <= 0 for start, _ in slides))]
-    for start, end in slides:
-        changes += [(start, True), (end, False)]
-    return changes
-
-
-def alarm_text(alarm: Alarm) -> str:
-    """An alarm in a line, for people."""
-    known = "-" if math.isnan(alarm.probability) else f"{alarm.probability:.3f}"
-    return (
-        f"slip alarm by {alarm.raised_by}; slip began {alarm.alarm_s - alarm.onset_s:.3f} "
-        f"s before; probability {known}"
-    )

@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, softplus
 
+from tactslip_torch.runtime import check_share
+
 LARGEST_LLR = 1e30  # where llrs saturate, so that what adds them up stays finite in float32
 LARGEST_SCORE = 1e300  # beyond it the difference of two scores may leave float64
 
@@ -109,8 +111,7 @@ def probability(llr: Tensor, slip_share: float) -> Tensor:
     Raises:
         ValueError: if the share does not lie between 0 and 1.
     """
-    if not 0 < slip_share < 1:
-        raise ValueError(f"slip_share must lie between 0 and 1, got {slip_share}")
+    check_share("slip_share", slip_share)
     return (llr + (math.log(slip_share) - math.log1p(-slip_share))).sigmoid()
 
 

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -20,7 +20,6 @@ from torch import Tensor
 from tactslip_torch.features.ops import power_of_two_below
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import LARGEST_SAMPLE, Sensing, is_alive
-from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -143,23 +142,20 @@ class BaselineDetector:
         Raises:
             ValueError: if the number of channels or samples is another.
         """
-        given, fast, (pool, own) = given or samples.dtype, self.needed_index, self._of_fast
-        self.channel_filter.check(samples)
-        first = self.channel_filter.context_before - own.context_before
-        rest = samples.shape[-1] - 2 * self.channel_filter.context + 2 * own.context
-        raw = samples[..., fast, first : first + rest]
-        bins = own.valid(raw)
-        pool.check(bins)
+        given, pool, fast = given or samples.dtype, self.pool, list(self.pool.hand.fast)
+        filtered = self.channel_filter.valid(samples, fast)
+        pool.check(filtered)
+        bins = filtered[..., fast, :]
         high, low = bins.detach().amax(-1).double(), bins.detach().amin(-1).double()
         is_known = torch.maximum(high, -low) <= min(LARGEST_SAMPLE, torch.finfo(bins.dtype).max)
-        inverse = pool.inverse_span(given, is_raw=True).to(high.device)
-        none = torch.zeros(len(fast), dtype=torch.float64, device=high.device)
-        alive = is_alive(high - low, own.raw_magnitude(raw), is_known, inverse, none)
-        bins = torch.where(is_known[..., None], bins.to(given), 0.0)
+        inverse = pool.inverse_span(given, is_raw=True).to(high.device)[fast]
+        magnitude = self.channel_filter.raw_magnitude(samples, fast)[..., fast]
+        alive = is_alive(high - low, magnitude, is_known, inverse, torch.zeros_like(inverse))
+        bins, every = torch.where(is_known[..., None], bins.to(given), 0.0), range(len(fast))
         if self.name == "fast_band_power":
-            score = fast_band_power(bins, pool.hand.fast, pool.sample_rate_hz)
+            score = fast_band_power(bins, every, pool.sample_rate_hz)
         else:
-            score = largest_detail(bins, pool.hand.fast, pool.wavelet, pool.level)
+            score = largest_detail(bins, every, pool.wavelet, pool.level)
         is_valid = alive.sum(-1) >= self.sensing.min_alive
         is_lost = is_known.new_zeros(samples.shape[:-1])
         is_lost[..., fast] = ~alive
@@ -173,18 +169,6 @@ class BaselineDetector:
         """Without training: half of the fast channels must be alive."""
         pool = self.pool
         return Sensing.unknown(len(pool.hand), len(pool.hand.fast), pool.sample_rate_hz)
-
-    @cached_property
-    def _of_fast(self) -> tuple[FeaturePool, ChannelFilter]:
-        """Pool and filter of the fast channels alone."""
-        channels, lengths = self.pool.hand.channels, self.channel_filter.window_lengths
-        hand = HandLayout(tuple(channels[place] for place in self.pool.hand.fast))
-        frames = [lengths[place] for place in self.pool.hand.fast]
-        settings: dict[str, Any] = self.channel_filter.config() | {
-            "window_lengths": frames,
-            "kernels": {k: v for k, v in self.channel_filter.kernels.items() if k in frames},
-        }
-        return FeaturePool(hand, **self.pool.config(), backend="torch"), ChannelFilter(**settings)
 
 
 def _log_of_largest(

@@ -34,7 +34,7 @@ from tactslip_torch.onset.rules import (
     most_lost,
     rule_from_dict,
 )
-from tactslip_torch.runtime import check_number
+from tactslip_torch.runtime import check_number, check_share
 from tactslip_torch.signals.filtering import ChannelFilter, extended
 
 LARGEST = 1e30
@@ -87,8 +87,7 @@ class AlarmSettings:
 
     def __post_init__(self) -> None:
         check_number("hop_samples", self.hop_samples, whole=True)
-        if not 0 < self.slip_share < 1:
-            raise ValueError(f"slip_share must lie between 0 and 1, got {self.slip_share}")
+        check_share("slip_share", self.slip_share)
         if self.target_per_hour is not None:
             check_number("target_per_hour", self.target_per_hour)
         if math.isfinite(self.threshold) and self.threshold > self.rule.ceiling:
@@ -123,12 +122,6 @@ class AlarmSettings:
         if self.onset is None:
             return replace(self, threshold=value)
         return replace(self, onset=replace(self.onset, threshold=value))
-
-    @property
-    def thresholds(self) -> dict[str, float]:
-        """That of the statistic and, with an onset classifier, of its score."""
-        of_onset = {} if self.onset is None else {"onset_score": self.onset.threshold}
-        return {"statistic": self.threshold} | of_onset
 
     def latch_times(self, sample_rate_hz: float) -> dict[str, int]:
         """Times of a latch, in decisions, rounded up."""
@@ -179,16 +172,6 @@ class AlarmSettings:
                 "with onset=debounced, which is set for no rate"
             )
         return cls.from_dict(detector.info[KEY], detector.pool.hand, detector.pool.sample_rate_hz)
-
-
-def calibration_of(detector: SlipDetector) -> tuple[Platt, float] | None:
-    """What makes a probability of a detector's score, and the share of slip it is stated for.
-
-    As ``SlipDetector.calibration``, whose alarm settings are checked.
-    """
-    if KEY in detector.info:
-        AlarmSettings.of(detector)
-    return detector.calibration
 
 
 class Scorer(Protocol):
@@ -253,13 +236,19 @@ def score_stream(
         if samples.shape[-1] < max(length, *(lengths[channel] for channel in used)):
             empty, none = samples.new_empty(0), samples.new_empty(0, len(samples))
             return Prediction(empty, empty.bool(), empty.bool(), none.bool(), none.double())
-        samples = without_stuck(samples, detector.sensing.stuck_samples)
-        whole = extended(detector.pool.widen(samples), detector.channel_filter, used)
-        bins = whole.unfold(-1, length + 2 * detector.channel_filter.context, hop_samples)
+        bins = _raw_bins(detector, samples, hop_samples)
         parts = [
             detector.predict_raw(x, given=samples.dtype) for x in bins.transpose(0, 1).split(chunk)
         ]
         return Prediction(*map(torch.cat, zip(*parts, strict=True)))
+
+
+def _raw_bins(detector: Scorer, samples: Tensor, hop_samples: int) -> Tensor:
+    """Bins with their context: ``[*, C, T] -> [*, C, m, W]``."""
+    layer, length = detector.channel_filter, detector.pool.bin_samples
+    samples = without_stuck(samples, detector.sensing.stuck_samples)
+    whole = extended(detector.pool.widen(samples), layer, detector.needed_index.tolist())
+    return whole.unfold(-1, length + 2 * layer.context, hop_samples)
 
 
 @dataclass(frozen=True)
@@ -436,7 +425,7 @@ class _StreamRule:
     def _begin(self) -> None:
         """Forget all that the rule gathered."""
         if self._rule is not None:
-            self._memory = self._rule.start(torch.zeros(()).double()).tolist()
+            self._memory = self._rule.start()
 
 
 class Decider:
@@ -670,9 +659,7 @@ def stream_statistic(
             f"expected at least {shortest} samples, a bin and the longest frame in use, "
             f"got {samples.shape[-1]}; give a longer recording"
         )
-    samples = without_stuck(samples, detector.sensing.stuck_samples)
-    whole = extended(detector.pool.widen(samples), detector.channel_filter, used)
-    bins = whole.unfold(-1, length + 2 * detector.channel_filter.context, settings.hop_samples)
+    bins = _raw_bins(detector, samples, settings.hop_samples)
     is_used = torch.zeros(len(detector.pool.hand), 1, dtype=torch.bool, device=bins.device)
     is_used[used] = True
     bins = bins.movedim(-3, -2)  # [*, m, C, n + context]
@@ -685,7 +672,7 @@ def stream_statistic(
         found.is_valid.reshape(-1, llr.shape[-1]),
         strict=True,
     ):
-        known, _ = settings.rule.scan(own[valid], settings.rule.start(own.new_zeros(())))
+        known = settings.rule.scan(own[valid])
         rows.append(torch.full_like(own, torch.nan).masked_scatter(valid, known))
     statistic = torch.stack(rows).reshape(llr.shape)
     llr = torch.where(found.is_valid, llr, torch.nan)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 _OUTCOMES = ("found", "early", "missed")  # what becomes of an onset
+_LEVEL = 0.95  # of intervals
 _STEPS = 20  # between the quantiles that are kept
 
 _FOREVER_S = 1e9
@@ -281,25 +282,14 @@ class Bootstrap:
         num_recordings: in the set.
         level: of the intervals, whose ends are percentiles.
         num: how many draws.
-        seed: of the draws.
-
-    Raises:
-        ValueError: if the level is not between 0 and 1, or nothing is to be drawn.
 
     Reference:
         Efron and Tibshirani (1993), An Introduction to the Bootstrap, chapters 8 and 13. Wilson
         (1927), J. Am. Stat. Assoc. 22, 209-212, and its form for a Poisson count.
     """
 
-    def __init__(
-        self, num_recordings: int, level: float = 0.95, num: int = 1000, seed: int = 0
-    ) -> None:
-        if not (0 < level < 1 and num >= 1):
-            raise ValueError(
-                "an interval needs a level between 0 and 1 and at least one draw, got "
-                f"level={level} and num_resamples={num}"
-            )
-        generator = torch.Generator().manual_seed(seed)
+    def __init__(self, num_recordings: int, level: float = _LEVEL, num: int = 1000) -> None:
+        generator = torch.Generator().manual_seed(0)
         shape = (num, num_recordings)
         drawn = torch.randint(max(num_recordings, 1), shape, generator=generator)
         self._ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
@@ -330,12 +320,13 @@ class Bootstrap:
             return None
         sums = self._times @ torch.tensor([parts, wholes], dtype=torch.float64).T  # [draws, 2]
         drawn, having = per * sums[:, 0] / sums[:, 1], torch.tensor(wholes).nonzero()
-        low, high = self._interval(value := per * part / whole, drawn, having)
-        if end is not None:
-            ends = [per * end(part, whole, z) for z in (-self._z, self._z)]
-            low = ends[0] if low is None else min(ends[0], low)
-            high = ends[1] if high is None else max(ends[1], high)
-        return {"value": value, "low": low, "high": high}
+        number = self._number(per * part / whole, drawn, having)
+        if end is None:
+            return number
+        low, high = (per * end(part, whole, z) for z in (-self._z, self._z))
+        if number["low"] is not None and number["high"] is not None:
+            low, high = min(low, number["low"]), max(high, number["high"])
+        return number | {"low": low, "high": high}
 
     def quantile(self, values: Tensor, recording: Tensor, share: float) -> Number:
         """Quantile of values, linear between neighbours, each value drawn with its recording.
@@ -355,31 +346,12 @@ class Bootstrap:
         drawn = torch.where(reached[:, -1:] < 1, torch.nan, drawn)[:, 0]
         return self._number(float(ordered.quantile(share)), drawn, recording)
 
-    def mean(self, values: Tensor, recording: Tensor) -> Number:
-        """Mean of values; shapes as of ``quantile``."""
-        times = self._times[:, recording]
-        return self._number(float(values.mean()), times @ values / times.sum(1), recording)
-
-    def deviation(self, values: Tensor, recording: Tensor) -> Number:
-        """Standard deviation of values, of the population; shapes as of ``quantile``."""
-        away = values - values.mean()
-        powers = torch.stack([torch.ones_like(away), away, away**2])  # [3, N]
-        count, first, second = (self._times[:, recording] @ powers.T).T
-        drawn = (second / count - (first / count) ** 2).clamp(min=0).sqrt()
-        return self._number(float(away.square().mean().sqrt()), drawn, recording)
-
     def _number(self, value: float, drawn: Tensor, recording: Tensor) -> Number:
-        low, high = self._interval(value, drawn, recording)
-        return {"value": value, "low": low, "high": high}
-
-    def _interval(
-        self, value: float, drawn: Tensor, recording: Tensor
-    ) -> tuple[float | None, float | None]:
         known = drawn[~drawn.isnan()]  # NaN where a draw has none
         if len(recording.unique()) < 2 or not len(known):
-            return None, None
+            return {"value": value, "low": None, "high": None}
         low, high = known.quantile(self._ends).tolist()
-        return min(low, value), max(high, value)
+        return {"value": value, "low": min(low, value), "high": max(high, value)}
 
 
 def _share_end(part: float, whole: float, z: float) -> float:
@@ -392,10 +364,7 @@ def _rate_end(count: float, time: float, z: float) -> float:
 
 
 def pooled_metrics(
-    events: Sequence[RecordingEvents],
-    *,
-    level: float = 0.95,
-    num_resamples: int = 1000,
+    events: Sequence[RecordingEvents], *, num_resamples: int = 1000
 ) -> dict[str, Any]:
     """All recordings together, in JSON-able numbers; their order does not matter.
 
@@ -407,9 +376,8 @@ def pooled_metrics(
     - ``delay_ms`` of the slips found: ``median``, ``p95``, and ``quantiles`` from least to most in
       steps of 5 %. ``delay_first_ms``, from the first release, and ``slid_mm``, at most slid until
       the alarm: ``median`` and ``p95``. ``latency_ms``: means of the delay's parts, which add up to
-      ``delay``, and ``compute`` (None where not measured). ``onset_error_ms``: ``median``, ``sd``
-      (of the population) and ``mean_abs`` of the estimates. None where there is nothing to say
-      this of.
+      ``delay``, and ``compute`` (None where not measured). None where there is nothing to say this
+      of.
     - ``per_material``, ``per_scene``, ``per_speed``: the same of groups, without groups, level and
       quantiles; a false alarm has no speed. Of several scenes, materials and speeds are of the
       paper's alone.
@@ -419,18 +387,14 @@ def pooled_metrics(
 
     Args:
         events: of ``recording_events``; of several detectors if they are to be pooled.
-        level: of the intervals.
         num_resamples: draws.
-
-    Raises:
-        ValueError: if the level is not between 0 and 1, or nothing is to be drawn.
     """
     events = sorted(events, key=lambda one: (*_name(one), one.quiet_s, str(one.onsets)))
     is_one = len({one.scene for one in events}) < 2
     counted = [one for one in events if is_one or one.scene == PAPER_SCENE]
 
     def summary(own: Sequence[RecordingEvents], *, is_group: bool = True) -> dict[str, Any]:
-        numbers = _summary(own, level, num_resamples)
+        numbers = _summary(own, num_resamples)
         if is_group and numbers["delay_ms"]:
             del numbers["delay_ms"]["quantiles"]
         return numbers
@@ -452,17 +416,17 @@ def pooled_metrics(
         per_speed[f"{speed:g}"] = summary(own)
     return {
         **summary(events, is_group=False),
-        "level": level,
+        "level": _LEVEL,
         "per_material": by("material", counted),
         "per_speed": per_speed,
         "per_scene": by("scene", events),
     }
 
 
-def _summary(events: Sequence[RecordingEvents], level: float, num_resamples: int) -> dict[str, Any]:
+def _summary(events: Sequence[RecordingEvents], num_resamples: int) -> dict[str, Any]:
     """The numbers of ``pooled_metrics`` but for its groups."""
     places = {name: place for place, name in enumerate(dict.fromkeys(map(_name, events)))}
-    bootstrap = Bootstrap(len(places), level, num_resamples)
+    bootstrap = Bootstrap(len(places), num=num_resamples)
     sums = {
         name: [0.0] * len(places) for name in (*_OUTCOMES, "onsets", "alarms", "false", "hours")
     }
@@ -490,7 +454,7 @@ def _summary(events: Sequence[RecordingEvents], level: float, num_resamples: int
         shares = {"median": 0.5, "p95": 0.95} if len(values) else {}
         return {n: bootstrap.quantile(values, own, share) for n, share in shares.items()} or None
 
-    delay_ms, latency_ms, error_ms = spread("delay_s"), None, None
+    delay_ms, latency_ms = spread("delay_s"), None
     if delay_ms:
         steps = torch.linspace(0, 1, _STEPS + 1, dtype=torch.float64)
         delay, _ = known("delay_s", 1000)
@@ -506,13 +470,6 @@ def _summary(events: Sequence[RecordingEvents], level: float, num_resamples: int
             name: 1000 * math.fsum(seconds) / len(seconds) if seconds else None
             for name, seconds in parts.items()
         }
-        error, recording = known("error_s", 1000)
-        if len(error):
-            error_ms = {
-                "median": bootstrap.quantile(error, recording, 0.5),
-                "sd": bootstrap.deviation(error, recording),
-                "mean_abs": bootstrap.mean(error.abs(), recording),
-            }
     shares = {name: bootstrap.share(sums[name], sums["onsets"]) for name in _OUTCOMES}
     return {
         "num_recordings": len(places),
@@ -527,7 +484,6 @@ def _summary(events: Sequence[RecordingEvents], level: float, num_resamples: int
         "delay_first_ms": spread("delay_first_s"),
         "slid_mm": spread("slid_mm", 1),
         "latency_ms": latency_ms,
-        "onset_error_ms": error_ms,
     }
 
 

@@ -221,9 +221,9 @@ class OnsetEvidence:
         x = samples.double()
         hop, context = self.hop_samples, self.context
         frames = x[list(self.hand.fast)].unfold(-1, context + hop, hop)  # [F, k, context + hop]
-        heard = (frames - frames[..., :1]) @ torch.from_numpy(self.filter_matrix).flatten(1)
+        filtered = (frames - frames[..., :1]) @ torch.from_numpy(self.filter_matrix).flatten(1)
         square = (
-            heard.unflatten(-1, (len(self.fast_compression), hop)).square().mean(-1)
+            filtered.unflatten(-1, (len(self.fast_compression), hop)).square().mean(-1)
         )  # [F, k, B]
         power = square.mT + torch.from_numpy(np.square(self.fast_compression))[:, None]
         mean = x[list(self.hand.slow), context:].unfold(-1, hop, hop).mean(-1)
@@ -245,7 +245,7 @@ class OnsetEvidence:
 
         Args:
             blocks: of ``memory - 1`` hops before the first and of k more.
-            masked: channels that are not to be listened to.
+            masked: channels to leave out.
 
         Shape:
             - masked: ``[C]``, bool
@@ -258,13 +258,13 @@ class OnsetEvidence:
         floor = _moving_mean(logs, self.memory - windows[-1])
         rows = mean.unfold(-1, len(self.step_matrix), 1)[:, -num:]
         steps = (rows - rows[..., :1]) @ self.step_matrix  # [S, k, D]
-        heard = torch.ones(len(self.hand), dtype=torch.bool) if masked is None else ~masked
+        used = torch.ones(len(self.hand), dtype=torch.bool) if masked is None else ~masked
         return self.pooled(
             level.permute(2, 3, 1, 0),
             floor.permute(2, 1, 0),
             steps.permute(1, 2, 0),
-            heard[list(self.hand.fast)],
-            heard[list(self.hand.slow)],
+            used[list(self.hand.fast)],
+            used[list(self.hand.slow)],
         )
 
     def pooled(
@@ -276,7 +276,7 @@ class OnsetEvidence:
             level: mean power in each window and of each filter.
             floor: mean of half the log power over the last second.
             steps: of the slow channels.
-            fast: fast channels that are listened to.
+            fast: fast channels in use.
             slow: slow ones.
 
         Shape:
@@ -481,10 +481,7 @@ class OnsetStream:
         self, x: Array, rows: Array, num_rows: int, num_lost: int, listened: Array
     ) -> tuple[Array, Array, int, int]:
         """As ``native.OnsetEngine``."""
-        evidence, num_filters = (
-            self._classifier.evidence,
-            len(self._classifier.evidence.fast_compression),
-        )
+        evidence = self._classifier.evidence
         made = evidence.blocks(torch.from_numpy(x))
         logs = (made.power.log() * 0.5).transpose(1, 2)  # [F, k, B]
         fast = listened[list(evidence.hand.fast)]
@@ -493,25 +490,18 @@ class OnsetStream:
         alive = logs.sum(-1).isfinite() & ((rises > 0.0) & made.moves | rises.isinf())  # [F, k]
         is_lost = alive.numpy()[fast].sum(0) < evidence.min_alive
         made_rows = torch.cat([logs.transpose(1, 2).flatten(0, 1), made.mean]).T.numpy()
-        score, segments = np.full(len(made_rows), math.nan), list[tuple[bool, list[int]]]()
-        for hop in range(len(made_rows)):
-            num_lost += int(is_lost[hop])
-            if is_lost[hop]:
-                continue
-            if begins_anew := num_lost > self._most_lost:
-                segments.append((begins_anew, []))
-            elif not segments:
-                segments.append((False, []))
-            segments[-1][1].append(hop)
-            num_lost = 0
-        for begins_anew, hops in segments:
-            first = 0 if begins_anew else num_rows
+        score, kept = np.full(len(made_rows), math.nan), np.flatnonzero(~is_lost)
+        lost_before = np.diff(kept, prepend=-1 - num_lost) - 1
+        num_lost = len(is_lost) + (-1 - int(kept[-1]) if len(kept) else num_lost)
+        begins_anew = np.flatnonzero(lost_before > self._most_lost)
+        for part, hops in enumerate(np.split(kept, begins_anew)):
+            first = 0 if part else num_rows
             num_rows = first + len(hops)
             rows[first:num_rows] = made_rows[hops]
             known = torch.from_numpy(rows[max(first + 1 - evidence.memory, 0) : num_rows].T)
             if (num := known.shape[-1] - evidence.memory + 1) > 0:
                 own, means = known.split([len(known) - len(made.mean), len(made.mean)])
-                power = (2.0 * own).exp().unflatten(0, (-1, num_filters))
+                power = (2.0 * own).exp().unflatten(0, (-1, made.power.shape[1]))
                 found = self._classifier.score(Blocks(power, means), torch.from_numpy(~listened))
                 score[hops[-num:]] = found.numpy()
         return score, is_lost, num_rows, num_lost

@@ -17,6 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tactslip_torch.runtime import check_share
+
 HOLD_S = 0.25
 """Lost samples in a row up to which a rule keeps its state; beyond, it begins anew."""
 
@@ -49,31 +51,28 @@ class KOfN:
         if not 1 <= self.k <= self.n:
             raise ValueError(f"k must lie between 1 and n, got k={self.k} and n={self.n}")
 
-    def start(self, like: Tensor) -> Tensor:
-        """No decision yet: ``[*] -> [*, n - 1]``."""
-        return like.new_full((*like.shape, self.n - 1), NOTHING_YET)
+    def start(self) -> list[float]:
+        """The state before the first decision: ``n - 1`` that are none yet."""
+        return [NOTHING_YET] * (self.n - 1)
 
-    def scan(self, llr: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """The k-th largest of each decision and the ``n - 1`` before it, and the state after them.
+    def scan(self, llr: Tensor) -> Tensor:
+        """The k-th largest of each decision of a stream and the ``n - 1`` before it.
 
         Finite ratios up to 1e30 of either sign give finite statistics and gradients; what
-        is not valid the caller leaves out. Differentiable in both arguments.
+        is not valid the caller leaves out. Differentiable.
 
         Shape:
-            - llr, statistic: ``[*, T]``, ``T`` may be 0
-            - state: ``[*, n - 1]``
+            - llr, output: ``[T]``, ``T`` may be 0
         """
-        _check_state(llr, state, self.n - 1)
-        if llr.shape[-1] == 0:
-            return llr, state
-        known = torch.cat([state, llr], dim=-1)  # [*, n - 1 + T]
-        statistic = known.unfold(-1, self.n, 1).kthvalue(self.n - self.k + 1, dim=-1).values
-        return statistic, known[..., known.shape[-1] - self.n + 1 :].clone()
+        if not len(llr):
+            return llr
+        known = torch.cat([llr.new_tensor(self.start()), llr])  # [n - 1 + T]
+        return known.unfold(-1, self.n, 1).kthvalue(self.n - self.k + 1, dim=-1).values
 
     def scan_row(
         self, llrs: Sequence[float], state: list[float], dtype: type[Any]
     ) -> tuple[list[float], list[float]]:
-        """``scan`` of one stream, in plain numbers of a NumPy dtype: quicker than small tensors."""
+        """``scan`` from a state on, in plain numbers of a NumPy dtype; the state behind them."""
         known = [*state, *llrs]
         statistic = [sorted(known[i : i + self.n])[-self.k] for i in range(len(llrs))]
         return statistic, known[len(llrs) :]
@@ -118,30 +117,22 @@ class Cusum:
         if not self.ceiling > 0:
             raise ValueError(f"ceiling must be positive, got {self.ceiling}")
 
-    def start(self, like: Tensor) -> Tensor:
-        """Nothing gathered: ``[*] -> [*, 1]``."""
-        return like.new_zeros((*like.shape, 1))
+    def start(self) -> list[float]:
+        """The state before the first decision: a sum of 0."""
+        return [0.0]
 
-    def scan(self, llr: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """The sum after each decision, and the state after them; else as ``KOfN.scan``.
-
-        Shape:
-            - llr, statistic: ``[*, T]``, ``T`` may be 0
-            - state: ``[*, 1]``
-        """
-        _check_state(llr, state, 1)
-        steps = self.evidence * (llr - self.drift)
-        total = state[..., 0]
-        statistic = []
-        for step in steps.movedim(-1, 0).contiguous().unbind(0):  # the same kernels for any T
+    def scan(self, llr: Tensor) -> Tensor:
+        """The sum after each decision of a stream; else as ``KOfN.scan``."""
+        total, statistic = llr.new_zeros(()), []
+        for step in (self.evidence * (llr - self.drift)).unbind():
             total = (total + step).clamp(0.0, self.ceiling)
             statistic.append(total)
-        return torch.stack(statistic, dim=-1) if statistic else llr, total.unsqueeze(-1)
+        return torch.stack(statistic) if statistic else llr
 
     def scan_row(
         self, llrs: Sequence[float], state: list[float], dtype: type[Any]
     ) -> tuple[list[float], list[float]]:
-        """``scan`` of one stream, in plain numbers of a NumPy dtype: quicker than small tensors."""
+        """``scan`` from a state on, in plain numbers of a NumPy dtype; the state behind them."""
         sums = list(state)
         for llr in llrs:
             step = float(dtype(self.evidence) * (dtype(llr) - dtype(self.drift)))
@@ -245,14 +236,6 @@ def most_lost(window_samples: int, hold_samples: int, hop_samples: int) -> int:
     return -(-(window_samples + hold_samples) // hop_samples)
 
 
-def _check_state(llr: Tensor, state: Tensor, size: int) -> None:
-    if llr.ndim == 0 or state.shape != (*llr.shape[:-1], size):
-        raise ValueError(
-            f"expected llr [*, T] and the state [*, {size}] that start or scan gave, "
-            f"got {tuple(llr.shape)} and {tuple(state.shape)}"
-        )
-
-
 # Thresholds --------------------------------------------------------------------------------------
 
 
@@ -294,8 +277,7 @@ class Budget:
         if not (0 < self.limit < math.inf and (self.limit < 1 or not self.is_share)):
             most = "between 0 and 1" if self.is_share else "positive"
             raise ValueError(f"onset.budget of {self.scene} must be {most}, got {self.limit}")
-        if not 0 < self.confidence < 1:
-            raise ValueError(f"onset.confidence must lie between 0 and 1, got {self.confidence}")
+        check_share("onset.confidence", self.confidence)
 
     def bound(self, alarms: int, amount: float) -> float:
         """The upper confidence bound of what so many alarms in so many hours, or knocks, show.

@@ -31,7 +31,6 @@ Array = NDArray[Any]
 
 
 _LEVELS_S = 2.0  # of stream, from which levels at rest are taken
-_MOST_NAMES = 6  # in an event
 _MOST_EVENTS = 1000  # that wait
 
 
@@ -462,18 +461,18 @@ class _HandEvents:
     def _report(self, time_s: float, state: Array, is_new: Array) -> None:
         names, texts = self._detector.pool.hand.names, []
         if is_new[-1]:
-            lost = f"not valid: {_listed(names, state[:-1])} lost"
+            lost = f"not valid: {listed(names, state[:-1])} lost"
             texts.append(f"decisions are {lost if state[-1] else 'valid again'}")
         for is_lost, what in ((True, "lost"), (False, "back")):
             if (which := is_new[:-1] & (state[:-1] == is_lost)).any():
-                texts.append(f"channels {what}: {_listed(names, which)}")
+                texts.append(f"channels {what}: {listed(names, which)}")
         self._events.extend(StreamEvent(time_s, text) for text in texts)
 
 
-def _listed(names: Sequence[str], which: Array) -> str:
-    """Names of channels, not too many: ``"A, B and 5 more"``."""
+def listed(names: Sequence[str], which: Array, most: int = 6) -> str:
+    """Names of the channels in a mask, not too many: ``"A, B and 5 more"``."""
     own = [name for name, is_one in zip(names, which, strict=True) if is_one]
-    if len(own) == len(names):
+    if len(own) == len(names) > 1:
         return f"all {len(names)} channels"
-    rest = f" and {len(own) - _MOST_NAMES} more" if len(own) > _MOST_NAMES else ""
-    return ", ".join(own[:_MOST_NAMES]) + rest
+    rest = f" and {len(own) - most} more" if len(own) > most else ""
+    return ", ".join(own[:most]) + rest

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.report.published import PAPER_SCENE
+from tactslip_torch.runtime import check_share
 
 _Label = TypeVar("_Label", str, int)
 _FIRST, _LAST = -20, 19
@@ -194,8 +195,7 @@ def weights_at_share(is_slip: Tensor, slip_share: float) -> Tensor:
     Raises:
         ValueError: if a class is absent or the fraction does not lie between 0 and 1.
     """
-    if not 0 < slip_share < 1:
-        raise ValueError(f"slip_share must lie between 0 and 1, got {slip_share}")
+    check_share("slip_share", slip_share)
     if not is_slip.any() or is_slip.all():
         raise ValueError(
             f"expected bins of slip and of non-slip, got one of them in {len(is_slip)}"

@@ -41,7 +41,6 @@ from tactslip_torch.onset.decisions import (
     Decider,
     Decisions,
     Scorer,
-    calibration_of,
     score_stream,
 )
 from tactslip_torch.onset.events import (
@@ -66,7 +65,7 @@ from tactslip_torch.onset.rules import (
 )
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.report.metrics import weights_at_share
-from tactslip_torch.runtime import bar, check_number, in_processes, one_thread
+from tactslip_torch.runtime import bar, check_number, check_share, in_processes, one_thread
 from tactslip_torch.training.onset import OnsetTraining
 
 log = logging.getLogger(__name__)
@@ -94,7 +93,6 @@ _PUSHES = 200  # timed
 _FULL_S = 2.0  # of stream, until memories are full
 _OF_BINS = 0.5  # of what a budget allows, at most, that bins alone raise
 _SETTLE_S = 0.05  # behind what a decision rests on, as EventRules.settle_s
-_FOUND = 0.95  # share of slips below which a warning names the budgets that cost them
 _LEVEL = 0.95  # of intervals
 _OTHERS = "others"  # scenes without hours of their own
 
@@ -302,6 +300,18 @@ def threshold_curve(
     return points[::-1]
 
 
+def _events(
+    streams: Sequence[Stream], settings: AlarmSettings, timing: Timing, compute_s: float | None
+) -> dict[str, Any]:
+    rate = timing.sample_rate_hz
+    latency = LatencyParts(timing.look_ahead / rate, timing.bin_samples / rate, compute_s)
+    seen = [
+        recording_events(event_record(*made), EventRules(), latency)
+        for made in decide(streams, settings, timing)
+    ]
+    return pooled_metrics(seen)
+
+
 def _reliability(
     streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
 ) -> dict[str, Any]:
@@ -414,8 +424,8 @@ class CalibratedAlarm:
                 )
         if self.slip_free not in self.budget:
             raise ValueError(f"onset.budget must say what {self.slip_free} may have, an hour")
-        _check_numbers(self, positive=("hop_ms",))
-        self.made_rule(self.hop_samples)  # bad numbers are refused now
+        check_number("onset.hop_ms", self.hop_ms)
+        self._settings(self.made_rule(1), Platt(1.0, 0.0), self.hop_samples)  # refuses bad numbers
 
     @property
     def hop_samples(self) -> int:
@@ -535,10 +545,8 @@ class CalibratedAlarm:
         methods = self.methods(scored["calibrate"], timings, onset)
         amounts = self._amounts({"learn": learn, **roles})
         _, settings = methods[JOINT]
-        calibrating: dict[str, list[Stream]] = {PAPER_SCENE: [], self.slip_free: []}
-        for stream in scored["calibrate"][OURS]:
-            calibrating.setdefault(stream.recording.scene, []).append(stream)
-        curve = threshold_curve(calibrating[self.slip_free], settings, timings[OURS])
+        quiet = [x for x in scored["calibrate"][OURS] if x.recording.scene == self.slip_free]
+        curve = threshold_curve(quiet, settings, timings[OURS])
         metadata = {
             **settings.metadata,
             "simulated": self.streams.is_simulated,
@@ -547,25 +555,7 @@ class CalibratedAlarm:
         }
         settings = replace(settings, metadata=metadata)
         detector.info[KEY] = settings.to_dict()
-        compute_s = {OURS: _push_seconds(detector, settings)}
-        events = defaultdict[str, dict[str, dict[str, Any]]](lambda: defaultdict(dict))
-        calibrations = {}
-        checked = [role for role in roles if role != "calibrate" and roles[role]]
-        for role, name in bar(list(product(checked, methods)), "events", "table row"):
-            scorer, made = methods[name]
-            by_scene = defaultdict[str, list[Stream]](list)  # "" the usual ones
-            for stream in scored[role][scorer]:
-                scene = stream.recording.scene
-                by_scene["" if scene in (PAPER_SCENE, self.slip_free) else scene].append(stream)
-            for scene, own in by_scene.items():
-                found = self._events(own, made, timings[scorer], compute_s.get(scorer))
-                events[scene][role][name] = found
-            if name == JOINT and (found := _reliability(by_scene[""], settings, timings[OURS])):
-                calibrations[f"{role} stream"] = found
-        of_paper = self._events(calibrating[PAPER_SCENE], settings, timings[OURS], None)
-        self._warn_of_costs(of_paper, settings)
-        budget_rows = self._budget_rows(events, methods, roles)
-        usual = events.pop("", {})
+        del scored["calibrate"]
         return {
             "rule": JOINT,
             "sample_rate_hz": rate,
@@ -581,6 +571,33 @@ class CalibratedAlarm:
                 }
                 for name, (scorer, made) in methods.items()
             },
+            **self._evaluated(scored, methods, timings, _push_seconds(detector, settings)),
+        }
+
+    def _evaluated(
+        self,
+        scored: Mapping[str, Mapping[str, Sequence[Stream]]],
+        methods: Mapping[str, tuple[str, AlarmSettings]],
+        timings: Mapping[str, Timing],
+        compute_s: float,
+    ) -> dict[str, Any]:
+        """What came of each method on recordings of each role that set nothing."""
+        events = defaultdict[str, dict[str, dict[str, Any]]](lambda: defaultdict(dict))
+        calibrations = {}
+        for role, name in bar(list(product(scored, methods)), "events", "table row"):
+            scorer, made = methods[name]
+            by_scene = defaultdict[str, list[Stream]](list)  # "" the usual ones
+            for stream in scored[role][scorer]:
+                scene = stream.recording.scene
+                by_scene["" if scene in (PAPER_SCENE, self.slip_free) else scene].append(stream)
+            for scene, own in by_scene.items():
+                measured_s = compute_s if scorer == OURS else None
+                events[scene][role][name] = _events(own, made, timings[scorer], measured_s)
+            if name == JOINT and (found := _reliability(by_scene[""], made, timings[OURS])):
+                calibrations[f"{role} stream"] = found
+        budget_rows = self._budget_rows(events, methods, scored)
+        usual = events.pop("", {})
+        return {
             "budget": budget_rows,
             "reliability": calibrations,
             "events": {f"{role} stream": found for role, found in usual.items()},
@@ -768,29 +785,15 @@ class CalibratedAlarm:
         """Decisions of an hour."""
         return 3600 * self.streams.sample_rate_hz / settings.decision_samples
 
-    def _warn_of_costs(self, numbers: Mapping[str, Any], settings: AlarmSettings) -> None:
-        """Warn where budgets leave fewer slips found than wanted, and name what costs them."""
-        share = numbers["found"] and numbers["found"]["value"]
-        if share is None or share >= _FOUND:
-            return
-        full = [row for row in settings.metadata["budget"] if row["alarms"] == row["allowed"]]
-        log.warning(
-            "%.1f %% of the slips that calibrate are found, fewer than %.0f: the budget "
-            "of %s leaves no more; allow it more alarms, or give it more hours to show its rate on",
-            100 * share,
-            100 * _FOUND,
-            ", ".join(row["scene"] for row in full) or "every scene",
-        )
-
     def _budget_rows(
         self,
         events: Mapping[str, Mapping[str, Mapping[str, Any]]],
         methods: Mapping[str, object],
-        roles: Mapping[str, Sequence[RecordingId]],
+        scored: Mapping[str, Mapping[str, Sequence[Stream]]],
     ) -> list[dict[str, Any]]:
         """What each method had of each budget, on recordings of each role."""
         rows = []
-        for role, budget, name in product(roles, self.budgets, methods):
+        for role, budget, name in product(scored, self.budgets, methods):
             is_usual = budget.scene == self.slip_free
             scene = "" if is_usual else budget.scene
             numbers = events.get(scene, {}).get(role, {}).get(name, {})
@@ -800,8 +803,8 @@ class CalibratedAlarm:
                 continue
             alarms, amount = numbers["num_false_alarms"], numbers["quiet_hours"]
             if budget.is_share:
-                own = (one for one in roles[role] if one.scene == budget.scene)
-                amount = sum(len(self.streams.timeline(one).non_slip_s) for one in own)
+                own = (x for x in scored[role][OURS] if x.recording.scene == budget.scene)
+                amount = sum(len(stream.times.non_slip_s) for stream in own)
             if not amount:
                 continue
             low, high = budget.interval(alarms, amount, _LEVEL)
@@ -820,21 +823,6 @@ class CalibratedAlarm:
                 }
             )
         return rows
-
-    def _events(
-        self,
-        streams: Sequence[Stream],
-        settings: AlarmSettings,
-        timing: Timing,
-        compute_s: float | None,
-    ) -> dict[str, Any]:
-        rate = timing.sample_rate_hz
-        latency = LatencyParts(timing.look_ahead / rate, timing.bin_samples / rate, compute_s)
-        seen = [
-            recording_events(event_record(*made), EventRules(), latency)
-            for made in decide(streams, settings, timing)
-        ]
-        return pooled_metrics(seen, level=_LEVEL)
 
     def _amounts(
         self, roles: Mapping[str, Sequence[RecordingId]]
@@ -904,10 +892,12 @@ class DebouncedAlarm:
     refractory_s: float = 0.2
 
     def __post_init__(self) -> None:
-        _check_numbers(self, positive=() if self.hop_ms is None else ("hop_ms",))
+        if self.hop_ms is not None:
+            check_number("onset.hop_ms", self.hop_ms)
         for name in ("k", "n"):
             check_number(f"onset.{name}", getattr(self, name), whole=True)
-        KOfN(self.k, self.n)
+        check_share("onset.probability", self.probability)
+        self._settings(Platt(1.0, 0.0), 1)  # refuses bad numbers
 
     def hop_samples(self, sample_rate_hz: float, bin_samples: int) -> int:
         """The distance of two decisions in samples.
@@ -925,34 +915,25 @@ class DebouncedAlarm:
         Raises:
             ValueError: if training had nothing to choose, so that scores have no calibration.
         """
-        known = calibration_of(detector)
+        known = detector.calibration
         if known is None:
             raise ValueError(
                 "onset=debounced needs the calibration of held-out scores, and training chose "
                 "nothing; give several recipe.penalties"
             )
-        pool = detector.pool
-        odds, share_odds = (p / (1 - p) for p in (self.probability, self.slip_share))
+        hop = self.hop_samples(detector.pool.sample_rate_hz, detector.pool.bin_samples)
+        detector.info[KEY] = self._settings(known[0], hop).to_dict()
+
+    def _settings(self, calibration: Platt, hop_samples: int) -> AlarmSettings:
         settings = AlarmSettings(
-            hop_samples=self.hop_samples(pool.sample_rate_hz, pool.bin_samples),
-            calibration=known[0],
-            rule=KOfN(self.k, self.n),
-            threshold=math.log(odds) - math.log(share_odds),
+            hop_samples,
+            calibration,
+            KOfN(self.k, self.n),
+            threshold=0.0,
             target_per_hour=None,
             slip_share=self.slip_share,
             rearm_s=self.rearm_s,
             refractory_s=self.refractory_s,
         )
-        detector.info[KEY] = settings.to_dict()
-
-
-def _check_numbers(stage: CalibratedAlarm | DebouncedAlarm, positive: Sequence[str]) -> None:
-    """Refuse numbers that cannot be, of both stages."""
-    for name in positive:
-        check_number(f"onset.{name}", getattr(stage, name))
-    for name in ("rearm_s", "refractory_s"):
-        check_number(f"onset.{name}", getattr(stage, name), least=0)
-    for name in ("slip_share", "probability"):
-        value = getattr(stage, name, 0.5)
-        if type(value) not in (int, float) or not 0 < value < 1:
-            raise ValueError(f"onset.{name} must lie between 0 and 1, got {value!r}")
+        odds, share_odds = (p / (1 - p) for p in (self.probability, self.slip_share))
+        return replace(settings, threshold=math.log(odds) - math.log(share_odds))

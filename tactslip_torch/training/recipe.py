@@ -236,22 +236,23 @@ class _Recipe(ABC):
         statistics = _merged(statistics)
         plan: _Plan = from_first_process(lambda: self._plan(statistics, pool, is_nested, show))
         size, degree, kept = plan.selection.size, plan.kernel.degree, {}
-        sums = SufficientStats(size, degree=degree)
-        adds_up = plan.num_bins > plan.kernel.num_monomials(size)  # else the bins are fewer
+        sums = None  # where bins are fewer than products, which may have no place in memory
+        if plan.num_bins > plan.kernel.num_monomials(size):
+            sums = SufficientStats(size, degree=degree)
         for some in bins:
             part = self._weighted(plan, some)
-            if adds_up:
-                sums.update(some.name, *part)
-            else:
+            if sums is None:
                 kept[some.name] = part
-        if not adds_up:
+            else:
+                sums.update(some.name, *part)
+        if sums is None:
             kept = dict(itertools.chain(*(own.items() for own in gathered(kept))))
         elif _num_processes() > 1:
             for total in (sums.sums, sums.count):
                 torch.distributed.all_reduce(total)
 
         def solve() -> Head:
-            if adds_up:
+            if sums is not None:
                 return sums.solve(plan.penalty, plan.kernel.offset, balance="none")
             columns = zip(*(kept[name] for name in sorted(kept)), strict=True)
             return fit_machine(TrainingBins(*map(torch.cat, columns)), plan.penalty, plan.kernel)

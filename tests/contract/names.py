@@ -122,11 +122,3 @@ from tactslip_torch.data.formats import FORMATS, Reading, named_format, open_fil
 
 INSTALL_FORMATS = 'pip install "tactslip-torch[formats]"'
 """What brings the library of a format that is not installed."""
-
-
-def rate_in_set(path):
-    """The rate at which a set of files takes a recording."""
-    from tactslip_torch.data.file_recordings import FileRecordings
-
-    (path.parent / MANIFEST).write_text(f"file,material,label\n{path.name},wood,slip\n")
-    return FileRecordings(path.parent).sample_rate_hz
