@@ -402,7 +402,7 @@ def test_what_is_wrong_in_text_has_its_line(tmp_path, content, said):
 HUNDRED = {"sample_rate_hz": 100.0}
 TIMELESS = HUNDRED | {"time": None}
 NAN, INF = float("nan"), float("inf")
-COUNTS = {"frame", "Frame Index", "episode_index", "seq", "label", "Slip [0/1]", "time (min)"}
+COUNTS = ["frame", "Frame Index", "episode_index", "seq", "label", "Slip [0/1]", "time (min)"]
 STAMP = 1_700_000_000  # seconds since 1970
 FOREIGN = [  # head, the i-th of 40 lines, how it is read, names, the last sample, rate by its times
     ("time,a,b\n", "{s},-1.#IND,1.#INF", {}, "ab", [NAN, INF], 100),  # as Microsoft writes them
