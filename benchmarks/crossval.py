@@ -17,7 +17,6 @@ from typing import Any, ClassVar
 
 import torch
 from hydra.utils import instantiate
-from omegaconf import DictConfig
 
 from benchmarks.harness import Benchmark, Job, code_digest, resumed
 from benchmarks.subjects import composed
@@ -28,7 +27,7 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.runtime import in_processes
 from tactslip_torch.training.bins import BinSample, RecordingBins, SampledBins
 from tactslip_torch.training.choice import balanced_accuracy
-from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import feature_cache, feature_maker
 from tactslip_torch.training.recipe import Recipe
 
@@ -53,30 +52,35 @@ class Materials:
 
 
 def read_materials(
-    config: DictConfig, source: RecordingSource, names: Sequence[str], train_bins: int, scored: int
+    maker: FeatureMaker,
+    names: Sequence[str],
+    train_bins: int,
+    scored: int,
+    *,
+    seed: int = 0,
+    num_workers: int | None = None,
 ) -> Materials:
     """One pass over all recordings, split by cycle.
 
     Args:
-        config: of ``tactslip train``.
-        source: of the recordings.
+        maker: of the features of their source.
         names: of the materials.
         train_bins: bins of each material and class to fit on.
         scored: and to evaluate on.
+        seed: of the split.
+        num_workers: processes that make features.
     """
-    by_cycle = seen6(source.ids, seen=list(names), seed=config.seed)[0]
-    maker = feature_maker(source, instantiate(config.labels), **config.features)
+    by_cycle = seen6(maker.source.ids, seen=list(names), seed=seed)[0]
     fitted = {name: BinSample(train_bins) for name in names}
     drawn = {(name, role): BinSample(scored) for name in names for role in ("train", "test")}
-    with feature_cache(config.cache) as maker.cache:
-        data = SlipDataModule(maker, [by_cycle], config.num_workers)
-        data.setup()
-        for made in data.features("train", "test"):
-            material, role = made.recording.material, by_cycle.roles[made.recording]
-            bins = RecordingBins(str(made.recording), material, made.features, made.is_slip)
-            drawn[material, role].update(bins)
-            if role == "train":
-                fitted[material].update(bins)
+    data = SlipDataModule(maker, [by_cycle], num_workers)
+    data.setup()
+    for made in data.features("train", "test"):
+        material, role = made.recording.material, by_cycle.roles[made.recording]
+        bins = RecordingBins(str(made.recording), material, made.features, made.is_slip)
+        drawn[material, role].update(bins)
+        if role == "train":
+            fitted[material].update(bins)
     training = {}
     for name, sample in fitted.items():
         own = sample.bins()
@@ -156,7 +160,12 @@ class Crossval(Benchmark):
             recipes[name] = replace(made, sample_bins=self.train_bins)
         source: RecordingSource = instantiate(config.data, _convert_="all")
         names = sorted({recording.material for recording in source.ids})
-        materials = read_materials(config, source, names, self.train_bins, self.scored_bins)
+        maker = feature_maker(source, instantiate(config.labels), **config.features)
+        sizes = self.train_bins, self.scored_bins
+        with feature_cache(config.cache) as maker.cache:
+            materials = read_materials(
+                maker, names, *sizes, seed=config.seed, num_workers=config.num_workers
+            )
 
         def work(job: tuple[str, Sequence[str]]) -> dict[str, Any]:
             return evaluate_split(materials, recipes[job[0]], job[1])

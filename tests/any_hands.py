@@ -179,9 +179,8 @@ def detector_of(name: str, backend: BackendName = "auto") -> SlipDetector:
     features = pool(channel_filter.valid(samples))
     moments = ClassMoments(len(pool.names))
     moments.update(features.float(), is_slip)
-    scores, allowed = t_scores(moments), Paper().allowed(pool)
-    if allowed is not None:
-        scores[~allowed] = 0.0
+    scores, allowed = t_scores(moments), Paper(num_features=1).allowed(pool)
+    scores[~allowed] = 0.0
     selected = rank_features(scores, hand.num_features).tolist()
     scaler = FeatureScaler.fit(features[:, selected])
     machine = fit_machine(TrainingBins(scaler(features[:, selected]), is_slip), 1.0)

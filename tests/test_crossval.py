@@ -3,24 +3,23 @@
 import pytest
 from small_set import SmallSet, small_maker, small_recipe
 
-from benchmarks.crossval import Materials, evaluate_split
-from tactslip_torch.data.splits import seen6
-from tactslip_torch.training.datamodule import SlipDataModule
+from benchmarks.crossval import evaluate_split, read_materials
+from tactslip_torch.training.recipe import General
+
+RECIPES = {
+    "paper": small_recipe(),
+    "general": General(sample_bins=50, use="channel", num_features=10, degree=1),
+}
 
 
 def read(source):
-    by_cycle = seen6(source.ids, seen=["a", "b", "c"])[0]
-    maker = small_maker(source)
-    materials = Materials(maker.pool, 30, 2000)
-    for batch in SlipDataModule(maker, by_cycle, 0).loader(["train", "test"]):
-        materials.update(batch, by_cycle.roles[batch.recording])
-    return materials
+    return read_materials(small_maker(source), "abc", 30, 2000, num_workers=0)
 
 
-@pytest.mark.parametrize("balance", ["undersample", "weights"])
-def test_an_unseen_material_teaches_nothing(balance):
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_an_unseen_material_teaches_nothing(recipe):
     def found(source, unseen):
-        return evaluate_split(read(source), small_recipe(balance=balance), [unseen])
+        return evaluate_split(read(source), RECIPES[recipe], [unseen])
 
     plain = SmallSet()
     louder = SmallSet(gains={r: 5.0 for r in plain.ids if r.material == "c"})
@@ -32,9 +31,8 @@ def test_an_unseen_material_teaches_nothing(balance):
 
 def test_a_score_is_the_mean_recall_on_all_bins_of_the_unseen_materials():
     materials = read(SmallSet())
-    trained = {name: len(s.seen_batches) for name, s in materials.training_statistics.items()}
-    assert trained == dict.fromkeys("abc", 4)  # the fifth cycle is for tests
+    scored = {key: len(sample.is_slip) for key, sample in materials.scored.items()}
+    roles = {"train": 4, "test": 1}  # of five cycles
+    assert scored == {(name, role): 37 * num for name in "abc" for role, num in roles.items()}
     found = evaluate_split(materials, small_recipe(), ["a", "c"])
-    bins = materials.bins_of(["a", "c"], ("train", "test"))
-    assert len(bins.is_slip) == 2 * 5 * 37  # every bin of both materials: none was sampled away
     assert found["unseen"] == pytest.approx(sum(found["per_material"].values()) / 2)

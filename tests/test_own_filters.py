@@ -6,7 +6,6 @@ from small_set import SMALL_HAND, SmallSet
 
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.splits import unseen4
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import FORMAT, SlipDetector
@@ -26,17 +25,13 @@ def maker_of(source, wavelet="rbio2.2", kernels=None, cache=None):
     return FeatureMaker(source, pool, ChannelFilter([51, 11], kernels=kernels), LabelRule(), cache)
 
 
-def split_of(source):
-    return unseen4(source.ids, seen=["a", "b"], unseen=["c"])[0]
-
-
 def test_other_filters_are_another_entry_of_the_cache(tmp_path):
     source, cache = SmallSet(), FeatureCache(tmp_path)
     others = own_kernels(ChannelFilter([51, 11]), seed=4)
     choices = [{}, {"wavelet": WAVELET}, {"kernels": KERNELS}, {"kernels": others}]
     for _ in range(2):
         for choice in choices:
-            maker_of(source, cache=cache, **choice)(RECORDING, split_of(source))
+            maker_of(source, cache=cache, **choice)(RECORDING)
     assert source.loads == len(choices)
 
 
