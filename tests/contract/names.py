@@ -80,7 +80,7 @@ MANIFEST = "manifest.csv"
 DECISIONS = "{}_decisions.csv"
 RUN_FILES = (DETECTOR, METRICS, "config.yaml", "confusion.png", "selected_features.png")
 CONVERT = "convert"
-UNSEEN_EXPERIMENT, REAL_EXPERIMENT = "unseen4", "biotacsp_dos"
+UNSEEN_EXPERIMENT = "unseen4"
 
 # metrics.json: the splits' names, and what the fit alone decides
 TRAIN, TEST, HELD_OUT = "train", "test", "unseen"

@@ -15,17 +15,20 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from .names import CONFUSION, METRICS, REAL_EXPERIMENT, SPLITS, UNSEEN_EXPERIMENT, settings
+from .names import CONFUSION, METRICS, SPLITS, UNSEEN_EXPERIMENT, settings
 from .running import ROOT, arguments_of, environment
 
 FILE = Path(__file__).with_name("unmoved.json")
 REAL_DATA = Path(os.environ.get("BIOTACSP", ROOT.parent / "shared" / "data" / "biotacsp-dos"))
 MOST_MOVED = 2
 """Bins of any cell of a confusion."""
+_REAL = """data=biotacsp_dos labels.bin_ms=640 labels.hop_ms=320 +features.frames.electrode=null
+features.level=3 features.spectrum=clean features.pooling=sorted split.seen=[case,hd,sponge,pen]
+split.unseen=[bottle,cardboard,brush,screw,striped,bubbles,plate] split.train_fraction=0.5"""
 EXPERIMENTS = {
     "paper": settings(experiment=UNSEEN_EXPERIMENT, recipe="paper", seed=0),
     "default": settings(experiment=UNSEEN_EXPERIMENT, seed=0),
-    "real": settings(experiment=REAL_EXPERIMENT, root=REAL_DATA, seed=0),
+    "real": [*_REAL.split(), *settings(root=REAL_DATA, seed=0)],
 }
 
 
