@@ -54,7 +54,7 @@ DESCRIPTORS = (
 )
 """Those of ``recipe=general``: none jumps with the last digit, none needs sorting."""
 POOLING = ("mean", "std", "min", "max")
-PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+PENALTIES = General.penalties
 _USES = ("channel", "pooled", "both")
 _FOLDS = 5  # of validation without groups
 _BLOCK = 50  # windows that lose the same channels in a second copy (``drop_channels``)

@@ -32,7 +32,7 @@ _MAKE_FEATURES = (
     "training/datamodule.py",
 )
 _KEPT = ("features", "columns", "longest_run")
-_told: set[tuple[str, str]] = set()
+_reported: set[tuple[str, str]] = set()
 
 
 def default_cache_folder() -> Path:
@@ -155,8 +155,8 @@ class FeatureCache:
             total -= size
 
     def _warn(self, cause: str, path: Path) -> None:
-        if (str(self.folder), cause) not in _told:
-            _told.add((str(self.folder), cause))
+        if (str(self.folder), cause) not in _reported:
+            _reported.add((str(self.folder), cause))
             log.warning("cached features %s %s; they are computed anew", path, cause)
 
     def _path(self, key: str) -> Path:

@@ -269,12 +269,6 @@ class QuadraticForm(nn.Module):
         return self.quadratic.numel() == 0
 
     @property
-    def dense_quadratic(self) -> Tensor:
-        """``Q``, ``[K, K]``, of a linear machine too."""
-        num = self.num_features
-        return self.linear.new_zeros(num, num) if self.is_linear else self.quadratic
-
-    @property
     def cost(self) -> Cost:
         """Multiply-adds a bin and bytes, whatever the number of training bins."""
         num_values = self.num_features + self.quadratic.numel()

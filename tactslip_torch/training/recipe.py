@@ -430,7 +430,7 @@ class General(_Recipe):
         Raises:
             ValueError: if a class is absent, or a scene is weighed that no recording is of.
         """
-        class_counts(sample)  # refuses one that is absent
+        _class_counts(sample)  # refuses one that is absent
         scenes = sample.scene_names
         if strangers := sorted(set(self.scene_weights) - set(scenes) - {PAPER_SCENE}):
             raise ValueError(
@@ -512,7 +512,7 @@ class Paper(_Recipe):
         self, statistics: _Statistics, pool: FeaturePool, is_nested: bool, show: bool
     ) -> _Plan:
         sample = statistics.sample.bins()
-        counts = class_counts(sample)
+        counts = _class_counts(sample)
         fractions = min(counts) / counts[0], min(counts) / counts[1]
         weight = sample.weight * torch.tensor(fractions).double()[sample.is_slip.long()]
         places = self.allowed(pool).nonzero()[:, 0]
@@ -582,7 +582,7 @@ Recipe = General | Paper
 """How a detector is made."""
 
 
-def class_counts(sample: SampledBins) -> list[int]:
+def _class_counts(sample: SampledBins) -> list[int]:
     """How many training bins of non-slip and of slip a sample was drawn from.
 
     Raises:
