@@ -11,12 +11,11 @@ import onnxruntime
 import pytest
 import torch
 from contract.names import STREAM_OUTPUTS
-from engine_bins import some_hand
 from extremes import slip_samples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_detector import HAND, alarming_detector, raw_bins, with_floors
-from streams import detector_of, onset_of, signal
+from streams import detector_of, hand_of, onset_of, signal
 from test_detector import VARIANTS, noise, random_detector
 from test_predictions import with_imputation
 
@@ -454,7 +453,7 @@ def test_fast_evidence_in_any_cut_is_that_of_the_detector(
 @pytest.mark.parametrize("num_lost", [30, 200])
 @pytest.mark.parametrize("kinds", ["F", "FF", "GF", "GGF"])
 def test_onset_scores_of_any_hand_with_channels_missing(kinds, num_lost):
-    hand = some_hand(kinds)
+    hand = hand_of(kinds)
     names = [{"G": 0, "F": 2}[kind] + i % 2 for i, kind in enumerate(kinds)]
     samples = signal(4000, 6)[names]
     samples[-1, 3500:] = samples[-1, 3500]  # stuck
