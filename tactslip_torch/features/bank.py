@@ -23,19 +23,16 @@ from tactslip_torch.features.descriptors import (
     SPECTRUM_DESCRIPTORS,
     STEPPED,
     TIME_DESCRIPTORS,
+    TINY,
     Rows,
     band_energy_ratios,
-)
-from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.ops import (
-    TINY,
-    bounded_gradient,
     like,
-    power_of_two_below,
     root,
     taken,
 )
+from tactslip_torch.features.names import FeatureName
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.runtime import ascending, is_traced
 from tactslip_torch.signals.wavelet import (
     SpectrumMethod,
     Wavelet,
@@ -348,6 +345,33 @@ class Samples(NamedTuple):
     unit: Tensor | None
 
 
+def power_of_two_below(magnitude: Tensor) -> Tensor:
+    """The largest power of two that is no larger, by which to divide rounds nothing; no gradient.
+
+    Of magnitudes below 1e-300, 0 among them, that of 1e-300 (the dtype's smallest normal number).
+    """
+    tiny = max(TINY, torch.finfo(magnitude.dtype).tiny)
+    return magnitude.detach().clamp(min=tiny).log2().floor().exp2()
+
+
+def bounded_gradient(x: Tensor) -> Tensor:
+    """``x``, whose gradient saturates at the largest finite number of the dtype.
+
+    The derivative of a shape is of order 1/span, which for denormals no float can hold. Backward
+    only: derivatives taken forwards become Inf there.
+
+    Shape:
+        - x, output: ``[*]``
+    """
+    if not (x.requires_grad and torch.is_grad_enabled()) or is_traced():
+        return x
+    x = x.view_as(x)
+    largest = torch.finfo(x.dtype).max
+    # autograd hands on None for a gradient that is undefined
+    x.register_hook(lambda g: None if g is None else g.clamp(-largest, largest))
+    return x
+
+
 class Bank:
     """Makes the features of a plan.
 
@@ -604,6 +628,8 @@ class _RowSet:
         made = []
         for names, index in self._groups:
             own = rows.take(index)
+            if names[0] in SORTED and (self._is_sorted or isinstance(own.values, Tensor)):
+                own = replace(own, in_order=ascending(own.values, own.num))
             if names == ["correlation"]:
                 own = replace(
                     own, filtered=taken(families[-1].filtered(self._dtype), self._correlated, -2)
@@ -644,7 +670,6 @@ class _RowSet:
             scale / length,
             amplitude=amplitude,
             frequency_hz=self._maps.frequency_hz if is_freq else None,
-            is_sorted=self._is_sorted,
         )
 
     def _of_cells(self, tables: Sequence[Tensor]) -> Tensor:

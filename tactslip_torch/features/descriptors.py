@@ -21,14 +21,58 @@ from functools import cached_property, lru_cache
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.ops import ascending, counted, like, looked_up, root, taken
-
+TINY = 1e-300
+"""Instead of 0 in a divisor, where a quotient of 0 is to be 0."""
 _ENTROPY_LEVELS = 255
 _RUN_TOLERANCE = 1e-12
 _HALF_SLACK = 1e-6
 _CV_FLOOR = 1e-6
 _CV_ZERO = 1e-12
 _NEXT_TO_NOTHING = 1e-60  # instead of 0 in a divisor; variances of rows are 0 or far above
+
+
+# Operations that torch has not under one name. Each asks once whether it is given a tensor, or a
+# value of a graph (deploy/value.py); both take part in all others that are used below.
+
+
+def root(square: Tensor) -> Tensor:
+    """Square root, whose derivative at 0 is 0."""
+    if not isinstance(square, Tensor):
+        return square.sqrt()
+    is_zero = square.detach() <= 0  # not so for NaN
+    return torch.where(is_zero, 0.0, torch.where(is_zero, 1.0, square).sqrt())
+
+
+def taken(x: Tensor, index: Tensor | None, axis: int) -> Tensor:
+    """Entries at constant places along an axis; ``None`` is all of them."""
+    if index is None:
+        return x
+    if not isinstance(x, Tensor):
+        return x.take(index.tolist(), axis)
+    return x.index_select(axis, index.to(x.device))
+
+
+def looked_up(table: Tensor, index: Tensor) -> Tensor:
+    """Entries of a constant table ``[n]`` at places that were computed, in the shape of these."""
+    return table.to(index.device)[index] if isinstance(index, Tensor) else index.entries_of(table)
+
+
+def counted(index: Tensor, num: int) -> Tensor:
+    """How often each of the numbers 0 to ``num - 1`` occurs along the last axis.
+
+    Shape:
+        - index: ``[*, n]``, whole numbers in that range
+        - output: ``[*, num]``
+    """
+    if not isinstance(index, Tensor):
+        return index.counted(num)
+    none = index.new_zeros(*index.shape[:-1], num)
+    return none.scatter_add(-1, index, torch.ones_like(index))
+
+
+def like(constant: Tensor, x: Tensor) -> Tensor:
+    """A constant with the dtype and the device of what it meets; a value of a graph asks itself."""
+    return constant.to(x) if isinstance(x, Tensor) else constant
 
 
 @dataclass
@@ -47,10 +91,10 @@ class Rows:
         filtered: bin less its mean, of order one, with which ``correlation`` correlates.
         amplitude: of spectra, the values with their mean.
         frequency_hz: of the lines of spectra.
-        is_sorted: whether ``ascending`` is asked for, so that ``ranked`` may take it.
+        in_order: the values in ascending order, where a descriptor of sorted values is wanted.
 
     Shape:
-        - values, filtered, amplitude: ``[*, R, n]``; mean, unit, scale: ``[*, R]``;
+        - values, filtered, amplitude, in_order: ``[*, R, n]``; mean, unit, scale: ``[*, R]``;
           frequency_hz: ``[n]``
     """
 
@@ -62,7 +106,7 @@ class Rows:
     filtered: Tensor | None = None
     amplitude: Tensor | None = None
     frequency_hz: Tensor | None = None
-    is_sorted: bool = False
+    in_order: Tensor | None = None
 
     def take(self, index: Tensor | None) -> Rows:
         """Some of the rows, by their places; all of them for ``None``."""
@@ -78,19 +122,21 @@ class Rows:
             amplitude=None if self.amplitude is None else taken(self.amplitude, index, -2),
         )
 
-    @cached_property
+    @property
     def ascending(self) -> Tensor:
         """Values in ascending order, ``[*, R, n]``."""
-        return ascending(self.values, self.num)
+        if self.in_order is None:
+            raise ValueError("mode and iqr need the values in ascending order")
+        return self.in_order
 
     def ranked(self, first: int, count: int) -> Tensor:
         """Values at ``count`` places of the ascending order, from ``first`` on, ``[*, R, count]``.
 
-        A graph selects quicker than it sorts.
+        A graph whose values are not in order selects quicker than it sorts.
         """
-        if self.is_sorted or isinstance(self.values, Tensor):
-            return self.ascending[..., first : first + count]
-        return self.values.ranked(first, count)
+        if self.in_order is not None:
+            return self.in_order[..., first : first + count]
+        return self.values.ranked(first, count)  # type: ignore[attr-defined,no-any-return]
 
     @cached_property
     def squares(self) -> Tensor:
