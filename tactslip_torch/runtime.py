@@ -444,7 +444,7 @@ LEAD = 31
 _EVERY_S = 10.0
 
 
-class Progress(tqdm):  # type: ignore[misc]
+class _Progress(tqdm):  # type: ignore[misc]
     """A progress bar on a terminal or in a notebook; elsewhere a logged line every ten seconds.
 
     What takes less than ten seconds leaves no line in a log.
@@ -488,16 +488,16 @@ def bar(
     """``items`` with a progress bar on standard error that shows rate and time left."""
     if not show:
         return items
-    shown: Iterable[Any] = Progress(
+    shown: Iterable[Any] = _Progress(
         items, desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", dynamic_ncols=True
     )
     return shown
 
 
-def steps(what: str, unit: str, total: int, *, show: bool = True) -> Progress:
+def steps(what: str, unit: str, total: int, *, show: bool = True) -> _Progress:
     """A bar of at most so many steps for a ``with``, moved by its ``update``, from any thread."""
     options = {"dynamic_ncols": True, "smoothing": 0, "disable": not show}
-    return Progress(desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", **options)
+    return _Progress(desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", **options)
 
 
 _function: Callable[[Any], Any] | None = None
