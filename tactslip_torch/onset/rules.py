@@ -330,7 +330,7 @@ class Budget:
         return count
 
 
-def false_alarm_places(
+def false_alarms(
     is_high: NDArray[np.bool_], is_quiet: NDArray[np.bool_], rearm: int, refractory: int
 ) -> NDArray[np.int64]:
     """Places of a latch's alarms, raised where the first mask holds, in which the second does.
@@ -341,13 +341,6 @@ def false_alarm_places(
     """
     places = _alarms(np.flatnonzero(is_high), rearm, refractory)
     return places[is_quiet[places]]
-
-
-def false_alarms(
-    is_high: NDArray[np.bool_], is_quiet: NDArray[np.bool_], rearm: int, refractory: int
-) -> int:
-    """The number of ``false_alarm_places``."""
-    return len(false_alarm_places(is_high, is_quiet, rearm, refractory))
 
 
 def lowest_threshold(

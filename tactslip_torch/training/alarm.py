@@ -283,7 +283,7 @@ def threshold_curve(
     points = list[list[float]]()
     for value in dict.fromkeys(falling[ranks].tolist()):
         alarms = sum(
-            false_alarms((own >= value) | other, np.ones(len(own), bool), **times)
+            len(false_alarms((own >= value) | other, np.ones(len(own), bool), **times))
             for own, other in zip(scores, raised, strict=True)
         )
         rate = alarms / hours
@@ -434,7 +434,7 @@ class _Scores:
                 for of_bins, own in zip(raised, self.onset_score, strict=True)
             ]
         pairs = zip(raised, self.is_quiet, strict=True)
-        return [false_alarms(is_high, is_quiet, **times) for is_high, is_quiet in pairs]
+        return [len(false_alarms(is_high, is_quiet, **times)) for is_high, is_quiet in pairs]
 
 
 def _decisions_h(settings: AlarmSettings, timing: Timing) -> float:
