@@ -36,7 +36,7 @@ every command also takes:
   TACTSLIP_TRACEBACK=1            environment variable: errors show where they were raised"""
 
 
-class Mistake(ValueError):
+class _Mistake(ValueError):
     """A command line that cannot be carried out; its text is one line for the user."""
 
 
@@ -242,14 +242,14 @@ def _row(name: str, text: str) -> list[str]:
 
 class _Parser(ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        raise Mistake(message)
+        raise _Mistake(message)
 
 
 def checked(command: str, arguments: Sequence[str]) -> CommandLine:
     """A command line, read and composed.
 
     Raises:
-        Mistake: if it cannot be composed.
+        ValueError: if it cannot be composed.
     """
     if "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("RANK", "0") != "0":
         nowhere = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
@@ -265,9 +265,9 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
         key, _, value = unknown[0].lstrip("-").partition("=")
         near = _nearest(command, key.replace("-", "_")) or "KEY"
         hint = f"write {near}={value or 'VALUE'}, without dashes"
-        raise Mistake(f"{command} has no option {unknown[0]}; {hint}")
+        raise _Mistake(f"{command} has no option {unknown[0]}; {hint}")
     if options.config_dir is not None and not Path(options.config_dir).is_dir():
-        raise Mistake(f"--config-dir {options.config_dir}: there is no such folder")
+        raise _Mistake(f"--config-dir {options.config_dir}: there is no such folder")
     rest = list(arguments)
     for override in options.overrides:
         rest.remove(override)
@@ -275,7 +275,7 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
     known = {key.name.partition(".")[0] for key in keys_of(command, config) if key.description}
     for name in config:
         if str(name) not in known.union(_groups(config.hydra), presets(), ("hydra",)):
-            raise Mistake(_no_key(command, str(name), config))
+            raise _Mistake(_no_key(command, str(name), config))
     return CommandLine(command, [*overrides, *rest], options, config)
 
 
@@ -299,7 +299,7 @@ def _composed(command: str, options: Namespace) -> tuple[list[str], DictConfig]:
                 known = options_of(key.lstrip("+"))
                 for option in others if known and not options.config_dir else ():
                     if option not in known:
-                        raise Mistake(_unknown(key.lstrip("+"), option, known)) from error
+                        raise _Mistake(_unknown(key.lstrip("+"), option, known)) from error
                 continue
             word = error.override if isinstance(error, OverrideParseException) else ""
             key, found, value = word.partition("=")
@@ -310,7 +310,7 @@ def _composed(command: str, options: Namespace) -> tuple[list[str], DictConfig]:
                 for words in (overrides, tried):
                     words[words.index(word)] = quoted
                 continue
-            raise Mistake(_translated(command, tried, error)) from error
+            raise _Mistake(_translated(command, tried, error)) from error
 
 
 def _translated(command: str, overrides: Sequence[str], error: Exception) -> str:
@@ -404,7 +404,7 @@ def check_folder(line: CommandLine) -> None:
     """Refuse a results folder that cannot be made; Hydra alone would show a trace.
 
     Raises:
-        Mistake: that says why.
+        ValueError: that says why.
     """
     of = "sweep" if line.options.multirun else "run"
     where: Any = OmegaConf.to_container(line.config.hydra[of])
@@ -417,4 +417,4 @@ def check_folder(line: CommandLine) -> None:
                 pass
     except OSError as error:
         why = f"cannot write to hydra.{of}.dir={folder}: {error.strerror} at {nearest}"
-        raise Mistake(why) from error
+        raise _Mistake(why) from error

@@ -13,12 +13,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.recording import PAPER_SCENE, RecordingId
 from tactslip_torch.runtime import check_share
 
 ROLES = ("train", "test", "unseen")
-PAPER_SCENE = RecordingId.scene
-"""The scene of recordings that are the paper's protocol."""
 
 
 @dataclass(frozen=True)
