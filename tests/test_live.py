@@ -772,6 +772,7 @@ def test_only_the_right_token_and_origin_open_the_page(serve, query, origin, sta
     assert found == status
 
 
+@pytest.mark.slow
 def test_wrong_tokens_are_answered_slowly_and_hold_up_nobody_else(serve):
     server = serve(token="a token+more")
     place = f"ws://127.0.0.1:{server.port}/ws"
@@ -793,6 +794,7 @@ def test_wrong_tokens_are_answered_slowly_and_hold_up_nobody_else(serve):
     assert took_s[-1] >= 2.0  # one in half a second
 
 
+@pytest.mark.slow
 def test_idle_connections_make_room_for_who_asks(serve):
     server = serve()
     with connect(f"ws://127.0.0.1:{server.port}/ws") as page:

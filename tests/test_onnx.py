@@ -393,7 +393,7 @@ def test_any_cut_gives_what_the_detector_gives(
     precision=st.sampled_from(list(STREAM_CLOSE)),
     losses=st.lists(LOSSES, max_size=4),
 )
-@settings(max_examples=20)
+@settings(max_examples=10)
 def test_fast_evidence_in_any_cut_is_that_of_the_detector(
     num_samples, cuts, kind, rule, hop, floors, precision, losses
 ):
