@@ -37,8 +37,9 @@ from tactslip_torch.training.experiment import (
 
 log = logging.getLogger(__name__)
 
-_OF_A_HAND = ("pattern", "labels", "rename", "channels", "kind", "adapting", "units") + (
-    ("skip_s", "slide_s")
+_OF_A_HAND = (
+    *("pattern", "labels", "rename", "channels", "kind", "adapting", "units"),
+    *("skip_s", "slide_s"),
 )
 """Settings of ``data`` that are the same for all recordings of a hand."""
 

@@ -14,13 +14,11 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.recording import PAPER_SCENE, RecordingId
 from tactslip_torch.runtime import check_choice, check_number, check_share
 
 GroupBy = Literal["material", "session", "recording"]
 ROLES = ("train", "test", "unseen")
-PAPER_SCENE = RecordingId.scene
-"""The scene of recordings that are the paper's protocol."""
 
 
 @dataclass(frozen=True)

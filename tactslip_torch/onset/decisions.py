@@ -22,7 +22,6 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import Sensing, without_stuck
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Platt, calibration_from_dict, probability
-from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.onset.evidence import OnsetClassifier
 from tactslip_torch.onset.rules import (
@@ -160,7 +159,7 @@ class AlarmSettings:
             raise ValueError(f"no alarm settings of this version: {error}") from error
 
     @classmethod
-    def of(cls, detector: SlipDetector) -> AlarmSettings:
+    def of(cls, detector: HasInfo) -> AlarmSettings:
         """The settings in a detector's file.
 
         Raises:
@@ -172,6 +171,18 @@ class AlarmSettings:
                 "with onset=debounced, which is set for no rate"
             )
         return cls.from_dict(detector.info[KEY], detector.pool.hand, detector.pool.sample_rate_hz)
+
+
+class HasInfo(Protocol):
+    """What alarm settings are read from: ``SlipDetector``, with the content of its file."""
+
+    @property
+    def pool(self) -> FeaturePool:
+        """Of which hand, at which rate."""
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """JSON-able values by name."""
 
 
 class Scorer(Protocol):
@@ -618,9 +629,7 @@ class StreamStatistic(NamedTuple):
     statistic: Tensor
 
 
-def stream_statistic(
-    detector: SlipDetector, settings: AlarmSettings, samples: Tensor
-) -> StreamStatistic:
+def stream_statistic(detector: Scorer, settings: AlarmSettings, samples: Tensor) -> StreamStatistic:
     """Every decision on whole recordings, differentiable in the raw samples.
 
     Gradients are those of the values: 0 through a feature that is clipped, through a channel that
@@ -643,7 +652,7 @@ def stream_statistic(
     Example:
         The gradient of the highest statistic, volt by volt, summed up for each channel:
 
-        >>> detector = SlipDetector.load("onset.pt")  # doctest: +SKIP
+        >>> detector = tactslip_torch.SlipDetector.load("onset.pt")  # doctest: +SKIP
         >>> samples = recording.samples.clone().requires_grad_()  # doctest: +SKIP
         >>> found = stream_statistic(detector, AlarmSettings.of(detector), samples)
         ... # doctest: +SKIP

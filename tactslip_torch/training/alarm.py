@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.data.labels import whole_samples
-from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
-from tactslip_torch.data.splits import PAPER_SCENE
+from tactslip_torch.data.recording import PAPER_SCENE, RecordingId, RecordingSource, Timeline
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.calibration import (
     Platt,

@@ -20,11 +20,16 @@ import torch
 import torch.distributed
 from torch import Tensor
 
-from tactslip_torch.data.splits import PAPER_SCENE
+from tactslip_torch.data.recording import PAPER_SCENE
 from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
-from tactslip_torch.features.groups import checked_attributes, matching
 from tactslip_torch.features.pool import FeaturePool, is_rounding
-from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
+from tactslip_torch.features.selection import (
+    ClassMoments,
+    checked_attributes,
+    matching,
+    rank_features,
+    t_scores,
+)
 from tactslip_torch.features.sensing import (
     Sensing,
     SpanFeatures,
