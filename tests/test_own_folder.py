@@ -56,7 +56,7 @@ def test_other_commands_read_as_the_file_of_the_hand_says(folder, command):
 )
 def test_a_wrong_file_of_the_hand_is_named_with_its_key(folder, text, words):
     (folder / "hand.yaml").write_text(text)
-    with pytest.raises(ValueError) as raised:
+    with pytest.raises(ValueError, match=r"hand\.yaml") as raised:
         checked("train", [str(folder)])
     assert not [word for word in words.split() if word not in str(raised.value)], raised.value
 
