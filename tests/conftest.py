@@ -6,13 +6,13 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import generated
 import numpy as np
 import pytest
 import torch
 from contract.names import settings as overrides
 from contract.recordings import of_set, split_of_set, write_set
 from contract.running import Runner, Trained, train
+from extremes import SEED
 from hypothesis import HealthCheck, is_hypothesis_test, seed, settings
 from matplotlib.figure import Figure
 
@@ -67,11 +67,11 @@ def seed_hypothesis(config: pytest.Config, items: list[pytest.Item]) -> None:
         test = getattr(item, "obj", None)
         if test is not None and is_hypothesis_test(test):
             name = item.nodeid.split("[")[0]
-            seed(f"{generated.SEED} {name}")(test)
+            seed(f"{SEED} {name}")(test)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    line = f"property tests: seed {generated.SEED} (TACTSLIP_SEED={generated.SEED} repeats them)"
+    line = f"property tests: seed {SEED} (TACTSLIP_SEED={SEED} repeats them)"
     terminalreporter.write_line(line)
 
 

@@ -113,12 +113,6 @@ def tiny(tmp_path_factory):
     return SimpleNamespace(folder=folder, cache=cache)
 
 
-def test_features_are_cached_in_the_users_folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    run_train(tmp_path, *TINY)
-    assert list((tmp_path / "home" / "tactslip_torch").rglob("*.npz"))
-
-
 def test_one_fold_per_material_leaves_a_folder_each(tiny, tmp_path):
     _, metrics = run_train(tmp_path, *TINY_BY_FOLD, f"cache={tiny.cache}")
     folds, events = metrics["folds"], metrics["events"]
