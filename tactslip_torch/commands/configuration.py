@@ -282,9 +282,9 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
         if str(name) not in known.union(_groups(config.hydra), presets(), ("hydra",)):
             raise _Mistake(_no_key(command, str(name), config))
     if list(arguments) != typed:  # of a hand.yaml
-        for key in keys_of(command, config):
-            if not key.description and key.name.partition(".")[0] in OF_HAND:
-                raise _Mistake(f"{HAND_FILE}: {_no_key(command, key.name, config)}")
+        for own in keys_of(command, config):
+            if not own.description and own.name.partition(".")[0] in OF_HAND:
+                raise _Mistake(f"{HAND_FILE}: {_no_key(command, own.name, config)}")
     return CommandLine(command, [*overrides, *rest], typed, options, config)
 
 
