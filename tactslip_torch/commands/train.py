@@ -121,7 +121,7 @@ def _experiment(config: DictConfig) -> Experiment:
             "experiment": config.name,
             "seed": config.seed,
             "features_dtype": config.features.dtype,
-            **({} if source.is_simulated else reading_settings(config)),
+            **({} if source.is_simulated else _reading_settings(config)),
         },
         num_workers=config.num_workers,
         with_baselines=config.baselines,
@@ -130,7 +130,7 @@ def _experiment(config: DictConfig) -> Experiment:
     )
 
 
-def reading_settings(config: DictConfig) -> dict[str, Any]:
+def _reading_settings(config: DictConfig) -> dict[str, Any]:
     """How recordings are read and labelled, for a detector's ``info``: it reads others so too."""
     plain: Any = OmegaConf.to_container(config, resolve=True)
     data = {key: value for key, value in plain["data"].items() if key in _OF_A_HAND}
