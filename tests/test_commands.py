@@ -151,7 +151,8 @@ def test_evaluate_tells_of_recordings_it_was_trained_on(tiny, tmp_path, capsys):
 
 
 def evaluated(tiny, folder, *overrides):
-    told = *TINY_DATA, *TINY_SPLIT, "num_workers=0", f"cache={tiny.cache}"
+    given = "data=simulated", "split=unseen4", *TINY_DATA, *TINY_SPLIT
+    told = *given, "num_workers=0", f"cache={tiny.cache}"
     model = f"model={tiny.folder / 'detector.pt'}"
     return evaluate(composed(*told, model, *overrides, name="evaluate"), folder)
 
