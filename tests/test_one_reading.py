@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from hydra.utils import instantiate
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from test_commands import composed
@@ -127,6 +127,7 @@ def configs():
     }
 
 
+@settings(max_examples=8)
 @given(tables())
 def test_check_train_detect_and_stream_agree(configs, made):
     with tempfile.TemporaryDirectory() as folder:

@@ -3,7 +3,6 @@
 import importlib.util
 import json
 import shutil
-from dataclasses import replace
 from itertools import pairwise
 
 import h5py
@@ -15,7 +14,6 @@ import scipy.io
 import torch
 from foreign_files import LVM, made_73, made_hdf5, stored
 from mcap.reader import make_reader
-from mcap.records import Statistics
 from message_bags import (
     START_NS,
     STEP_NS,
@@ -149,15 +147,6 @@ def test_what_goes_in_comes_out(tmp_path, ending, dtype):
             assert bits(torch.cat(parts, 1)) == bits(samples.contiguous())
             part = opened.samples.read(1500, 1600)
             assert bits(part) == bits(samples[:, 1500:1600].contiguous())
-
-
-def test_a_table_that_says_nothing_of_releases_is_read_as_before(tmp_path):
-    form, path = named_format("csv"), tmp_path / "a.csv"
-    wanted, hand = recording(released_s=()), hand_of("ab")
-    form.save(path, wanted, hand, KEY)
-    path.write_text(path.read_text("utf-8").replace('"released_s": [], ', "", 1), "utf-8")
-    assert "released_s" not in path.read_text("utf-8")
-    assert_truth(form.load(path), wanted, hand)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -540,15 +529,6 @@ def test_files_of_all_formats_are_read_as_meant_or_refused_in_a_line(tmp_path, n
         return
     samples, names, *_ = read(tmp_path / name)
     assert (names, samples[:, -1].tolist()) == tuple(wanted)
-
-
-def test_a_message_lost_from_an_mcap_file_is_noticed(tmp_path, monkeypatch):
-    counted = Statistics.write
-    monkeypatch.setattr(
-        Statistics, "write", lambda self, out: counted(replace(self, message_count=8), out)
-    )
-    path = write_mcap(tmp_path / "a.mcap", [wrenches(7)[0]])
-    assert "holds 7 messages, where its metadata say 8" in refused(path)
 
 
 # Arrays: NumPy, HDF5, MAT, Parquet -------------------------------------------------------------
