@@ -38,7 +38,7 @@ _AGAIN = f"tries again every {RETRY_S:g} s"
 KINDS = "serial:PORT, tcp:HOST:PORT, listen:PORT, ros2:TOPIC, stdin, or a file"
 
 
-def address_of(text: str, what: str, default_host: str = "127.0.0.1") -> tuple[str, int]:
+def address_of(text: str, what: str) -> tuple[str, int]:
     """Host and port of ``[HOST:]PORT``.
 
     Raises:
@@ -51,7 +51,7 @@ def address_of(text: str, what: str, default_host: str = "127.0.0.1") -> tuple[s
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or not int(port) < 1 << 16:
         raise ValueError(f"{what} needs [HOST:]PORT with a port from 0 to 65535, got {text!r}")
-    return host.strip("[]") or default_host, int(port)
+    return host.strip("[]") or "127.0.0.1", int(port)
 
 
 # Bytes -------------------------------------------------------------------------------------------

@@ -90,11 +90,6 @@ FIT_FACTS = ("selected", "penalty", "kernel", "solve", "validation", "num_bins")
 ALARM_INFO = "alarm"  # in the detector's info
 TRAINING_RECORDINGS = "train_recordings"  # in the detector's info
 
-# Graphs: inputs and outputs
-BIN_INPUT = "samples"
-BIN_OUTPUTS = ("score", "probability", "valid", "in_range", "channels_lost")
-STREAM_INPUTS = ("samples", "tail", "state", "threshold")
-STREAM_HANDED_ON = {"tail": "next_tail", "state": "next_state"}
 STREAM_OUTPUTS = {
     "score": "score",
     "probability": "probability",
