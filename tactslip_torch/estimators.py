@@ -408,20 +408,17 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return self._score(X)[1]
 
     @classmethod
-    def from_detector(
-        cls, detector: SlipDetector, classes: Sequence[Any] | None = None, *, filtered: bool = False
-    ) -> SlipClassifier:
+    def from_detector(cls, detector: SlipDetector, *, filtered: bool = False) -> SlipClassifier:
         """A fitted classifier that scores as a detector does.
+
+        Its labels are those that the detector was fitted with by a classifier, or 0 and 1.
 
         Args:
             detector: trained in any way.
-            classes: labels for non-slip and slip; by default those it was fitted with, or 0 and 1.
             filtered: whether windows will come filtered; raw ones with their context otherwise.
         """
         pool, layer = detector.pool, detector.channel_filter
-        labels = list(classes or detector.info.get("classes") or (0, 1))
-        if len(labels) != 2 or labels[0] == labels[1]:
-            raise ValueError(f"classes must be two labels, non-slip and slip, got {labels}")
+        labels = list(detector.info.get("classes") or (0, 1))
         features = TactileFeatures(
             pool.sample_rate_hz, pool.hand, filtered=filtered, align=layer.align
         )
