@@ -280,12 +280,14 @@ class EvenSamples(Samples):
         rows: Sequence[int] | None = None,
     ) -> None:
         self.num_samples, self.dtype = clock.num_samples, samples.dtype
-        self._rows = list(range(samples.num_channels) if rows is None else rows)
-        self.num_channels = len(self._rows)
+        all_rows = list(range(samples.num_channels))
+        wanted = all_rows if rows is None else list(rows)
+        self._rows = None if wanted == all_rows else wanted
+        self.num_channels = len(wanted)
         self._inner, self._whole = samples, None
         self.level: Tensor | None = None
         if clock.gaps:
-            self._whole = _without_gaps(samples, clock, most_bridged)[self._rows]
+            self._whole = _of_rows(_without_gaps(samples, clock, most_bridged), self._rows)
 
     def read(self, first: int, stop: int) -> Tensor:
         """Samples from ``first`` to before ``stop`` on the clock, ``[C, n]``."""
@@ -296,8 +298,13 @@ class EvenSamples(Samples):
         if self._whole is not None:
             found = self._whole[:, first : max(stop, first)]
         else:
-            found = self._inner.read(first, stop)[self._rows]
+            found = _of_rows(self._inner.read(first, stop), self._rows)
         return found if self.level is None else found - self.level
+
+
+def _of_rows(samples: Tensor, rows: Sequence[int] | None) -> Tensor:
+    """Some rows of samples ``[C, T]``; ``None`` for all, which are not copied."""
+    return samples if rows is None else samples[rows]
 
 
 def _without_gaps(samples: Samples, clock: Clock, most_bridged: int) -> Tensor:
