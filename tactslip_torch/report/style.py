@@ -27,6 +27,7 @@ ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 PALETTE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 INK, GREY, LIGHT = "#222222", "#666666", "#DDDDDD"
 ALARM = "#C6361B"
+_EMPTY = (None, "-")
 _KIND_COLOURS = {"SG": ORANGE, "PVDF": BLUE}
 
 UPPER_LEFT_OUTSIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
@@ -63,6 +64,18 @@ def table(rows: Sequence[Mapping[str, object]], num_left: int = 1, merged: int =
             padded[column] = row[column].ljust(widths[column])
         lines.append("  ".join(padded).rstrip())
     return "\n".join(lines)
+
+
+def with_values(rows: Sequence[Mapping[str, object]], num_kept: int) -> list[dict[str, object]]:
+    """The rows with their first so many columns, and of the others those that have some value.
+
+    Example:
+        >>> with_values([{"file": "a", "onset": "-", "alarm": 1}], 1)
+        [{'file': 'a', 'alarm': 1}]
+    """
+    titles = list(rows[0]) if rows else []
+    has = [title for title in titles[num_kept:] if any(row[title] not in _EMPTY for row in rows)]
+    return [{title: row[title] for title in (*titles[:num_kept], *has)} for row in rows]
 
 
 def cells(rows: Sequence[Mapping[str, object]]) -> list[list[str]]:

@@ -18,10 +18,13 @@ from tactslip_torch.training.baselines import Baselines
 from tactslip_torch.training.datamodule import RecordingFeatures, TrainingBins
 from tactslip_torch.training.evaluation import (
     EvaluatedBins,
+    Outcomes,
     bin_scores,
+    compared,
     evaluated_bins,
     event_numbers,
     events_by_rule,
+    outcomes_of,
 )
 from tactslip_torch.training.recipe import General, Recipe, from_first_process, gathered
 
@@ -40,8 +43,11 @@ class SlipLearner(L.LightningModule):
     Attributes:
         detector: the result, after the training step.
         metadata: how it was made, such as the penalty.
-        metrics: ``{"splits": ..., "baselines": ..., "events": ...}`` after a test.
+        metrics: ``{"splits": ..., "baselines": ..., "comparison": ..., "events": ...}`` after a
+            test.
         events: of each recording, by role and rule, after a test; to be pooled with others.
+        outcomes: of the recordings that are held out, by role, after a test; to be compared with
+            others.
         seconds: time of each stage of the fit.
 
     Raises:
@@ -72,6 +78,7 @@ class SlipLearner(L.LightningModule):
         self.metadata: dict[str, Any] = {}
         self.metrics: dict[str, Any] = {}
         self.events: dict[str, dict[str, list[RecordingEvents]]] = {}
+        self.outcomes: dict[str, Outcomes] = {}
         self.seconds: dict[str, float] = {}
         self._evaluated: dict[str, list[EvaluatedBins]] = {}
         # nothing is trained by it: torch's DistributedDataParallel refuses a module without one
@@ -125,7 +132,7 @@ class SlipLearner(L.LightningModule):
     def on_test_epoch_end(self) -> None:
         """Turn decisions into metrics."""
         assert self.detector is not None  # on_test_start
-        self.metrics, self.events = {"splits": {}}, {}
+        self.metrics, self.events, self.outcomes = {"splits": {}, "comparison": {}}, {}, {}
         known = self.baselines.metadata if self.baselines else {}
         baselines = {name: metadata | {"splits": {}} for name, metadata in known.items()}
         pool = self.detector.pool
@@ -143,6 +150,10 @@ class SlipLearner(L.LightningModule):
                 baselines[name]["splits"][role] = found
             self.metrics["splits"][role] = scores
             self.events[role] = events_by_rule(parts, latency)
+            if self.baselines and role != "train":
+                self.outcomes[role] = outcomes_of(parts)
+                if found := compared([self.outcomes[role]], role):
+                    self.metrics["comparison"][role] = found
             for name in ("accuracy", "balanced_accuracy"):
                 if scores[name] is not None:
                     self.log(f"{role}/{name}", scores[name], batch_size=1)
