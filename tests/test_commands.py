@@ -113,6 +113,7 @@ def tiny(tmp_path_factory):
     return SimpleNamespace(folder=folder, cache=cache)
 
 
+@pytest.mark.slow
 def test_one_fold_per_material_leaves_a_folder_each(tiny, tmp_path):
     _, metrics = run_train(tmp_path, *TINY_BY_FOLD, f"cache={tiny.cache}")
     folds, events = metrics["folds"], metrics["events"]

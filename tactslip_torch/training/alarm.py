@@ -370,7 +370,6 @@ def within_budgets(
     streams: Sequence[Stream],
     timing: Timing,
     budgets: Sequence[Budget],
-    allowed: int | None = None,
 ) -> AlarmSettings:
     """Settings with the lowest thresholds that keep every budget, and what they gave as metadata.
 
@@ -384,14 +383,13 @@ def within_budgets(
         streams: of each budget those of its scene, scored.
         timing: of the scores.
         budgets: the first is of recordings without slip, whose rate is stated.
-        allowed: alarms, in place of those that each budget allows.
 
     Raises:
         ValueError: if streams are too few to show a budget.
     """
     rule, onset = settings.rule, settings.onset
     settings = replace(settings, threshold=math.inf)
-    scored = _budget_scores(streams, settings, timing, budgets, allowed)
+    scored = _budget_scores(streams, settings, timing, budgets)
     part = _OF_BINS if onset else 1.0
     value = _lowest(scored, settings, timing, "statistic", of_allowed=part)
     value = max(value, _LEAST_THRESHOLD)
@@ -400,7 +398,7 @@ def within_budgets(
         if isinstance(rule, Cusum) and rule.ceiling == math.inf:
             made = replace(rule, ceiling=_CEILING * value)
         settings = replace(settings, rule=made, threshold=value)
-        scored = _budget_scores(streams, settings, timing, budgets, allowed)
+        scored = _budget_scores(streams, settings, timing, budgets)
         if onset:
             threshold = _lowest(scored, settings, timing, "onset_score")
             settings = replace(settings, onset=replace(onset, threshold=threshold))
@@ -447,7 +445,6 @@ def _budget_scores(
     settings: AlarmSettings,
     timing: Timing,
     budgets: Sequence[Budget],
-    allowed: int | None = None,
 ) -> list[_Scores]:
     """What thresholds are set on, of each budget."""
     settle_s = (timing.bin_samples + timing.look_ahead) / timing.sample_rate_hz + _SETTLE_S
@@ -467,7 +464,7 @@ def _budget_scores(
             scores.is_quiet.append(quiet)
             hours = int(quiet.sum()) / _decisions_h(settings, timing)
             scores.amount += len(times.non_slip_s) if budget.is_share else hours
-        scores.allowed = budget.allowed(scores.amount) if allowed is None else allowed
+        scores.allowed = budget.allowed(scores.amount)
         found.append(scores)
     return found
 

@@ -13,6 +13,7 @@ from tactslip_torch.data.splits import ROLES
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.events import LatencyParts, RecordingEvents
+from tactslip_torch.runtime import from_first_process, gathered
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.baselines import Baselines
 from tactslip_torch.training.datamodule import RecordingFeatures, TrainingBins
@@ -26,7 +27,7 @@ from tactslip_torch.training.evaluation import (
     events_by_rule,
     outcomes_of,
 )
-from tactslip_torch.training.recipe import General, Recipe, from_first_process, gathered
+from tactslip_torch.training.recipe import General, Recipe
 
 
 class SlipLearner(L.LightningModule):

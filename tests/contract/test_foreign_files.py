@@ -43,6 +43,9 @@ WORDS = [
 WORDS += [b"\xb0", b"\xef\xbb\xbf", b"\xff\xfe", "\u0663".encode(), b"9" * 400, b"{", b"[", b"../"]
 
 
+NATIVE = ("npz", "csv", "h5", "mcap", "parquet")
+
+
 def is_read(path):
     """Whether a file is read to its end; else one line is said, with its name."""
     said = ""
@@ -80,7 +83,7 @@ def whole(tmp_path_factory):
     """Files as they should be, native and foreign, by name."""
     folder = tmp_path_factory.mktemp("whole")
     recording = Recording(torch.from_numpy(SAMPLES.T.copy()), 100.0, "M1", (), (), ())
-    for ending in ("npz", "csv", "mcap"):
+    for ending in NATIVE:
         path = folder / f"native.{ending}"
         named_format(ending).save(path, recording, HandLayout.from_rows(CHANNELS[:3]), {"k": 1})
     np.save(folder / "a.npy", SAMPLES)
@@ -96,7 +99,7 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize(
     "name",
     [
-        *(f"native.{e}" for e in ("npz", "csv", "mcap")),
+        *(f"native.{ending}" for ending in NATIVE),
         "a.npy",
         "b.npz",
         "c.csv",
@@ -112,7 +115,7 @@ def test_damage_is_one_line_and_never_other_samples_where_there_are_check_sums(
         path = tmp_path / name
         path.write_bytes(damaged(whole[name], random.Random(f"{SEED} {name} {number}")))
         counts[found := is_read(path)] += 1
-        if found and name.endswith(("npz", "mcap")):
+        if found and name.endswith(("npz", "mcap", "parquet")):
             with format_of(path).open(path) as opened:
                 np.testing.assert_array_equal(opened.samples.read(0, 99).T, SAMPLES)
     assert counts[False]

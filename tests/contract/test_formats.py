@@ -36,7 +36,7 @@ from tactslip_torch import HandLayout, Recording
 from tactslip_torch.data.clock import even_clock
 from tactslip_torch.data.formats import endings, find_format, format_of, pieces
 
-from .names import FORMATS, INSTALL_FORMATS, Reading, named_format, open_file
+from .names import FORMATS, Reading, named_format, open_file
 
 ENDINGS = ("npz", "csv", "txt", "h5", "mat", "mcap", "parquet")
 ALIKE = ("npy", "tsv", "dat", "lvm", "hdf5", "he5")
@@ -222,28 +222,6 @@ def test_ours_saved_again_by_others_are_ours(tmp_path):
         archived = format_of(tmp_path / name).load(tmp_path / name)
         assert torch.equal(archived.recording.samples, wanted.samples)
         assert_truth(archived, wanted, hand)
-
-
-@pytest.mark.parametrize("ending", ["npz", "csv", "h5", "mcap", "parquet"])
-def test_a_damaged_sample_of_ours_is_noticed(tmp_path, ending):
-    """MAT files of version 5 keep no check sums; all others must notice, or text be no number."""
-    form, path = named_format(ending), tmp_path / f"a.{ending}"
-    form.save(path, recording(), hand_of("ab"), KEY)
-    whole, values = path.read_bytes(), recording().samples.numpy()
-    plain = {
-        "csv": repr(float(values[0, 700])).encode(),
-        "mcap": values[:, 700].tobytes(),
-    }.get(ending, values[0, 700:703].tobytes())
-    turned = bytearray(whole)
-    turned[turned.index(plain) + 2] ^= 0x40
-    for content in (bytes(turned), *(whole[: len(whole) * part // 100] for part in (19, 57, 95))):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match=f"a.{ending}"):
-            form.load(path)
-    path.write_bytes(turned)
-    with pytest.raises(ValueError, match=f"a.{ending}"), open_file(path) as opened:
-        opened.samples.read(0, 1234)
-    assert form.is_native(path)
 
 
 # Which files there are -------------------------------------------------------------------------
@@ -886,4 +864,4 @@ def test_an_absent_library_is_one_line_with_its_remedy(tmp_path, monkeypatch, na
     monkeypatch.setattr("importlib.util.find_spec", hidden)
     with pytest.raises(ValueError, match=f"needs {library}, which is not installed") as caught:
         named_format(name[2:]).save(tmp_path / name, recording(), hand_of("ab"), KEY)
-    assert INSTALL_FORMATS in str(caught.value)
+    assert f"pip install {library}" in str(caught.value)
