@@ -311,7 +311,7 @@ def onsets_table(content: Mapping[str, Any]) -> str:
         cells |= {"delay s": _seconds(row["delay_s"]), "outcome": row["outcome"]}
         shown.append(cells)
     nothing = "no alarm, and no slip missed"
-    lines = [style.table(style.with_values(shown, 1), merged=1) if rows else nothing]
+    lines = [style.table(shown, merged=1, kept=1) if rows else nothing]
     if len(rows) > _MOST_ROWS:
         lines.append(f"and {len(rows) - _MOST_ROWS} more, see onsets.csv")
     return style.marked(content["simulated"], *lines)

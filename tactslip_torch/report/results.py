@@ -89,7 +89,7 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
 
 def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> None:
     """Print the tables of a run."""
-    texts = [splits_table(metrics), *comparison_lines(metrics), *_trained_on_lines(metrics)]
+    texts = [splits_table(metrics), *_comparison_lines(metrics), *_trained_on_lines(metrics)]
     texts.append(materials_table(metrics))
     for key, tables in (
         ("events", (events_table,)),
@@ -140,7 +140,7 @@ def splits_table(metrics: _Metrics) -> str:
     return style.marked(metrics["simulated"], style.table(rows), *source)
 
 
-def comparison_lines(metrics: _Metrics) -> list[str]:
+def _comparison_lines(metrics: _Metrics) -> list[str]:
     """A line for each held-out split: which baseline is ahead of the detector, or that none is.
 
     One is ahead where the whole interval of its difference is above 0. Then the line says what to
@@ -808,7 +808,7 @@ def events_table(metrics: _Metrics) -> str:
             delays.append(delay)
     found = [numbers for by_rule in metrics["events"].values() for numbers in by_rule.values()]
     is_any = any(numbers["num_onsets"] or numbers["quiet_hours"] for numbers in found)
-    lines = [style.table(style.with_values(rows, 2), num_left=2, merged=1)] if is_any else []
+    lines = [style.table(rows, num_left=2, merged=1, kept=2)] if is_any else []
     if is_any and not any(numbers["num_onsets"] for numbers in found):
         lines.append("no slip has a known onset: false alarms alone can be counted")
     lines += [
@@ -975,7 +975,7 @@ def _target_line(metrics: _Metrics) -> str:
     )
 
 
-def budget_rows(metrics: _Metrics) -> list[_Row]:
+def _budget_rows(metrics: _Metrics) -> list[_Row]:
     """False alarms of each scene and method beside the budget, on recordings that set nothing.
 
     Args:
@@ -996,9 +996,9 @@ def budget_rows(metrics: _Metrics) -> list[_Row]:
 
 
 def alarm_table(metrics: _Metrics) -> str:
-    """``_target_line``, ``_rate_rows`` and ``budget_rows`` for the terminal."""
+    """``_target_line``, ``_rate_rows`` and ``_budget_rows`` for the terminal."""
     rows = style.table(_rate_rows(metrics), num_left=2, merged=1)
-    budget = style.table(budget_rows(metrics), num_left=3)
+    budget = style.table(_budget_rows(metrics), num_left=3)
     return style.marked(metrics["simulated"], _target_line(metrics), rows, budget)
 
 

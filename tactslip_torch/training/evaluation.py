@@ -78,6 +78,24 @@ class Outcomes(NamedTuple):
     recordings: tuple[RecordingId, ...]
     confusions: Mapping[str, Tensor]
 
+    @classmethod
+    def of(cls, parts: Sequence[EvaluatedBins]) -> Outcomes:
+        """The confusions of the recordings; nothing of a recording without baselines."""
+        number = torch.arange(len(parts)).repeat_interleave(
+            torch.tensor([len(part.says_slip) for part in parts])
+        )
+        cell = 4 * number + 2 * torch.cat([part.bins.is_slip for part in parts]).long()
+        decisions = {"detector": torch.cat([part.says_slip for part in parts])}
+        for name in parts[0].baselines:
+            decisions[name] = torch.cat([part.baselines[name] for part in parts])
+        return cls(
+            tuple(part.bins.recording for part in parts),
+            {
+                name: torch.bincount(cell + says_slip, minlength=4 * len(parts)).view(-1, 2, 2)
+                for name, says_slip in decisions.items()
+            },
+        )
+
 
 def evaluated_bins(
     batch: RecordingFeatures,
@@ -116,24 +134,6 @@ def bin_scores(parts: Sequence[EvaluatedBins]) -> tuple[dict[str, Any], dict[str
         )
         for name in parts[0].baselines
     }
-
-
-def outcomes_of(parts: Sequence[EvaluatedBins]) -> Outcomes:
-    """The confusions of the recordings; nothing of a recording without baselines."""
-    number = torch.arange(len(parts)).repeat_interleave(
-        torch.tensor([len(part.says_slip) for part in parts])
-    )
-    cell = 4 * number + 2 * torch.cat([part.bins.is_slip for part in parts]).long()
-    decisions = {"detector": torch.cat([part.says_slip for part in parts])}
-    for name in parts[0].baselines:
-        decisions[name] = torch.cat([part.baselines[name] for part in parts])
-    return Outcomes(
-        tuple(part.bins.recording for part in parts),
-        {
-            name: torch.bincount(cell + says_slip, minlength=4 * len(parts)).view(-1, 2, 2)
-            for name, says_slip in decisions.items()
-        },
-    )
 
 
 def compared(outcomes: Sequence[Outcomes], role: str) -> dict[str, Any]:

@@ -25,7 +25,6 @@ from tactslip_torch.training.evaluation import (
     evaluated_bins,
     event_numbers,
     events_by_rule,
-    outcomes_of,
 )
 from tactslip_torch.training.recipe import General, Recipe
 
@@ -152,7 +151,7 @@ class SlipLearner(L.LightningModule):
             self.metrics["splits"][role] = scores
             self.events[role] = events_by_rule(parts, latency)
             if self.baselines and role != "train":
-                self.outcomes[role] = outcomes_of(parts)
+                self.outcomes[role] = Outcomes.of(parts)
                 if found := compared([self.outcomes[role]], role):
                     self.metrics["comparison"][role] = found
             for name in ("accuracy", "balanced_accuracy"):
