@@ -13,6 +13,7 @@ from tactslip_torch.data.splits import ROLES
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.events import LatencyParts, RecordingEvents
+from tactslip_torch.runtime import one_thread
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.baselines import Baselines
 from tactslip_torch.training.datamodule import RecordingFeatures, TrainingBins
@@ -106,6 +107,7 @@ class SlipLearner(L.LightningModule):
             raise ValueError("nothing to test: fit first, or give the learner a detector")
         self._evaluated = {role: [] for role in ROLES}
 
+    @one_thread()  # a recording is small: threads would mostly wait
     def test_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
         """Score the bins of one recording."""
         detector = self.detector
