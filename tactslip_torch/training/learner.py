@@ -121,6 +121,7 @@ class SlipLearner(L.LightningModule):
         for role, part in evaluated_bins(batch, score >= 0, baselines).items():
             self._evaluated[role].append(part)
 
+    @one_thread()
     def on_test_epoch_end(self) -> None:
         """Turn decisions into metrics."""
         assert self.detector is not None  # on_test_start
