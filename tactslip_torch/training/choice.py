@@ -270,7 +270,7 @@ class _Columns:
         names: of the columns.
         pooling: that made the pooled ones.
         sensing: of the training bins, for pooled columns.
-        is_lost: silent channels of all bins, ``[n + m, C]``, left out of the pools.
+        is_lost: silent channels, ``[n + m, C]``, left out of the pools; training bins come first.
     """
 
     sensing: Sensing
@@ -279,7 +279,8 @@ class _Columns:
     def __init__(
         self, bins: CandidateBins, rows: Tensor, train: Tensor, parts: Sequence[str]
     ) -> None:
-        is_train = train[rows]
+        rows = torch.cat([train.nonzero()[:, 0], (rows & ~train).nonzero()[:, 0]])
+        num = int(train.sum())
         self._is_slip, self._groups = bins.is_slip[train], bins.groups[train]
         features, scaled = bins.features[rows], list[Tensor]()
         self.names, self.pooling = list[FeatureName](), None
@@ -289,21 +290,22 @@ class _Columns:
             if part == "pooled":
                 assert bins.pooling is not None  # General
                 spans = bins.spans[rows]
-                self.sensing = Sensing.fit(spans[is_train], 1, 1)
+                self.sensing = Sensing.fit(spans[:num], 1, 1)
                 self.is_lost = bins.span_features.is_silent(spans, self.sensing)
-                known, lost = features[is_train], self.is_lost[is_train]
+                known, lost = features[:num], self.is_lost[:num]
                 layer = ChannelPooling.fit(bins.hand, names, known, bins.pooling, lost)
                 place = {name: index for index, name in enumerate(names)}
                 inputs = [place[name] for name in layer.inputs]
                 x, names = layer(features[:, inputs].double(), self.is_lost), list(layer.names)
                 self.pooling = layer
             x = x.double()
-            scaler = FeatureScaler.fit(x[is_train], compress=True, tail=TAIL)
-            scaled.append(torch.cat([scaler(few) for few in x.split(_SCALED_BINS)]))
+            scaler = FeatureScaler.fit(x[:num], compress=True, tail=TAIL)
+            for few in x.split(_SCALED_BINS):
+                few.copy_(scaler(few))
+            scaled.append(x)
             self._places[part] = torch.arange(len(names)) + len(self.names)
             self.names += names
-        z = torch.cat(scaled, 1)
-        self.z, self.left_out = z[is_train], z[~is_train]
+        self.z, self.left_out = torch.cat(scaled, 1).tensor_split([num])
 
     def places(self, structure: Structure) -> Tensor:
         """Which columns a structure takes, best first; all in their order."""
@@ -455,10 +457,10 @@ def _ridge_scores(
     Through the primal or the dual, whichever has fewer unknowns.
     """
     kernel, (z, left_out) = structure.kernel, columns.taken(structure)
-    is_linear, is_primal = kernel.degree == 1, kernel.degree == 1 and z.shape[1] < len(z)
-    if is_linear:
-        z, left_out = (_with_constant(x, kernel.offset) for x in (z, left_out))
+    is_primal = kernel.degree == 1 and z.shape[1] < len(z)
     if is_primal:
+        constant = math.sqrt(kernel.offset)
+        z, left_out = (torch.nn.functional.pad(x, (0, 1), value=constant) for x in (z, left_out))
         system, right = z.mT @ (z * weights[:, None]), z.mT @ (weights * targets)
     else:
         system = (columns.products(structure) + kernel.offset) ** kernel.degree
@@ -474,14 +476,11 @@ def _ridge_scores(
             found = torch.cholesky_solve(right[:, None], factor)
         solved.append(found)
     unknowns = torch.cat(solved, 1)
-    if not is_linear:
-        return ((left_out @ z.mT + kernel.offset) ** kernel.degree @ unknowns).mT
-    return (left_out @ (unknowns if is_primal else z.mT @ unknowns)).mT
-
-
-def _with_constant(z: Tensor, offset: float) -> Tensor:
-    """Columns, and one more whose products are the offset of a kernel of degree 1."""
-    return torch.cat([z, torch.full_like(z[:, :1], math.sqrt(offset))], 1)
+    if is_primal:
+        return (left_out @ unknowns).mT
+    if kernel.degree == 1:  # by the weights of the columns: fewer products than with every bin
+        return (left_out @ (z.mT @ unknowns) + kernel.offset * unknowns.sum(0)).mT
+    return ((left_out @ z.mT + kernel.offset) ** kernel.degree @ unknowns).mT
 
 
 def _means(table: Accuracies) -> dict[Candidate, float]:
