@@ -31,7 +31,7 @@ from tactslip_torch.features.sensing import Sensing, SpanFeatures
 from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.runtime import for_each, steps
+from tactslip_torch.runtime import for_each, one_thread, steps, trim_memory
 from tactslip_torch.training.bins import SampledBins
 
 log = logging.getLogger(__name__)
@@ -160,6 +160,7 @@ def choose_model(
 
         def leave_out(fold: frozenset[int]) -> None:
             table.leave_out(fold, structures, penalties)
+            trim_memory()  # of what the fold has left, in each thread
             shown.update()
 
         for_each(leave_out, folds)
@@ -241,6 +242,7 @@ class CandidateBins:
         thinned.__dict__.update(self.__dict__, is_kept=is_kept, weights=weights)
         return thinned
 
+    @one_thread()
     def select(self, structure: Structure) -> FeatureSelection:
         """Compression, ranking and scaling of a structure, learned from all of these bins."""
         everything = torch.ones_like(self.is_slip)

@@ -91,9 +91,10 @@ class SlipLearner(L.LightningModule):
         info = self.metadata | {"calibration": fit.calibration}
         if self.with_baselines:
             sample = fit.sample
-            self.baselines = from_first_process(
-                lambda: Baselines(self.pool, fit.selection(sample.features), sample)
-            )
+            with one_thread():
+                self.baselines = from_first_process(
+                    lambda: Baselines(self.pool, fit.selection(sample.features), sample)
+                )
             self.seconds["baselines"] = time.perf_counter() - fitted
         self.detector = fit.detector(self.pool, self.channel_filter, info)
 
