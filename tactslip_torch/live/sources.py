@@ -182,7 +182,7 @@ class SerialPort(_ByteSource):
         self, port: str, frames: Frames, detector: SlipDetector, baud: int = 115200
     ) -> None:
         check_number("baud", baud, whole=True)
-        self._serial = needs("serial", "a serial port", "live")
+        self._serial = needs("serial", "a serial port")
         self._port, self._baud = port, baud
         super().__init__(f"serial:{port}", frames, detector)
 
@@ -205,7 +205,7 @@ class SerialPort(_ByteSource):
         return _Connection(read, port.close)
 
     def _message(self, error: OSError) -> str:
-        there = needs("serial.tools.list_ports", "a serial port", "live").comports()
+        there = needs("serial.tools.list_ports", "a serial port").comports()
         names = ", ".join(sorted(each.device for each in there)) or "none"
         if error.errno == 2 or not Path(self._port).exists():
             return f"there is no serial port {self._port}; there are: {names}"

@@ -114,6 +114,3 @@ HOST_OPTIONS |= {"rate": "--rate"}
 # Recordings in files ---------------------------------------------------------------------------
 
 from tactslip_torch.data.formats import FORMATS, Reading, named_format, open_file  # noqa: E402
-
-INSTALL_FORMATS = 'pip install "tactslip-torch[formats]"'
-"""What brings the library of a format that is not installed."""
