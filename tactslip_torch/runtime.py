@@ -17,7 +17,6 @@ import multiprocessing
 import os
 import secrets
 import shutil
-import stat
 import sys
 import threading
 import time
@@ -379,32 +378,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def regular_file(path: str | os.PathLike[str], most_bytes: float = math.inf) -> Path:
-    """The path of a file that can be read from start to end: no folder, device or pipe.
-
-    Opening a pipe would wait for whoever writes to it.
-
-    Args:
-        path: of the file.
-        most_bytes: that it may be long.
-
-    Raises:
-        FileNotFoundError: if there is nothing.
-        ValueError: if it is no file, or longer than that.
-    """
-    path = Path(path)
-    try:
-        status = path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        raise FileNotFoundError(f"no file at {path}") from None
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or pipe"
-        raise ValueError(f"{path} is {kind}, expected a file; copy it to a file first")
-    if status.st_size > most_bytes:
-        raise ValueError(f"{path} has {status.st_size} bytes, at most {most_bytes:.0f} can be read")
-    return path
 
 
 class SeenBatches(dict[str, str]):
