@@ -319,10 +319,11 @@ class _Columns:
 
     def taken(self, structure: Structure) -> tuple[Tensor, Tensor]:
         """The columns that a structure takes, of training bins and of the others."""
-        places: Tensor | slice = self.places(structure)
-        if structure.num_features is None:  # neighbours, so that nothing is copied
-            places = slice(int(places[0]), int(places[-1]) + 1)
-        return self.z[:, places], self.left_out[:, places]
+        places = self.places(structure)
+        if structure.num_features is not None:
+            return self.z[:, places], self.left_out[:, places]
+        neighbours = slice(int(places[0]), int(places[-1]) + 1)  # nothing is copied
+        return self.z[:, neighbours], self.left_out[:, neighbours]
 
     def products(self, structure: Structure) -> Tensor:
         """Inner products of the training bins, ``[n, n]``."""
