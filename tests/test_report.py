@@ -440,7 +440,7 @@ def entry():
     truth = {"onsets": onsets, "false_alarms_s": [0.3], "early_s": 0.2}
     alarms = [
         {"alarm_s": t, "onset_s": t - 0.01, "probability": 0.9, "raised_by": "onset"}
-        | {"is_valid": True, "in_range": t != 1.5}
+        | {"in_range": t != 1.5}
         | alarm_outcome(t, truth)
         for t in (0.3, 1.05, 1.5, 2.9, 5.7)
     ]

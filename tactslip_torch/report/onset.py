@@ -29,7 +29,7 @@ Segments = Sequence[tuple[float, float]]
 
 REST, SLIP = style.BLUE, style.ORANGE
 COLUMNS = (
-    *("file", "alarm_s", "onset_s", "end_s", "score", "probability", "statistic", "is_valid"),
+    *("file", "alarm_s", "onset_s", "end_s", "score", "probability", "statistic"),
     *("in_range", "channels_lost", "raised_by"),
     *("outcome", "true_onset_s", "delay_s", "simulated"),
 )

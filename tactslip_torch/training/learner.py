@@ -13,7 +13,7 @@ from tactslip_torch.data.splits import ROLES
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.events import LatencyParts, RecordingEvents
-from tactslip_torch.runtime import from_first_process, gathered
+from tactslip_torch.runtime import from_first_process, gathered, one_thread
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.baselines import Baselines
 from tactslip_torch.training.datamodule import RecordingFeatures, TrainingBins
@@ -100,9 +100,10 @@ class SlipLearner(L.LightningModule):
         info = self.metadata | {"calibration": fit.calibration}
         if self.with_baselines:
             sample = fit.sample
-            self.baselines = from_first_process(
-                lambda: Baselines(self.pool, fit.selection(sample.features), sample)
-            )
+            with one_thread():
+                self.baselines = from_first_process(
+                    lambda: Baselines(self.pool, fit.selection(sample.features), sample)
+                )
             self.seconds["baselines"] = time.perf_counter() - fitted
         self.detector = fit.detector(self.pool, self.channel_filter, info)
 
@@ -116,6 +117,7 @@ class SlipLearner(L.LightningModule):
             raise ValueError("nothing to test: fit first, or give the learner a detector")
         self._evaluated = {role: [] for role in ROLES}
 
+    @one_thread()  # a recording is small: threads would mostly wait
     def test_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
         """Score the bins of one recording."""
         detector = self.detector
@@ -129,6 +131,7 @@ class SlipLearner(L.LightningModule):
         for role, part in evaluated_bins(batch, score >= 0, baselines).items():
             self._evaluated[role].append(part)
 
+    @one_thread()
     def on_test_epoch_end(self) -> None:
         """Turn decisions into metrics."""
         assert self.detector is not None  # on_test_start
