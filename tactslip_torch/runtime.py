@@ -30,6 +30,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+import torch.distributed
 from torch import Tensor
 from torch.autograd import forward_ad
 from tqdm.auto import tqdm
@@ -41,6 +42,7 @@ log = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Value = TypeVar("Value")
 
 _POOLS: dict[tuple[int, int], ThreadPoolExecutor] = {}  # by process and number of threads
 _MAKING = threading.Lock()
@@ -577,3 +579,39 @@ def process_number() -> int:
         if name in os.environ:
             return int(os.environ[name])
     return 0
+
+
+def _num_ranks() -> int:
+    ready = torch.distributed.is_available() and torch.distributed.is_initialized()
+    return torch.distributed.get_world_size() if ready else 1
+
+
+def gathered(own: Value) -> list[Value]:
+    """The value of every process, in the order of their ranks."""
+    values: list[Any] = [own] * _num_ranks()
+    if len(values) > 1:
+        torch.distributed.all_gather_object(values, own)
+    return values
+
+
+def from_first_process(make: Callable[[], Value]) -> Value:
+    """What the first process makes, in every process; its error as well, so that none waits."""
+    if _num_ranks() == 1:
+        return make()
+    box: list[Any] = [None, None]
+    if torch.distributed.get_rank() == 0:
+        try:
+            box[0] = make()
+        except Exception as error:
+            box[1] = error
+    torch.distributed.broadcast_object_list(box)
+    if box[1] is not None:
+        raise box[1]
+    made: Value = box[0]
+    return made
+
+
+def add_over_processes(*totals: Tensor) -> None:
+    """Add up tensors of every process, in place; in one process they are the sums already."""
+    for total in totals if _num_ranks() > 1 else ():
+        torch.distributed.all_reduce(total)

@@ -29,9 +29,7 @@ from tactslip_torch.training.calibrate import (
 
 TIMING = Timing(1000.0, 500, 1000, 0)
 """A decision every half second, on the second before."""
-SETTINGS = AlarmSettings(
-    500, Platt(1.0, 0.0), KOfN(1, 1), 0.0, None, rearm_s=1.0, refractory_s=1.0
-)
+SETTINGS = AlarmSettings(500, Platt(1.0, 0.0), KOfN(1, 1), 0.0, None, rearm_s=1.0, refractory_s=1.0)
 STRETCH_H = 0.1
 
 

@@ -541,7 +541,7 @@ REFUSED = [
     ({"reading": {"time_unit": "h"}}, r"reading\.time_unit must be one of s, ms, us, ns"),
     ({"reading": {"resample_hz": 199.9999}}, "is no ratio of whole numbers up to 50000"),
     ({"adapting": "quick"}, "adapting must be slow or fast, got 'quick'"),
-    ({"channels": [{"name": "a"}]}, "channel row 1: expected name, kind, finger, segment"),
+    ({"channels": [{"name": "a"}]}, "channel row 1: expected name, kind"),
     ({"manifest": "other.csv"}, r"no manifest at .*other\.csv"),
 ]
 
@@ -596,6 +596,13 @@ def test_paths_say_what_recordings_are(folder):
     told, other = map(found.timeline, slips[1:])
     assert (told.onsets_s, told.slip_s) == ((0.75,), ())
     assert (other.onsets_s, other.slip_s) == ((), ((0.5, 1.5),))
+
+
+def test_a_trial_of_each_session_is_a_recording_of_its_own(folder):
+    pattern = "{session}/{material:pen}{trial}"
+    found = named_recordings(folder, pattern=pattern, reading=NAMED["reading"])
+    expected = [(0, "n"), (7, "n"), (0, "t")]
+    assert set(found.ids) == {RecordingId("pen", trial, session=day) for trial, day in expected}
 
 
 UNSAID = [

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from streams import detector_of, onset_of
+from streams import onset_of
 
 from tactslip_torch import (
     SlipClassifier,
@@ -305,30 +305,3 @@ def test_windows_with_missing_samples_are_predicted_and_not_fitted():
     assert np.isfinite(classifier.decision_function(missing)).all()
     with pytest.raises(ValueError, match="X holds NaN: window 0, channel 0, sample 0"):
         classifier.fit(missing, y)
-
-
-def test_min_alive_can_be_set(detector, volts):
-    own = SlipDetector.pretrained()
-    half = volts[:200].T.clone()[None]
-    half[:, 14:19] = torch.nan
-    raw = half[..., : own.context_before + 100 + own.context_after]
-    assert own.predict_raw(raw).is_valid.all()
-    own.sensing = replace(own.sensing, min_alive=6)
-    assert not own.predict_raw(raw).is_valid.any()
-    with pytest.raises(ValueError, match="min_alive is 11, of 10 channels that count"):
-        own.sensing = replace(own.sensing, min_alive=11)
-
-
-def test_unpooled_columns_of_lost_channels_take_their_training_means():
-    own = detector_of()
-    bins = torch.randn(7, 4, 100, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    own.imputation.copy_(torch.linspace(-1, 1, len(own.imputation)))
-    lost = bins.clone()
-    lost[:, 2] = 3.0  # silent
-    other = bins.clone()
-    other[:, 2] = torch.nan
-    found, missing = own.predict(lost), own.predict(other)
-    torch.testing.assert_close(found.score, missing.score)
-    assert found.channels_lost[:, 2].all()
-    z = own.scaled(own.extractor(bins), found.channels_lost)
-    torch.testing.assert_close(found.score, own.head(z))

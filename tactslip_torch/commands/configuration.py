@@ -23,6 +23,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from tactslip_torch.commands.own_folder import HAND_FILE, OF_HAND, with_folder
 from tactslip_torch.commands.packaged import packaged_folder
 
 _COMMENTED = re.compile(r"( *)(?:- )?([\w@/]+):(?: +([^#\s].*?))?(?: +# (.*))?$")
@@ -46,12 +47,14 @@ class CommandLine(NamedTuple):
     Attributes:
         command: the first word.
         arguments: for ``hydra.main``: overrides, then options.
+        typed: the arguments as they were given.
         options: of the command line, such as ``multirun``.
         config: composed, with Hydra's own section; of several values each key has the first.
     """
 
     command: str
     arguments: list[str]
+    typed: list[str]
     options: Namespace
     config: DictConfig
 
@@ -251,6 +254,8 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
     Raises:
         ValueError: if it cannot be composed.
     """
+    typed = list(arguments)
+    arguments = with_folder(command, arguments)
     if "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("RANK", "0") != "0":
         nowhere = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
         arguments = [*nowhere, *arguments]
@@ -276,7 +281,11 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
     for name in config:
         if str(name) not in known.union(_groups(config.hydra), presets(), ("hydra",)):
             raise _Mistake(_no_key(command, str(name), config))
-    return CommandLine(command, [*overrides, *rest], options, config)
+    if list(arguments) != typed:  # of a hand.yaml
+        for own in keys_of(command, config):
+            if not own.description and own.name.partition(".")[0] in OF_HAND:
+                raise _Mistake(f"{HAND_FILE}: {_no_key(command, own.name, config)}")
+    return CommandLine(command, [*overrides, *rest], typed, options, config)
 
 
 def _composed(command: str, options: Namespace) -> tuple[list[str], DictConfig]:

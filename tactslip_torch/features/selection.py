@@ -6,7 +6,6 @@ Moments are gathered in passes over recordings and merge.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,7 +13,6 @@ from torch import Tensor
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.hand import HandLayout
 
-ScoreVariance = Literal["pooled", "welch"]
 CLASS_NAMES = ("non-slip", "slip")
 _ATTRIBUTES = ("kind", "finger", "channel", "component", "domain", "descriptor")
 
@@ -93,36 +91,29 @@ class ClassMoments:
         self.count = count
 
 
-def t_scores(moments: ClassMoments, variance: ScoreVariance = "pooled") -> Tensor:
-    """Absolute two-sample t statistic of every feature.
+def t_scores(moments: ClassMoments) -> Tensor:
+    """Absolute two-sample t statistic of every feature, of the pooled variance.
 
     Where both variances are 0 the score is 0 for equal means and +inf otherwise.
 
     Args:
         moments: of the training bins.
-        variance: ``"pooled"`` (MATLAB's ``rankfeatures``) or ``"welch"``; they agree for balanced
-            classes.
 
     Shape:
         - output: ``[F]``, float64
 
     Raises:
-        ValueError: if a class has no bin (named) or the variance is unknown.
+        ValueError: if a class has no bin (named).
 
     Reference:
-        ``scipy.stats.ttest_ind(equal_var=variance == "pooled").statistic``, absolute.
+        ``scipy.stats.ttest_ind(..).statistic``, absolute; MATLAB's ``rankfeatures``.
     """
     for name, count in zip(CLASS_NAMES, moments.count.tolist(), strict=True):
         if count < 1:
             raise ValueError(f"ranking features needs bins of both classes, got no {name} bin")
     count = moments.count[:, None]
-    if variance == "pooled":
-        freedom = (moments.count.sum() - 2).clamp(min=1)
-        square = moments.sum_sq_dev.sum(0) / freedom * (1 / count).sum(0)
-    elif variance == "welch":
-        square = (moments.sum_sq_dev / (count - 1).clamp(min=1) / count).sum(0)
-    else:
-        raise ValueError(f"variance must be 'pooled' or 'welch', got {variance!r}")
+    freedom = (moments.count.sum() - 2).clamp(min=1)
+    square = moments.sum_sq_dev.sum(0) / freedom * (1 / count).sum(0)
     apart = (moments.mean[1] - moments.mean[0]).abs()
     both_still = torch.where(apart == 0, 0.0, torch.inf).to(apart)
     return torch.where(square == 0, both_still + apart, apart / square.sqrt())

@@ -14,7 +14,8 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-from matplotlib import rc_context
+import numpy as np
+from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -197,6 +198,13 @@ def legend_below(figure: Figure, handles: Sequence[Any], ncols: int) -> None:
 def colours_of(names: Iterable[str]) -> dict[str, str]:
     """A colour for each name, in the order of ``PALETTE``."""
     return dict(zip(dict.fromkeys(names), cycle(PALETTE)))
+
+
+def shades(num: int) -> list[Any]:
+    """So many colours: those of ``PALETTE`` or, of more, a range from dark blue to yellow."""
+    if num <= len(PALETTE):
+        return list(PALETTE[:num])
+    return list(colormaps["viridis"](np.linspace(0, 0.92, num)))
 
 
 def kind_colours(kinds: Iterable[str]) -> dict[str, str]:

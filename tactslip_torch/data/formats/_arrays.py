@@ -524,7 +524,7 @@ def read_mat(path: Path, how: Reading, stack: ExitStack) -> Opened:
 
     Of foreign ones: the only matrix, or all vectors of one length as channels by name, also in
     structs (``trial.volts``); times by name; the rate by a number, names of channels by characters
-    or cells, that are called so.
+    or, up to version 7, cells, that are called so.
 
     Raises:
         Refused: if h5py is absent where it is needed, or a file of version 5 claims more than is
@@ -589,9 +589,8 @@ def _hdf5_variables(file: Any) -> dict[str, Any]:
             continue
         if "MATLAB_empty" in thing.attrs:
             found[name] = "is empty"
-        elif kind in ("char", "cell"):
-            words = _characters(thing) if kind == "char" else _cells(file, thing)
-            found[name] = f"is a {kind} array" if words is None else words
+        elif kind == "char":
+            found[name] = _characters(thing) or "is a char array"
         elif kind == "logical":
             found[name] = "holds true or false"
         elif "MATLAB_object_decode" in thing.attrs or kind not in _CLASSES:
@@ -610,17 +609,3 @@ def _characters(thing: Any) -> tuple[str, ...] | None:
         return None
     rows = np.ascontiguousarray(thing[()].T).astype("<u2")
     return tuple(row.tobytes().decode("utf-16-le", "replace").rstrip(" \0") for row in rows)
-
-
-def _cells(file: Any, thing: Any) -> tuple[str, ...] | None:
-    """The words of cells that hold one each."""
-    if thing.dtype.kind != "O" or thing.ndim != 2 or not 0 < thing.size <= MOST_MEMBERS:
-        return None
-    words: list[str] = []
-    for reference in thing[()].reshape(-1):
-        cell = file[reference]
-        if _attribute(cell, "MATLAB_class") != ("char",):
-            return None
-        is_empty = "MATLAB_empty" in cell.attrs
-        words += ("",) if is_empty else (_characters(cell) or ())[:1]
-    return tuple(words)
