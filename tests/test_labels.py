@@ -7,16 +7,13 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from small_set import SmallSet, small_maker
 
 from tactslip_torch.data.labels import (
     NO_POSITION,
     LabelRule,
     clear_of,
     label_bins,
-    slip_by_speed,
 )
-from tactslip_torch.data.recording import Timeline
 
 RATE = 2000.0
 ONSETS = (2.0, 9.0, 13.5)  # as in the paper, with slides of 100 mm at 20, 40, 60 mm/s
@@ -57,7 +54,9 @@ def by_hand(rule, onsets, slides, duration_s, rate, non_slip_s=(), slip_s=()):
     for stroke, (onset, (start, end)) in enumerate(zip(onsets, slides, strict=True)):
         edge = round((onset - shift_s) * rate)
         last = min(int(end * rate), edge + lead if is_half else len(taken))
-        quiet = [s for s in range(edge - lead, edge, hop) if previous <= s <= edge - size]
+        ends = [math.ceil(e * rate - 1e-6) for _, e in slip_s]
+        free = max([previous, *(e for e in ends if e <= edge)])
+        quiet = [s for s in range(edge - lead, edge, hop) if free <= s <= edge - size]
         found += [(s, False, stroke, n - len(quiet)) for n, s in enumerate(quiet)]
         slip = [s for s in range(edge, last, hop) if s + size <= last]
         found += [(s, True, stroke, n) for n, s in enumerate(slip)]
@@ -127,7 +126,8 @@ def windows_by_hand(rule, onsets, slides, duration_s, rate, non_slip_s=(), slip_
         last = end  # of these slides a whole sample
         for place in range(min(edge, int(start * rate)), end):
             label[place] = None
-        for place in range(max(edge - round(lead * rate), previous), edge):
+        free = max([previous, *(round(e * rate) for _, e in slip_s if round(e * rate) <= edge)])
+        for place in range(max(edge - round(lead * rate), free), edge):
             label[place] = False
         for place in range(edge, min(last, edge + round(lead * rate)) if is_half else last):
             label[place] = True
@@ -171,28 +171,6 @@ def test_bins_that_need_missing_samples_are_left_out():
         assert sorted(set(bins.starts.tolist()) - set(kept.starts.tolist())) == expected
         assert len(kept.starts) == len(kept.is_slip) == len(kept.stroke) == len(kept.position)
     assert 1900 in clear_of(bins, [(1.0 + 11 / RATE, 1.1)], 25, 11, RATE).starts.tolist()
-
-
-def test_a_speed_that_is_noisy_lost_or_begins_in_slip():
-    rate = 1000.0
-    speed = np.zeros(1000)
-    speed[:100] = 10.0  # slides already
-    speed[300:500] = -10.0  # either way
-    speed[400:410] = 0.0  # for 10 ms
-    speed[600:615] = 10.0  # for 15 ms
-    speed[700:750] = np.nan
-    speed[750:800] = 10.0  # since when is not known
-    found = slip_by_speed(speed, rate, 5.0)
-    np.testing.assert_allclose(found.slip_s, [[0, 0.0995], [0.75, 0.7995]])
-    np.testing.assert_allclose(found.sliding_s, [[0.2995, 0.4995]])
-    np.testing.assert_allclose(found.non_slip_s, [[0.0995, 0.2995], [0.4995, 0.7], [0.7995, 1.0]])
-    assert found.speeds_mm_s == (10.0,)
-    assert slip_by_speed(np.zeros(0), rate, 5.0) == Timeline()
-
-
-def test_a_speed_is_wanted_of_recordings_that_have_one():
-    with pytest.raises(ValueError, match=r"labels\.speed_over=5 needs recordings with a column of"):
-        small_maker(SmallSet(), speed_over=5.0)
 
 
 # Errors --------------------------------------------------------------------------------------
