@@ -23,7 +23,8 @@ from hydra.utils import instantiate
 from benchmarks.harness import Benchmark, Job
 from benchmarks.subjects import composed
 from benchmarks.tables import Table, by
-from tactslip_torch.data.splits import PAPER_SCENE, Split
+from tactslip_torch.data.recording import PAPER_SCENE
+from tactslip_torch.data.splits import Split
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.training.bins import RecordingBins
 from tactslip_torch.training.choice import recalls

@@ -133,7 +133,13 @@ def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> list[dict[str, s
     """Balanced accuracy on held-out cycles by the level trained on and the one evaluated on."""
     off = ["cache=off", *overrides]
     config = composed("train", off)
-    recipe = General(use="pooled", num_features=None, degree=1, sample_bins=sizes.train_bins)
+    recipe = General(
+        use="pooled",
+        num_features=None,
+        degree=1,
+        sample_bins=sizes.train_bins,
+        descriptors=None,
+    )
     kept = {}
     for level, (fidelity, given) in LEVELS.items():
         say(f"simulation: features of {level}")

@@ -49,12 +49,24 @@ def _main() -> None:
         print("\n".join(f"  {name:22}{what}" for name, what in COMMANDS.items()))
         print("\ntactslip COMMAND --help lists the keys of a command, with examples")
         return
+    if given in ("-V", "--version"):
+        print(f"tactslip_torch {_version()}")
+        return
     if given not in COMMANDS:
         near = get_close_matches(given, COMMANDS, 1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(COMMANDS)}"
         print(f"error: no command {given}; {hint}", file=sys.stderr)
         raise SystemExit(2)
     run(given, rest)
+
+
+def _version() -> str:
+    """That of the package, and of libraries that decide numbers."""
+    from tactslip_torch.features.cache import versions
+
+    known = versions()
+    own = known.pop("tactslip_torch")
+    return f"{own} ({', '.join(f'{name} {number}' for name, number in known.items())})"
 
 
 def run(command: str, arguments: list[str]) -> None:

@@ -34,27 +34,10 @@ from tactslip_torch.model.calibration import Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.training.bins import RecordingBins
-from tactslip_torch.training.recipe import Fit, General
+from tactslip_torch.training.recipe import POOLING, Fit, General
 
 FRAMES: Mapping[str, int] = {"SG": 51, "PVDF": 11}
 """Savitzky-Golay frames of the paper's kinds of channels, samples at 2 kHz; others are as given."""
-DESCRIPTORS = (
-    "mean",
-    "range",
-    "mean_deviation",
-    "std",
-    "skewness",
-    "kurtosis",
-    "energy",
-    "peak_factor",
-    "correlation",
-    "spectral_centroid",
-    "spectral_spread",
-    "band_energy_ratio",
-)
-"""Those of ``recipe=general``: none jumps with the last digit, none needs sorting."""
-POOLING = ("mean", "std", "min", "max")
-PENALTIES = General.penalties
 _USES = ("channel", "pooled", "both")
 _FOLDS = 5  # of validation without groups
 _BLOCK = 50  # windows that lose the same channels in a second copy (``drop_channels``)
@@ -107,7 +90,7 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         *,
         use: str | None = None,
         pooling: str | Sequence[str] = POOLING,
-        descriptors: Sequence[str] | None = DESCRIPTORS,
+        descriptors: Sequence[str] | None = General.descriptors,
         frames: Mapping[str, int] | None = None,
         filtered: bool = False,
         align: Align = "centred",
@@ -317,7 +300,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         *,
         num_features: int | Sequence[int | None] | None = (None, 120),
         degree: int | Sequence[int] = (1, 2),
-        penalties: float | Sequence[float] = PENALTIES,
+        penalties: float | Sequence[float] = General.penalties,
         tolerance: float = 0.005,
         drop_channels: float = 0.5,
         slip_label: Any = None,
@@ -425,20 +408,17 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return self._score(X)[1]
 
     @classmethod
-    def from_detector(
-        cls, detector: SlipDetector, classes: Sequence[Any] | None = None, *, filtered: bool = False
-    ) -> SlipClassifier:
+    def from_detector(cls, detector: SlipDetector, *, filtered: bool = False) -> SlipClassifier:
         """A fitted classifier that scores as a detector does.
+
+        Its labels are those that the detector was fitted with by a classifier, or 0 and 1.
 
         Args:
             detector: trained in any way.
-            classes: labels for non-slip and slip; by default those it was fitted with, or 0 and 1.
             filtered: whether windows will come filtered; raw ones with their context otherwise.
         """
         pool, layer = detector.pool, detector.channel_filter
-        labels = list(classes or detector.info.get("classes") or (0, 1))
-        if len(labels) != 2 or labels[0] == labels[1]:
-            raise ValueError(f"classes must be two labels, non-slip and slip, got {labels}")
+        labels = list(detector.info.get("classes") or (0, 1))
         features = TactileFeatures(
             pool.sample_rate_hz, pool.hand, filtered=filtered, align=layer.align
         )

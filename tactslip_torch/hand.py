@@ -21,7 +21,10 @@ changes; described by wavelet branches and their spectra.
 """
 KNOWN_KINDS: Mapping[str, Adapting] = MappingProxyType({"SG": "slow", "PVDF": "fast"})
 """The paper's kinds, strain gauges and piezoelectric films: their word says how they adapt."""
-_REQUIRED = ("name", "kind", "finger", "segment")
+_COLUMNS = ("name", "kind", "finger", "segment")
+_REQUIRED = _COLUMNS[:2]
+_NOWHERE = "unknown"
+"""The finger and segment of a channel that nobody stated."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +54,12 @@ class Channel:
 
     name: str
     kind: str
-    finger: str
-    segment: str
+    finger: str = _NOWHERE
+    segment: str = _NOWHERE
     adapting: Adapting | None = None
 
     def __post_init__(self) -> None:
-        for what in _REQUIRED:
+        for what in _COLUMNS:
             if not isinstance(getattr(self, what), str):
                 raise ValueError(
                     f"channel {self.name!r}: {what} must be text, got {getattr(self, what)!r}; "
@@ -85,7 +88,7 @@ class Channel:
 
         It holds ``adapting`` only where that is not what the kind implies.
         """
-        row = {what: str(getattr(self, what)) for what in _REQUIRED}
+        row = {what: str(getattr(self, what)) for what in _COLUMNS}
         if self.adapting != KNOWN_KINDS.get(self.kind):
             row["adapting"] = str(self.adapting)
         return row
@@ -190,19 +193,20 @@ class HandLayout:
         """A hand from plain rows of configuration or of a file.
 
         Args:
-            rows: ``name``, ``kind``, ``finger``, ``segment`` and, where the kind does not say it,
-                ``adapting``.
+            rows: ``name``, ``kind`` and, where the kind does not say it, ``adapting``; ``finger``
+                and ``segment`` where they are known.
 
         Raises:
-            ValueError: if a row lacks one of the four or has another key, or no channel can be
+            ValueError: if a row lacks one of the first two or has another key, or no channel can be
                 made of it; named with its row.
         """
         channels = []
         for number, row in enumerate(rows, 1):
-            if not set(_REQUIRED) <= set(row) <= {*_REQUIRED, "adapting"}:
+            if not set(_REQUIRED) <= set(row) <= {*_COLUMNS, "adapting"}:
                 raise ValueError(
-                    f"channel row {number}: expected {', '.join(_REQUIRED)} and, for kinds other "
-                    f"than {' and '.join(KNOWN_KINDS)}, adapting; got {sorted(map(str, row))}"
+                    f"channel row {number}: expected {', '.join(_REQUIRED)}, for kinds other than "
+                    f"{' and '.join(KNOWN_KINDS)} adapting, and if known finger and segment; got "
+                    f"{sorted(map(str, row))}"
                 )
             try:
                 channels.append(Channel(**row))  # type: ignore[arg-type]  # checked there

@@ -1,4 +1,7 @@
-"""Threads, processes, progress bars, files that are written whole, and batches that were seen."""
+"""What all parts use: threads, processes, progress bars, files that are written whole, tensors.
+
+Of tensors: whether their values may be looked at, and operations that are quicker where they may.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +22,18 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import lru_cache
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
+import torch.distributed
 from torch import Tensor
+from torch.autograd import forward_ad
 from tqdm.auto import tqdm
 
 __version__ = "0.3.0.dev0"
@@ -37,6 +43,7 @@ log = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Value = TypeVar("Value")
 
 _POOLS: dict[tuple[int, int], ThreadPoolExecutor] = {}  # by process and number of threads
 _MAKING = threading.Lock()
@@ -125,6 +132,106 @@ def _renew_lock() -> None:
 
 
 os.register_at_fork(after_in_child=_renew_lock)
+
+
+def is_traced() -> bool:
+    """Whether what runs is being written down as a graph, in which no value may be looked at."""
+    is_jit = torch.jit.is_tracing()  # type: ignore[attr-defined,no-untyped-call]
+    return bool(is_jit or torch.compiler.is_compiling())
+
+
+def has_values(x: Tensor) -> bool:
+    """Whether a decision may be taken on the values, wherever they lie and whatever comes along.
+
+    Not so where a graph is recorded or ``x`` is transformed (vmap, func.grad, jvp).
+    """
+    if is_traced():
+        return False
+    try:
+        x.detach().flatten()[:0].cpu().numpy()  # of what is transformed not even nothing
+    except (RuntimeError, TypeError):  # transformed, or NumPy has no such dtype
+        return False
+    return True
+
+
+def is_concrete(x: Tensor) -> bool:
+    """Whether only values are asked for, and lie in memory that can be looked at.
+
+    Not so where a gradient or a tangent is carried along, a graph is recorded, ``x`` is transformed
+    (vmap), or lies on another device than the CPU.
+    """
+    if not x.is_cpu or is_traced() or (x.requires_grad and torch.is_grad_enabled()):
+        return False
+    try:
+        x.detach().numpy()  # under vmap and other transforms there is no memory to look at
+        return forward_ad.unpack_dual(x).tangent is None
+    except (RuntimeError, TypeError):  # transformed, or NumPy has no such dtype
+        return False
+
+
+def stamps_of(tensors: Iterable[Tensor]) -> list[tuple[Tensor, int | Tensor]]:
+    """What ``are_unchanged`` compares: tensors, and how often each was changed in place.
+
+    Inference tensors do not count that: of those a copy.
+    """
+    return [(x, x.clone() if x.is_inference() else x._version) for x in tensors]
+
+
+def are_unchanged(tensors: Sequence[Tensor], stamps: Sequence[tuple[Tensor, int | Tensor]]) -> bool:
+    """Whether tensors are those of the stamps, none of them replaced or changed since."""
+    return len(tensors) == len(stamps) and all(
+        x is same and (torch.equal(x, was) if isinstance(was, Tensor) else x._version == was)
+        for x, (same, was) in zip(tensors, stamps, strict=True)
+    )
+
+
+def full_precision(x: Tensor) -> AbstractContextManager[object]:
+    """Within it ``torch.autocast`` narrows nothing that is computed on the device of ``x``."""
+    kind = x.device.type
+    is_on = torch.is_autocast_enabled(kind)
+    return torch.autocast(kind, enabled=False) if is_on else nullcontext()
+
+
+def ascending(x: Tensor, count: int) -> Tensor:
+    """The smallest values along the last axis, at least ``count`` of them, in ascending order.
+
+    By NumPy where only values are asked for: it sorts short rows several times as fast.
+    """
+    if not isinstance(x, Tensor):
+        return x.ascending(count)
+    if is_concrete(x):
+        return torch.from_numpy(np.sort(x.detach().numpy(), axis=-1))
+    return x.sort(-1).values
+
+
+def signed_log(features: Tensor, scale: Tensor) -> Tensor:
+    """``sign(f) * scale * log1p(|f| / scale)``: nearly ``f`` below the scale, logarithmic above.
+
+    Monotone, odd, with derivative ``scale / (scale + |f|)``, 1 at 0. Finite for every finite ``f``,
+    also where ``|f| / scale`` passes the largest float; NaN stays NaN.
+
+    Shape:
+        - features, output: ``[*, K]``
+        - scale: broadcasts with ``features``, positive
+    """
+    dtype_info = torch.finfo(features.dtype)
+    if is_concrete(features) and is_concrete(scale):  # the same in fewer passes
+        ratio = features.abs() / scale
+        if ratio.numel() and bool(ratio.amax().isfinite()):
+            bent, is_tiny = ratio.log1p().mul_(scale), ratio < dtype_info.tiny
+            if bool(is_tiny.any()):
+                bent = torch.where(is_tiny, features.abs(), bent)
+            return bent.copysign_(features)
+    is_negative = features < 0
+    size = torch.where(is_negative, -features, features)  # abs() has derivative 0 at 0
+    ratio = size / scale
+    bent = scale * ratio.log1p()
+    if not has_values(features) or bool(ratio.isinf().any()):
+        far = torch.maximum(size, scale).log() - scale.log()
+        far = far.clamp(min=math.log(dtype_info.max))  # no step back where log1p ends
+        bent = torch.where(ratio.isinf(), scale * far, bent)
+    bent = torch.where(ratio < dtype_info.tiny, size, bent)  # a denormal ratio has lost its digits
+    return torch.where(is_negative, -bent, bent)
 
 
 @contextmanager
@@ -364,7 +471,7 @@ LEAD = 31
 _EVERY_S = 10.0
 
 
-class Progress(tqdm):  # type: ignore[misc]
+class _Progress(tqdm):  # type: ignore[misc]
     """A progress bar on a terminal or in a notebook; elsewhere a logged line every ten seconds.
 
     What takes less than ten seconds leaves no line in a log.
@@ -408,16 +515,16 @@ def bar(
     """``items`` with a progress bar on standard error that shows rate and time left."""
     if not show:
         return items
-    shown: Iterable[Any] = Progress(
+    shown: Iterable[Any] = _Progress(
         items, desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", dynamic_ncols=True
     )
     return shown
 
 
-def steps(what: str, unit: str, total: int, *, show: bool = True) -> Progress:
+def steps(what: str, unit: str, total: int, *, show: bool = True) -> _Progress:
     """A bar of at most so many steps for a ``with``, moved by its ``update``, from any thread."""
     options = {"dynamic_ncols": True, "smoothing": 0, "disable": not show}
-    return Progress(desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", **options)
+    return _Progress(desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", **options)
 
 
 _function: Callable[[Any], Any] | None = None
@@ -497,3 +604,39 @@ def process_number() -> int:
         if name in os.environ:
             return int(os.environ[name])
     return 0
+
+
+def _num_ranks() -> int:
+    ready = torch.distributed.is_available() and torch.distributed.is_initialized()
+    return torch.distributed.get_world_size() if ready else 1
+
+
+def gathered(own: Value) -> list[Value]:
+    """The value of every process, in the order of their ranks."""
+    values: list[Any] = [own] * _num_ranks()
+    if len(values) > 1:
+        torch.distributed.all_gather_object(values, own)
+    return values
+
+
+def from_first_process(make: Callable[[], Value]) -> Value:
+    """What the first process makes, in every process; its error as well, so that none waits."""
+    if _num_ranks() == 1:
+        return make()
+    box: list[Any] = [None, None]
+    if torch.distributed.get_rank() == 0:
+        try:
+            box[0] = make()
+        except Exception as error:
+            box[1] = error
+    torch.distributed.broadcast_object_list(box)
+    if box[1] is not None:
+        raise box[1]
+    made: Value = box[0]
+    return made
+
+
+def add_over_processes(*totals: Tensor) -> None:
+    """Add up tensors of every process, in place; in one process they are the sums already."""
+    for total in totals if _num_ranks() > 1 else ():
+        torch.distributed.all_reduce(total)

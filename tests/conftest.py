@@ -1,18 +1,20 @@
 """Fixtures every test file may ask for, and the seed of everything that is generated."""
 
+import fcntl
 import os
 import sys
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import generated
 import numpy as np
 import pytest
 import torch
 from contract.names import settings as overrides
 from contract.recordings import of_set, split_of_set, write_set
-from contract.running import Runner, Trained, train
+from contract.running import Runner, Trained, train, trained_in
+from extremes import SEED
 from hypothesis import HealthCheck, is_hypothesis_test, seed, settings
 from matplotlib.figure import Figure
 
@@ -23,7 +25,7 @@ settings.register_profile(
     deadline=None,
     derandomize=False,  # the seed below is as good, and can be changed
     database=None,
-    max_examples=40,
+    max_examples=20,
     suppress_health_check=[HealthCheck.too_slow],  # no test fails because a machine is busy
 )
 torch.set_num_threads(1)  # two processes with two threads each on two cores spend hours waiting
@@ -67,16 +69,35 @@ def seed_hypothesis(config: pytest.Config, items: list[pytest.Item]) -> None:
         test = getattr(item, "obj", None)
         if test is not None and is_hypothesis_test(test):
             name = item.nodeid.split("[")[0]
-            seed(f"{generated.SEED} {name}")(test)
+            seed(f"{SEED} {name}")(test)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    line = f"property tests: seed {generated.SEED} (TACTSLIP_SEED={generated.SEED} repeats them)"
+    line = f"property tests: seed {SEED} (TACTSLIP_SEED={SEED} repeats them)"
     terminalreporter.write_line(line)
 
 
 # A folder of recordings, and a detector of each recipe that was trained on it: ask for these
-# before you make a detector another way. They are made once, when first asked for.
+# before you make a detector another way. They are made once in a run, when first asked for.
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """By name a folder of all processes of a run, which the first that asks for it fills."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def folder_of(name: str, fill: Callable[[Path], object]) -> Path:
+        folder, mark = shared / name, shared / f"{name}.whole"
+        with (shared / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not mark.exists():
+                folder.mkdir(exist_ok=True)
+                fill(folder)
+                mark.touch()
+        return folder
+
+    return folder_of
 
 
 @pytest.fixture(scope="session")
@@ -86,38 +107,36 @@ def command() -> Runner:
 
 
 @pytest.fixture(scope="session")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recordings(once: Callable[..., Path]) -> Path:
     """Twelve text files of a hand of two slow and two fast channels, with their manifest."""
-    return write_set(tmp_path_factory.mktemp("recordings"))
+    return once("recordings", write_set)
 
 
 @pytest.fixture(scope="session")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cache(once: Callable[..., Path]) -> Path:
     """Features of the recordings."""
-    return tmp_path_factory.mktemp("cache")
+    return once("cache", lambda folder: None)
 
 
 @pytest.fixture(scope="session")
-def general(
-    command: Runner, recordings: Path, cache: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Trained:
+def general(once: Callable[..., Path], command: Runner, recordings: Path, cache: Path) -> Trained:
     """A detector of the default recipe: pooled features and single ones, with an alarm."""
-    return _trained(command, recordings, cache, tmp_path_factory.mktemp("general"))
+    return _trained(once, "general", command, recordings, cache)
 
 
 @pytest.fixture(scope="session")
-def paper(
-    command: Runner, recordings: Path, cache: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Trained:
+def paper(once: Callable[..., Path], command: Runner, recordings: Path, cache: Path) -> Trained:
     """A detector of the paper's recipe: twelve features, nothing pooled, with an alarm."""
     recipe = {"recipe": "paper", "num_features": 12, "penalties": [0.001, 0.1]}
-    return _trained(command, recordings, cache, tmp_path_factory.mktemp("paper"), **recipe)
+    return _trained(once, "paper", command, recordings, cache, **recipe)
 
 
-def _trained(command: Runner, root: Path, cache: Path, folder: Path, **recipe: object) -> Trained:
-    quick = {"onset": "debounced", "workers": 0, "export": False, "baselines": False}
-    given = [*of_set(root), *split_of_set()]
-    return train(command, folder, given, cache=cache, **quick, **recipe)
+def _trained(
+    once: Callable[..., Path], name: str, command: Runner, root: Path, cache: Path, **recipe: object
+) -> Trained:
+    words = {"onset": "debounced", "workers": 0, "export": False, "baselines": False, **recipe}
+    given = [*of_set(root), *split_of_set(), *overrides(cache=cache, **words)]
+    return trained_in(once(name, lambda folder: train(command, folder, given)), given)
 
 
 @pytest.fixture(scope="session", params=["general", "paper"])
@@ -135,17 +154,19 @@ def trained_or_slow(request: pytest.FixtureRequest) -> Trained:
 
 
 @pytest.fixture(scope="session")
-def graphs_of(request: pytest.FixtureRequest, command: Runner, tmp_path_factory: Any) -> Any:
+def graphs_of(
+    request: pytest.FixtureRequest, once: Callable[..., Path], command: Runner
+) -> Callable[..., Path]:
     """By recipe and precision a folder with both graphs, exported when first asked for."""
-    made: dict[tuple[str, str], Path] = {}
 
     def graphs(recipe: str, precision: str = "float32") -> Path:
-        if (recipe, precision) not in made:
-            folder = made[recipe, precision] = tmp_path_factory.mktemp("graphs")
-            model = request.getfixturevalue(recipe).file
+        model = request.getfixturevalue(recipe).file
+
+        def fill(folder: Path) -> None:
             words = {"model": model, "precision": precision, "output": folder, "graph": "both"}
             command.well(folder, "export", *overrides(**words))
-        return made[recipe, precision]
+
+        return once(f"graphs_{recipe}_{precision}", fill)
 
     return graphs
 

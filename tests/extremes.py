@@ -1,14 +1,20 @@
-"""Bins by kind in which sums cancel, overflow or underflow, or a descriptor's definition ends."""
+"""Bins by kind in which sums cancel, overflow or underflow, or a descriptor's definition ends.
 
+``TACTSLIP_SEED`` drives what hypothesis draws; the head of a run says which seed it has.
+"""
+
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
+from hypothesis import strategies as st
 from torch import Tensor
 
 from tactslip_torch import HandLayout
 from tactslip_torch.pretrained import sample_recording
 
+SEED = int(os.environ.get("TACTSLIP_SEED", "1"))
 RAIL_V = 5.0
 COUNT_V = 2 * RAIL_V / 2**16  # of a converter of 16 bits
 
@@ -96,6 +102,31 @@ def extreme_bins(
     """Bins of one of ``EXTREMES`` in volts; drawn in float64 and rounded once."""
     found = _KINDS[kind](Draw(tuple(shape), generator, torch.finfo(dtype)))
     return found.expand(tuple(shape)).to(dtype).clone()
+
+
+def generator(drawn: int) -> torch.Generator:
+    """Random numbers that depend on the run's seed and a number that hypothesis drew."""
+    return torch.Generator().manual_seed((SEED * 1_000_003 + drawn) % 2**63)
+
+
+ORDINARY = ("plain", "integers", "ramp")  # drawn as often as all the others together
+
+
+def mixed_bins(drawn: int, shape: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
+    """Bins ``[N, C, n]`` whose channels are of random kinds, each its own."""
+    source = generator(drawn)
+    menu = (*EXTREMES, *ORDINARY * (len(EXTREMES) // len(ORDINARY)))
+    choice = torch.randint(len(menu), shape[:2], generator=source)
+    bins = torch.empty(shape, dtype=dtype)
+    for index, kind in enumerate(menu):
+        here = choice == index
+        bins[here] = extreme_bins(kind, (int(here.sum()), shape[-1]), source, dtype)
+    return bins
+
+
+def batches(shape: tuple[int, int, int], dtype: torch.dtype) -> st.SearchStrategy[Tensor]:
+    """``mixed_bins`` by a number that hypothesis shrinks, which is as good as any."""
+    return st.integers(0, 2**40).map(lambda drawn: mixed_bins(drawn, shape, dtype))
 
 
 def slip_samples(hand: HandLayout, dtype: torch.dtype = torch.float64) -> Tensor:

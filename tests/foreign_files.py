@@ -25,13 +25,11 @@ def made_73(path, **variables):
     with h5py.File(path, "w", userblock_size=512) as file:
 
         def put(name, values):
-            if isinstance(values, list):
-                references = [put(f"#refs#/{name}{i}", one).ref for i, one in enumerate(values)]
-                kept = file.create_dataset(name, data=[references], dtype=h5py.ref_dtype)
-                kind = "cell"
-            elif isinstance(values, str):
-                codes = np.frombuffer(values.encode("utf-16-le"), "<u2")
-                kept, kind = file.create_dataset(name, data=codes[:, None]), "char"
+            if isinstance(values, str | list):
+                words = [values] if isinstance(values, str) else values
+                rows = [word.ljust(max(map(len, words))).encode("utf-16-le") for word in words]
+                codes = np.stack([np.frombuffer(row, "<u2") for row in rows], 1)
+                kept, kind = file.create_dataset(name, data=codes), "char"
             else:
                 kept = file.create_dataset(name, data=np.atleast_2d(values).T)
                 kind = kinds[np.atleast_2d(values).dtype.str[1:]]

@@ -238,9 +238,9 @@ def pool(
 # Section 5: selection and model --------------------------------------------------------------
 
 
-def t_scores(features: np.ndarray, labels: np.ndarray, variance: str = "pooled") -> np.ndarray:
+def t_scores(features: np.ndarray, labels: np.ndarray) -> np.ndarray:
     slip, rest = features[labels == 1], features[labels == 0]
-    return np.abs(stats.ttest_ind(slip, rest, equal_var=variance == "pooled").statistic)
+    return np.abs(stats.ttest_ind(slip, rest).statistic)
 
 
 def kernel(a: np.ndarray, b: np.ndarray, degree: int = 2, offset: float = 0.5) -> np.ndarray:

@@ -4,7 +4,6 @@ import numpy as np
 import torch
 from extremes import slip_samples
 
-from tactslip_torch.features.groups import JUMPING
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import Sensing
 from tactslip_torch.hand import HandLayout
@@ -45,7 +44,7 @@ def small_detector(
     rng = np.random.default_rng(seed)
     pool = FeaturePool(HAND, arithmetic=arithmetic)  # type: ignore[arg-type]
     channel_filter = ChannelFilter([51, 51, 11, 11])
-    steady = [i for i, n in enumerate(pool.names) if n.descriptor not in JUMPING]
+    steady = [i for i, n in enumerate(pool.names) if n.descriptor not in ("mode", "cv", "entropy")]
     of_gauges = rng.choice([i for i in steady if i < 26], 4, replace=False)
     of_films = rng.choice([i for i in steady if i >= 26], NUM_FEATURES - 4, replace=False)
     selected = [int(i) for i in (*of_gauges, *of_films)]

@@ -4,11 +4,21 @@ import numpy as np
 import torch
 from small_detector import HAND, small_detector
 
+from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.signals.filtering import ChannelFilter
+
+
+def hand_of(kinds):
+    """A hand by letters: ``"GFF"`` is a slow channel and two fast ones."""
+    words = {"G": "SG", "F": "PVDF"}
+    return HandLayout.from_rows(
+        {"name": f"{words[kind]}{i}", "kind": words[kind], "finger": "index", "segment": "distal"}
+        for i, kind in enumerate(kinds)
+    )
 
 
 def signal(num_samples, seed=0, dtype=torch.float64):

@@ -1,6 +1,5 @@
 """Skin and bristles against Radau and in themselves, up to where a scheme breaks."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -159,40 +158,6 @@ def test_friction_and_breakaway_are_radaus(case, step_us, most, late_s):
     assert np.abs(error).max() <= most * found["friction"].max()
     let_go_s = crossing_s(times, trace.slip_m_s[:, 0].numpy(), arm_m_s / 2)
     assert abs(let_go_s - crossing_s(TIMES, found["slip"], arm_m_s / 2)) <= late_s
-
-
-def test_order_is_two_where_nothing_lets_go():
-    def arm(t):
-        return 0.06 + 0.01 * math.sin(60.0 * t)
-
-    def load(t):
-        return 1.0 + 0.3 * math.sin(90.0 * t)
-
-    element, times = replace(SMOOTH, sigma2=0.5), np.arange(1, 11) * 0.02
-    exact = element.radau(arm, load, times)["friction"]
-    lanes, errors = element.lanes(), []
-    for step_s in (1e-3, 5e-4, 2.5e-4, 1.25e-4):
-        every = round(0.02 / step_s)
-        trace, _ = carry(lanes, at_rest(lanes), driven(arm, load), 10 * every, step_s, every)
-        errors.append(np.abs(trace.friction_n[:, 0].numpy() - exact)[5:].max())
-    orders = np.log2(np.array(errors[:-1]) / errors[1:])
-    assert ((orders > 1.8) & (orders < 2.3)).all(), orders
-
-
-# --- what the model does ------------------------------------------------------------------------
-
-
-@each_backend
-def test_balance_of_forces_holds_in_the_trace(backend):
-    element = replace(TACKY, sigma2=0.7, pressure=tuple(hertz_pressure(3).tolist()))
-    lanes, step_s = element.lanes(), 250e-6
-    state, drive = at_rest(lanes), driven(ramped(0.04))
-    for number in range(200):
-        trace, state = carry(lanes, state, drive, 1, step_s, first_step=number, backend=backend)
-        arm, v = ramped(0.04)((number + 1) * step_s), float(state.speed_m_s)
-        _, friction = element.rates(v, state.bristle_m[0].numpy(), 1.0)
-        pulled = float(trace.friction_n) + element.c * (arm - v) - friction
-        assert abs(float(trace.inertia_n) - pulled) < 1e-8
 
 
 # --- engines ------------------------------------------------------------------------------------

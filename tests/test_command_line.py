@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from tactslip_torch import __version__
 from tactslip_torch.__main__ import COMMANDS, OF_THEIR_OWN, main
 from tactslip_torch.commands.configuration import checked, conf_dir, help_text, keys_of, with_lists
 
@@ -196,6 +197,12 @@ def test_help_comes_without_torch(line):
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert "tactslip train +exp=quick" in done.stdout
+
+
+def test_the_version_is_that_of_the_package(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["tactslip", "--version"])
+    main()
+    assert capsys.readouterr().out.startswith(f"tactslip_torch {__version__} (torch ")
 
 
 def test_the_page_has_every_mistake():

@@ -82,9 +82,10 @@ def test_sessions_trains_on_one_and_evaluates_the_same_materials_in_others():
     assert [len({r.session for r in fold.having("train")}) for fold in rest] == [2, 2, 2]
 
 
-def test_evaluate_has_the_defaults_of_train():
+def test_evaluate_of_simulated_recordings_has_the_defaults_of_train():
     train, evaluate = (
-        OmegaConf.to_container(compose_config(name), resolve=True) for name in ("train", "evaluate")
+        OmegaConf.to_container(compose_config(name, words), resolve=True)
+        for name, words in (("train", []), ("evaluate", ["data=simulated", "split=unseen4"]))
     )
     for section in ("data", "labels", "split", "trainer", "seed"):
         assert evaluate[section] == train[section]

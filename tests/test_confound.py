@@ -90,7 +90,9 @@ def test_a_run_on_several_scenes_leaves_table_figure_and_scores_by_fold(ran):
 
 def test_evaluate_counts_bins_that_both_folds_hold_out_once(ran, tmp_path):
     model = f"model={ran[0] / 'with_scenes' / 'detector.pt'}"
-    metrics = evaluate(composed(*SMALL, model, "+exp=confound", name="evaluate"), tmp_path)
+    metrics = evaluate(
+        composed("data=simulated", *SMALL, model, "+exp=confound", name="evaluate"), tmp_path
+    )
     trained = json.loads((ran[0] / "metrics.json").read_text())["folds"]["with_scenes"]
     for role in ("train", "test", "unseen"):  # with_scenes trains on all that protocol does
         assert metrics["splits"][role]["confusion"] == trained["splits"][role]["confusion"]

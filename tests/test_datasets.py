@@ -553,7 +553,7 @@ REFUSED = [
     ({"reading": {"time_unit": "h"}}, r"reading\.time_unit must be one of s, ms, us, ns"),
     ({"reading": {"resample_hz": 199.9999}}, "is no ratio of whole numbers up to 50000"),
     ({"adapting": "quick"}, "adapting must be slow or fast, got 'quick'"),
-    ({"channels": [{"name": "a"}]}, "channel row 1: expected name, kind, finger, segment"),
+    ({"channels": [{"name": "a"}]}, "channel row 1: expected name, kind"),
     ({"manifest": "other.csv"}, r"no manifest at .*other\.csv"),
 ]
 

@@ -133,26 +133,3 @@ def test_many_bins_are_judged_as_few_are(method):
         assert whole.shape[:2] == (3, 200)
         close = {"rtol": 1e-10, "atol": 1e-12, "equal_nan": True}
         torch.testing.assert_close(whole.flatten(0, 1), torch.cat(parts), **close)
-
-
-@pytest.mark.parametrize("head", ["quadratic", "watched", "constant feature"])
-def test_one_bin_is_judged_as_many_are(head):
-    """By NumPy or by modules: with a NaN, a dead channel, values beyond any range, both dtypes."""
-    detector, samples = random_detector(), noise(8)
-    if head == "constant feature":
-        detector.scaler.minimum[3] = detector.scaler.maximum[3]
-    if head == "watched":
-        detector.head.register_forward_hook(lambda *_: None)
-    samples[1, 16, 70], samples[2, 17], samples[3, 18] = torch.nan, 0.5, 1e200 * samples[3, 18]
-    for given in (samples, samples.float()):
-        whole = detector.predict_raw(given)
-        for index, one in enumerate(given[:5]):
-            alone = detector.predict_raw(one)
-            assert alone.score.dtype == given.dtype
-            expected = tuple(part[index] for part in whole)
-            close = {"rtol": 1e-5, "atol": 1e-6, "equal_nan": True}  # spans of what is missing
-            torch.testing.assert_close(tuple(alone), expected, **close)
-            assert alone.is_valid
-    detector.float()
-    one, many = detector(samples[:1, :, 25:125]), detector(samples[..., 25:125])
-    torch.testing.assert_close(one, many[:1], rtol=1e-4, atol=1e-5)

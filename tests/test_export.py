@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 
 import onnxruntime
 import pytest
@@ -158,3 +159,15 @@ def test_the_command_leaves_what_the_detector_can_give(capsys, tmp_path, detecto
     assert read_sidecar(out / "stream.onnx")["precision"] == "float64"
     with pytest.raises(ValueError, match=r"^output must be a folder, got small\.onnx"):
         command(model, tmp_path, "output=small.onnx")
+
+
+def test_export_writes_where_it_is_told_and_else_beside_the_detector(paper, command, tmp_path):
+    model = shutil.copy(paper.file, tmp_path / "detector.pt")
+    for words, place in (
+        (["hydra.run.dir=told"], "told"),
+        (["output=out", "hydra.run.dir=told"], "out"),
+        ([], ""),
+    ):
+        command.well(tmp_path, "export", f"model={model}", "graph=bin", *words)
+        assert (tmp_path / place / "model.onnx").is_file(), words
+    assert not (tmp_path / "told" / "model.onnx").samefile(tmp_path / "model.onnx")

@@ -97,33 +97,6 @@ def test_each_channel_gets_its_own_frame_and_bins_are_parts_of_the_whole(
     np.testing.assert_allclose(bins, inside, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("channels", [None, (1, 2), (3,), (0, 1, 2, 3)])
-@aligned
-def test_few_bins_are_filtered_as_many_are_and_only_where_it_is_wanted(channels, align, rng):
-    """The others come back as their largest magnitude, which shows what is not finite."""
-    x = torch.from_numpy(oracles.random_bins(rng, 9, 4, 150))
-    x[0, 1, 40] = torch.nan
-    x[1, 0, 0 if align == "centred" else 149] = torch.inf
-    x[2, 3, 75] = -torch.inf
-    layer = ChannelFilter(LENGTHS, align=align)
-    whole, many = layer.valid(x), layer.valid(x, channels)
-    assert whole[0, 1].isnan().all()
-    for channel, (before, after) in enumerate(layer.reaches):
-        if channel in (channels or range(4)):
-            torch.testing.assert_close(many[:, channel], whole[:, channel], equal_nan=True)
-        else:
-            start = layer.context_before - before
-            largest = x[:, channel, start : start + before + 100 + after].abs().amax(-1, True)
-            torch.testing.assert_close(
-                many[:, channel], largest.expand(9, 100), rtol=0, atol=0, equal_nan=True
-            )
-    for part in (slice(1), slice(4), 2):
-        for dtype, close in ((torch.float64, 1e-13), (torch.float32, 1e-4)):
-            how = {"rtol": close, "atol": close, "equal_nan": True}
-            ours = layer.valid(x[part].to(dtype), channels)
-            torch.testing.assert_close(ours, many[part].to(dtype), **how)
-
-
 def test_channel_filter_errors():
     layer = ChannelFilter(LENGTHS)
     for call in (layer, layer.valid):

@@ -9,8 +9,7 @@ import pytest
 import torch
 from sklearn.kernel_ridge import KernelRidge
 
-from tactslip_torch.model import fit
-from tactslip_torch.model.fit import TrainingBins, fit_machine, fit_quadratic
+from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import (
     PAPER_KERNEL,
     KernelSum,
@@ -82,20 +81,6 @@ def test_a_head_is_the_sum_over_its_bins(make, kernel, rng, device):
     assert head(bad).isnan().tolist() == [False, True]
     numbers = sum(value.numel() for value in head.state_dict().values())
     assert (head.num_features, head.cost.num_bytes) == (4, 8 * numbers)
-
-
-def test_a_form_is_folded_in_float64_and_gradients_reach_its_bins(rng):
-    """20 000 terms that cancel: sums in float32 would be off in the third digit."""
-    support = torch.from_numpy(rng.uniform(-1, 1, (20000, 3))).float()
-    beta = torch.from_numpy(rng.choice([-1e4, 1e4], 20000)).float()
-    z = torch.from_numpy(rng.uniform(-1, 1, (5, 3)))
-    terms = PAPER_KERNEL(z, support.double()) * beta
-    error = (collapse(support, beta)(z) - terms.sum(-1)).abs()
-    assert bool((error <= 1e-10 * terms.abs().sum(-1)).all())
-    few = [part.requires_grad_() for part in terms_of(rng, 5, 3)]
-    for make in (collapse, KernelSum):
-        for kernel in (PAPER_KERNEL, Polynomial(1)):
-            assert torch.autograd.gradcheck(lambda s, b, k=kernel, m=make: m(s, b, k)(z), few)
 
 
 @pytest.mark.parametrize(
@@ -196,86 +181,3 @@ SOME = TrainingBins(torch.eye(3), torch.tensor([True, False, True]))
 def test_what_makes_no_machine_is_refused(given, message):
     with pytest.raises(ValueError, match=message):
         fit_machine(*given)
-
-
-# Differentiable fits ---------------------------------------------------------------------------
-
-ROUTES = pytest.mark.parametrize("route", ["primal", "dual"])
-
-
-def drawn(rng, num_bins, num_features):
-    """Features, targets that are any numbers, C, c and weights; a gradient is wanted of all."""
-    z = torch.from_numpy(rng.uniform(-1, 1, (num_bins, num_features)))
-    targets, weights = rng.standard_normal(num_bins), rng.uniform(0.2, 3, num_bins)
-    numbers = [torch.tensor(value, dtype=torch.float64) for value in (0.7, 0.4)]
-    inputs = z, torch.from_numpy(targets), *numbers, torch.from_numpy(weights)
-    return tuple(tensor.requires_grad_() for tensor in inputs)
-
-
-def by_gram_matrix(new):
-    """Scores of new bins from the whole Gram matrix and through the solve."""
-
-    def solve(z, targets, penalty, offset, weights):
-        gram = (z @ z.mT + offset) ** 2
-        beta = torch.linalg.solve(gram + torch.diag(1 / (penalty * weights)), targets)
-        return (new @ z.mT + offset) ** 2 @ beta
-
-    return solve
-
-
-@ROUTES
-@pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize(("penalty", "num_bins"), [(1e-3, 12), (0.3, 60), (1e4, 60)])
-def test_the_differentiable_fit_is_that_of_fit_machine(num_bins, penalty, weighted, route, rng):
-    bins = draw(rng, num_bins, 4, weighted)
-    expected = fit_machine(bins, penalty, Polynomial(2, 0.3), route=route)
-    actual = fit_quadratic(bins.features, bins.is_slip, penalty, 0.3, bins.weights, route)
-    assert actual.solved.size == expected.solved.size
-    for name, value in expected.state_dict().items():
-        scale = max(1.0, float(value.abs().max()))
-        torch.testing.assert_close(getattr(actual, name), value, rtol=0, atol=1e-10 * scale)
-
-
-@ROUTES
-@pytest.mark.parametrize(("num_bins", "num_features"), [(7, 1), (4, 2)])
-def test_derivatives_are_right_once_and_twice(num_bins, num_features, route, rng, monkeypatch):
-    """More bins than monomials, and fewer; in several chunks."""
-    monkeypatch.setattr(fit, "_CHUNK_BINS", 5)
-    new = torch.from_numpy(rng.uniform(-1, 1, (3, num_features)))
-    inputs = drawn(rng, num_bins, num_features)
-
-    def scores(*inputs):
-        return fit_quadratic(*inputs, route=route)(new)
-
-    assert torch.autograd.gradcheck(scores, inputs)
-    assert torch.autograd.gradgradcheck(scores, inputs)
-    expected = torch.autograd.grad(by_gram_matrix(new)(*inputs).sum(), inputs)
-    for one, other in zip(
-        torch.autograd.grad(scores(*inputs).sum(), inputs), expected, strict=True
-    ):
-        torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-9)
-
-
-@ROUTES
-def test_what_cannot_be_differentiated_is_refused(route, rng):
-    z, targets, *_ = (tensor.detach() for tensor in drawn(rng, 12, 3))
-    for penalty in (0.0, float("inf"), float("nan")):
-        with pytest.raises(
-            ValueError, match=rf"positive and finite penalty .* got {penalty}; fit_"
-        ):
-            fit_quadratic(z, targets, penalty)
-    with pytest.raises(ValueError, match=r"one N, got \(12, 3\), \(11,\)"):
-        fit_quadratic(z, targets[1:], 1.0)
-    with pytest.raises(ValueError, match="needs training bins, got none"):
-        fit_quadratic(z[:0], targets[:0], 1.0)
-    with pytest.raises(ValueError, match=r"offset .* at least 0, got -0.5"):
-        fit_quadratic(z, targets, 1.0, -0.5)
-    nothing = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    with pytest.raises(ValueError, match=r"no derivative by an offset .* of 0; .* route='dual'"):
-        fit_quadratic(z, targets, 1.0, nothing, route="primal")
-    with pytest.raises(ValueError, match="weights must be positive"):
-        fit_quadratic(z, targets, 1.0, weights=-torch.ones(12))
-    with pytest.raises(ValueError, match="must be finite, got nan"):
-        fit_quadratic(z, targets * torch.nan, 1.0, route=route)
-    with pytest.raises(ValueError, match=r"penalty=1e\+18.*, wanted up to 1e\+12; lower"):
-        fit_quadratic(z.repeat(4, 1)[:, [0, 0]], targets.repeat(4), 1e18, route=route)

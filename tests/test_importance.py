@@ -2,9 +2,11 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 
+from tactslip_torch import SlipDetector
 from tactslip_torch.commands.configuration import compose_config
 from tactslip_torch.commands.importance import importance
 
@@ -29,7 +31,8 @@ def test_only_channels_in_use_cost_accuracy_when_they_are_masked(trained_or_slow
     used = {name.channel for name in trained.detector.extractor.names}
     for name, row in channels.items():
         assert name in used or row["test"] == whole["test"]
-    assert min(row["test"] for row in rows if row["unit"] == "kind") < whole["test"] - 0.1
+    of_kinds = [row["test"] for row in rows if row["unit"] == "kind"]
+    assert min(0.0 if of is None else of for of in of_kinds) < whole["test"] - 0.1
     assert "channel PVDF1" in capsys.readouterr().out
 
 
@@ -37,3 +40,19 @@ def test_a_detector_needs_the_configuration_of_its_training(paper, tmp_path):
     shutil.copy(paper.file, tmp_path / "alone.pt")
     with pytest.raises(FileNotFoundError, match=r"config\.yaml"):
         sensors_of(tmp_path / "alone.pt", tmp_path)
+
+
+def test_nothing_is_said_of_a_sensor_without_which_no_decision_is_valid(paper, tmp_path, capsys):
+    detector = SlipDetector.load(paper.file)
+    needs_all = replace(detector.sensing, min_alive=int(detector.counted.sum()))
+    detector.sensing = needs_all
+    detector.save(tmp_path / "detector.pt")
+    shutil.copy(paper.file.with_name("config.yaml"), tmp_path)
+    found = sensors_of(tmp_path / "detector.pt", tmp_path / "out", bins=2)
+    used = {name.channel for name in detector.extractor.names}
+    channels = {row["name"]: row["test"] for row in found["rows"] if row["unit"] == "channel"}
+    assert {name for name, of in channels.items() if of is None} == used
+    printed = capsys.readouterr().out.splitlines()
+    for name in channels:
+        (line,) = (line for line in printed if f"channel {name} " in line)
+        assert (" - " in line) == (name in used)

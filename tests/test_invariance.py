@@ -1,13 +1,8 @@
-"""Every cell of the page's table of invariances: that it holds, and that "neither" is neither.
-
-Of definitions by the slow oracle, on signals in whole numbers so that changes round nothing; of all
-columns by the pool.
-"""
+"""Every cell of the page's table of invariances: that it holds, and that "neither" is neither."""
 
 from pathlib import Path
 
 import numpy as np
-import oracles
 import pytest
 import torch
 
@@ -32,18 +27,11 @@ def table():
 
 
 ROWS = table()
-
-
-def answer_of(name, change):
-    """That of a feature of the pool: an offset of the bin is none of a detail's."""
-    row = ROWS[name.domain, name.descriptor]
-    is_detail = change == "offset" and name.component.startswith("D")
-    return row["detail_offset" if is_detail else change]
-
-
-RNG = np.random.default_rng(3)
-SHUFFLE = RNG.permutation(24)
-SIGNALS = np.concatenate([RNG.integers(-4, 9, (6, 24)), RNG.integers(-99, 300, (6, 24))]) / 4.0
+HAND = HandLayout.from_rows(
+    {"name": f"{kind}1", "kind": kind, "finger": "thumb", "segment": "distal"}
+    for kind in ("SG", "PVDF")
+)
+SHUFFLE = np.random.default_rng(3).permutation(100)
 CHANGES = {
     "gain": lambda x: 8 * x,
     "offset": lambda x: x + 16,
@@ -53,22 +41,15 @@ CHANGES = {
 }
 FORMS = {"gain": (0, 1, 2), "offset": ("same", "shifts"), "polarity": ("even", "odd")}
 """What an answer may be, beside "neither"; of the rest "same"."""
+ORDER = ("reversal", "permutation")
+"""Changes that branches of a bin do not follow: of these the bin itself answers."""
 
 
-def measure(x, domain, descriptor):
-    """Values of one descriptor of signals; correlation is with the one before."""
-    if domain == "time":
-        pairs = zip(x, np.roll(x, 1, 0), strict=True)
-        return [oracles.describe_one(one, descriptor, reference=other) for one, other in pairs]
-    spectra = [oracles.amplitude_spectrum(one) for one in x]
-    if descriptor == "band_energy_ratio":
-        return oracles.band_energy_ratio(np.stack(spectra))
-    scales, hz = np.abs(x).max(-1), oracles.frequency_axis_hz(24, 2000.0)
-    options = [{"scale": scale, "frequency_hz": hz} for scale in scales]
-    return [
-        oracles.describe_one(one, descriptor, **each)
-        for one, each in zip(spectra, options, strict=True)
-    ]
+def answer_of(name, change):
+    """That of a feature of the pool: an offset of the bin is none of a detail's."""
+    row = ROWS[name.domain, name.descriptor]
+    is_detail = change == "offset" and name.component.startswith("D")
+    return row["detail_offset" if is_detail else change]
 
 
 def by_table(before, answer):
@@ -79,31 +60,14 @@ def by_table(before, answer):
 
 
 @pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize(("domain", "descriptor"), ROWS)
-def test_a_definition_answers_as_the_table_says(domain, descriptor, change):
-    """As it says, or by one signal at least otherwise than in every form of an answer."""
-    before = np.array(measure(SIGNALS, domain, descriptor), np.float64)
-    after = np.array(measure(CHANGES[change](SIGNALS), domain, descriptor), np.float64)
-    forms = FORMS.get(change, ("same",))
-    away = {form: np.abs(after - by_table(before, form)).max() for form in forms}
-    size, answer = np.abs(before).max(), ROWS[domain, descriptor][change]
-    if answer == "neither":
-        assert min(away.values()) > 1e-3 * size
-    else:
-        assert away[answer] <= 1e-12 * max(np.abs(after).max(), 1)
-
-
-@pytest.mark.parametrize("change", ["gain", "offset", "polarity"])
 def test_every_column_of_the_pool_answers_as_the_table_says(change):
-    kinds = {"SG1": "SG", "PVDF1": "PVDF"}
-    hand = HandLayout.from_rows(
-        {"name": n, "kind": k, "finger": "thumb", "segment": "distal"} for n, k in kinds.items()
-    )
-    pool, bins = FeaturePool(hand), np.random.default_rng(0).standard_normal((40, 2, 100))
+    pool, bins = FeaturePool(HAND), np.random.default_rng(0).standard_normal((40, 2, 100))
     before, after = (pool(torch.from_numpy(x)).numpy() for x in (bins, CHANGES[change](bins)))
     for column, name in enumerate(pool.names):
+        if change in ORDER and name.component != "raw":
+            continue
         answer = answer_of(name, change)
-        forms = FORMS[change] if answer == "neither" else (answer,)
+        forms = FORMS.get(change, ("same",)) if answer == "neither" else (answer,)
         values, found = before[:, column], after[:, column]
         if name.descriptor == "cv":  # as mean by deviation, which has the rounding of the mean
             values, found = 1 / values, 1 / found

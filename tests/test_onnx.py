@@ -11,27 +11,22 @@ import onnxruntime
 import pytest
 import torch
 from contract.names import STREAM_OUTPUTS
-from engine_bins import some_hand
 from extremes import slip_samples
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_detector import HAND, alarming_detector, raw_bins, with_floors
+from small_detector import HAND, alarming_detector, with_floors
 from streams import detector_of, onset_of, signal
 from test_detector import VARIANTS, noise, random_detector
 from test_predictions import with_imputation
 
-from tactslip_torch.deploy.bins import RawBin, Timing, bin_graph, described
+from tactslip_torch.deploy.bins import RawBin, Timing, bin_graph
 from tactslip_torch.deploy.check import check_model, compare, runner, session_of
-from tactslip_torch.deploy.stream import onset_memory, onset_scores, stream_graph
-from tactslip_torch.deploy.value import F32, F64, I64, Graph
-from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.deploy.stream import stream_graph
+from tactslip_torch.deploy.value import F32, F64, Graph
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernels import QuadraticForm
-from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.decisions import KEY, AlarmSettings, score_stream
-from tactslip_torch.onset.evidence import OnsetStream
-from tactslip_torch.onset.rules import Cusum, KOfN, most_lost
+from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -71,50 +66,6 @@ def assert_scores(detector, precision, samples, mask=None, spread=None):
     return got
 
 
-# Features --------------------------------------------------------------------------------------
-
-
-def whole_pool(align="centred", spectrum="reference", bin_samples=100, level=4):
-    """A detector of every feature there is; its head is never used."""
-    pool = FeaturePool(HAND, bin_samples=bin_samples, level=level, spectrum=spectrum)
-    ones = torch.ones(len(pool.names), dtype=torch.float64)
-    flat = torch.zeros(len(ones), len(ones), dtype=torch.float64)
-    head = QuadraticForm(flat, flat[0], flat[0, 0])
-    channel_filter = ChannelFilter((51, 51, 11, 11), 1, align)
-    return SlipDetector(pool, channel_filter, range(len(ones)), FeatureScaler(-ones, ones), head)
-
-
-def off(detector, precision, samples):
-    """Largest error of each feature, by its root mean square over the bins."""
-    given = samples.to(getattr(torch, precision))
-    expected = detector.pool(detector.channel_filter.valid(given.double())).numpy()
-    graph, shape = Graph(), ("batch", len(HAND), RawBin.of(detector).length)
-    made = described(graph.input("samples", np.dtype(precision), shape), detector)[0]
-    graph.output("features", made, ("batch", len(detector.selected)))
-    got = runner(session_of(graph.model()))({"samples": cut(detector, given).numpy()})["features"]
-    size = np.sqrt((expected**2).mean(0))
-    error = np.abs(got - expected).max(0) / np.where(size > 0, size, 1)
-    return dict(zip(map(str, detector.pool.names), error, strict=True))
-
-
-CASES = [
-    ("float32", {}),
-    ("float64", {"align": "causal"}),
-    ("float64", {"bin_samples": 75, "level": 3, "spectrum": "clean"}),
-    ("float64", {"bin_samples": 101, "align": "trailing"}),
-]
-
-
-@pytest.mark.parametrize(("precision", "case"), CASES, ids=str)
-def test_every_feature_of_the_pool_is_that_of_torch(precision, case):
-    detector = whole_pool(**case)
-    extra = torch.from_numpy(np.random.default_rng(1).standard_normal((20, 4, 1)))
-    samples = torch.cat([raw_bins(20), extra], -1)[..., : detector.pool.bin_samples + 50]
-    error = off(detector, precision, samples)
-    worst = max(error, key=error.get)
-    assert error[worst] < {"float32": 2e-4, "float64": 1e-9}[precision], worst
-
-
 # Scores ----------------------------------------------------------------------------------------
 
 
@@ -134,42 +85,6 @@ def test_every_head_and_scaler_comes_through(variant, precision):
     got = assert_scores(detector, precision, samples)
     assert np.flatnonzero(~got["valid"]).tolist() == [21]
     assert np.flatnonzero(got["channels_lost"].any(-1)).tolist() == [*range(12), 20, 21]
-
-
-# Missing channels and probabilities ------------------------------------------------------------
-
-
-def broken_bins():
-    """Bins some of which miss or have silent one or two sensors, or all, neighbours or others."""
-    samples = raw_bins(32)
-    samples[3, 2, 60] = samples[4, 2, 80] = NAN
-    samples[5, 0, 60] = samples[5, 3, 90] = INF
-    samples[9] = NAN
-    samples[10, 2, 70] = -INF
-    samples[12:16, 3] = 0.25  # dead
-    samples[14:20, 1] = 1.0 + 1e-4 * (samples[14:20, 1] - 1.0)  # moves too little, by floors alone
-    samples[18:22] *= 1e-4
-    samples[22:25] *= 1e4
-    return samples
-
-
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("min_alive", [None, 1, 3, 4], ids="min_alive {}".format)
-@pytest.mark.parametrize("lost", [None, [2], [0, 3], [0, 1, 2, 3]], ids=str)
-def test_scores_without_channels_are_those_of_torch(precision, min_alive, lost):
-    detector = with_imputation()
-    spread = float(detector.predict_raw(raw_bins(24)).score.std())
-    if min_alive is not None:
-        with_floors(detector, min_alive)
-    mask = None if lost is None else torch.zeros(4).bool().index_fill(0, torch.tensor(lost), True)
-    got = assert_scores(detector, precision, broken_bins(), mask, spread)
-    if lost is not None and len(lost) == 4:
-        assert not got["valid"].any()
-        assert np.isnan(got["score"]).all()
-    elif lost is None and min_alive is not None:
-        assert not got["channels_lost"][22:25].any()
-        assert not got["in_range"][22:25].any()
-        assert got["channels_lost"][18:22].all()
 
 
 # The file --------------------------------------------------------------------------------------
@@ -442,45 +357,13 @@ def test_any_cut_gives_what_the_detector_gives(
     precision=st.sampled_from(list(STREAM_CLOSE)),
     losses=st.lists(LOSSES, max_size=4),
 )
-@settings(max_examples=20)
+@settings(max_examples=10)
 def test_fast_evidence_in_any_cut_is_that_of_the_detector(
     num_samples, cuts, kind, rule, hop, floors, precision, losses
 ):
     samples = with_losses(signal(4000, 6), losses)
     options = {"kind": kind, "rule": rule, "hop": hop, "onset": ONSET, "floors": floors}
     assert_same_stream(samples[:, :num_samples], cuts, precision, **options)
-
-
-@pytest.mark.parametrize("num_lost", [30, 200])
-@pytest.mark.parametrize("kinds", ["F", "FF", "GF", "GGF"])
-def test_onset_scores_of_any_hand_with_channels_missing(kinds, num_lost):
-    hand = some_hand(kinds)
-    names = [{"G": 0, "F": 2}[kind] + i % 2 for i, kind in enumerate(kinds)]
-    samples = signal(4000, 6)[names]
-    samples[-1, 3500:] = samples[-1, 3500]  # stuck
-    classifier = onset_of(samples[:, :2400], hand)
-    samples[:, 2500 : 2500 + num_lost] = NAN
-    for masked in ([False] * len(hand), [False, *[True] * (len(hand) - 1)]):
-        graph = Graph()
-        x, memory = graph.input("x", F64, ("n", len(hand))), graph.input("memory", F64, ("m",))
-        places = graph.input("places", I64, ("k",))
-        known = onset_memory(memory, 0, classifier.evidence)
-        most = most_lost(classifier.evidence.context + 10, 100, 10)
-        score, after = onset_scores(x, places, known, classifier, most)
-        for name, value in zip("sm", (score, graph.concat(*after, axis=0)), strict=True):
-            graph.output(name, value, ("j",))
-        run, evidence = runner(session_of(graph.model())), classifier.evidence
-        memory = np.empty(0)
-        before = np.full((evidence.context, len(hand)), np.nan)
-        held, found = np.concatenate([before, samples.T.numpy()]), []
-        held[:, masked] = np.nan
-        for start, stop in pairwise([0, 1, 2, 100, 350, 398, 400]):
-            piece = held[10 * start : 10 * stop + evidence.context]
-            made = run({"x": piece, "places": np.arange(stop - start), "memory": memory})
-            found.append(made["s"])
-            memory = made["m"]
-        expected = OnsetStream(classifier, 100).push(samples, torch.tensor(masked))
-        np.testing.assert_allclose(np.concatenate(found), expected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("onset", [None, ONSET])

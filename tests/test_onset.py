@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from engine_bins import some_hand
 from hypothesis import given
 from hypothesis import strategies as st
 from oracles import plausible_bins, wavelet_branches
 from small_detector import HAND, raw_bins
 from small_set import SmallSet, SmallTimeline
+from streams import hand_of
 
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.features.pool import FeaturePool
@@ -40,7 +40,7 @@ SCALES = {"fast_compression": FAST_SCALE, "slow_compression": SLOW_SCALE}
 
 
 def evidence_of(kinds="GFFGFG", rate=RATE, hop=10, **changes):
-    return OnsetEvidence(some_hand(kinds), rate, hop, **(SCALES | changes))
+    return OnsetEvidence(hand_of(kinds), rate, hop, **(SCALES | changes))
 
 
 def samples_of(evidence, seconds=1.5, seed=0):
@@ -311,7 +311,7 @@ BAD_SETTINGS = [
     (lambda: evidence_of("GG"), "needs fast channels, and this hand has none; take onset=deb"),
     (lambda: evidence_of(hop=0), "a hop of 0 samples at 2000 Hz is no hop of at most 5 ms"),
     (lambda: evidence_of(fast_compression=(1.0,) * 3), "expected 10 positive and finite scales"),
-    (lambda: kept(dict, some_hand("F")), "expected 12 columns of evidence, got 72"),
+    (lambda: kept(dict, hand_of("F")), "expected 12 columns of evidence, got 72"),
     (lambda: kept(lambda plain: plain.pop("mains_hz")), "of this version: 'mains_hz'"),
 ]
 

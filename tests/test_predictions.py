@@ -6,7 +6,6 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from extremes import EXTREMES, extreme_bins
 from small_detector import HAND, raw_bins, small_detector
 from test_detector import noise, random_detector
 
@@ -105,26 +104,6 @@ def test_a_broken_sample_is_refused_by_its_place_on_request(detector):
         detector.predict_raw(noise(1), nonfinite="drop")
 
 
-@pytest.mark.parametrize("kind", EXTREMES)
-def test_every_extreme_gives_a_finite_score_or_a_flag(kind, detector):
-    samples = extreme_bins(kind, (16, 24, 150), torch.Generator().manual_seed(3), torch.float32)
-    found = detector.predict_raw(samples)
-    assert torch.equal(found.score.isfinite(), found.is_valid)
-    of_used = found.channels_lost[:, detector.needed_index]
-    if kind in ("constant", "zero"):
-        assert of_used.all()
-        assert not found.is_valid.any()
-    if kind == "tone without gain":  # of a channel's own frame, or of another's
-        assert of_used.any(-1).all()
-    if kind in ("plain", "integers", "rails", "alternating"):
-        assert found.is_valid.float().mean() > 0.9
-    single = copy.deepcopy(detector).float()  # as in float64 but for the head
-    is_known = found.is_valid & ~found.channels_lost.any(-1)
-    z = scaled_of(detector, samples[is_known].double())
-    expected = single.head(z.float())
-    torch.testing.assert_close(single.score_raw(samples[is_known]), expected, rtol=1e-4, atol=1e-4)
-
-
 def test_a_head_that_overflows_is_not_valid():
     detector = random_detector()
     detector.head.quadratic *= 1e40
@@ -179,15 +158,6 @@ def test_a_masked_channel_takes_its_imputation_values_whatever_it_says(num, smal
     alone = small.predict(bins[0], masked_channels=[name])  # without batch axes
     assert alone.score.shape == ()
     torch.testing.assert_close(alone.score, found.score[0], rtol=1e-12, atol=1e-12)
-
-
-def test_the_file_holds_what_stands_in_for_a_channel(tmp_path):
-    made = with_imputation()
-    made.save(tmp_path / "detector.pt")
-    again, samples = SlipDetector.load(tmp_path / "detector.pt"), raw_bins(9)
-    expected = made.predict_raw(samples, masked_channels=["PVDF1"])
-    found = again.predict_raw(samples, masked_channels=["PVDF1"])
-    torch.testing.assert_close(found, expected, rtol=0, atol=0, equal_nan=True)
 
 
 NO_CHANNELS = [

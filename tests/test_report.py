@@ -153,30 +153,6 @@ def test_reliability_has_a_row_for_each_role():
     assert [row[0] for row in rows[2:]] == ["unseen", "iron"]
 
 
-def test_events_have_a_row_for_each_role_and_rule():
-    numbers = events_of()
-    of_role = {"first_transition": numbers, "two_of_three": numbers}
-    text = results.events_table(metrics_of(events={"test": of_role, "unseen": of_role}))
-    first, _, *found = rows_of(text)
-    assert first[0].startswith("SIMULATED")
-    rate = numbers["false_alarms_per_minute"]
-    cells = [
-        str(numbers["num_onsets"]),
-        *(f"{100 * numbers[name]['value']:.1f}" for name in ("found", "early", "missed")),
-        *(f"{numbers['delay_ms'][name]['value']:.1f}" for name in ("median", "p95")),
-        "-",  # the first release is not known
-        f"{numbers['slid_mm']['median']['value']:.1f}",
-        f"{rate['value']:.1f} /min [{rate['low']:.1f}, {rate['high']:.1f}]",
-        f"{60 * numbers['quiet_hours']:.1f} min",
-        f"{numbers['alarms_per_slip']['value']:.2f}",
-    ]
-    assert found == [
-        [*head, rule, *cells]
-        for role in ("test", "unseen")
-        for head, rule in (([role], "first transition"), ([], "two of three"))
-    ]
-
-
 def test_events_say_what_their_delay_is_made_of_and_why_there_are_none():
     timed = {"test": {"rule": events_of(), "cusum at 1/h": events_of(compute_s=0.0021)}}
     *_, untimed, parts = rows_of(results.events_table(metrics_of(events=timed)))
@@ -358,13 +334,6 @@ def test_an_onset_classifier_has_a_panel_with_its_threshold(draw):
     assert (np.nanmax(values), list(threshold.get_ydata())) == (2.0, [1.5, 1.5])
 
 
-@pytest.mark.parametrize("level", [np.nan, 0.0, 3e38])
-@pytest.mark.parametrize("num_decisions", [0, 1])
-def test_dead_films_and_few_decisions_are_drawn_without_a_warning(draw, level, num_decisions):
-    films = np.stack([np.full(200, level), np.zeros(200)])
-    draw(traces_of(films, (0.0, 0.1), num_decisions), alarms=[])
-
-
 # Tables ----------------------------------------------------------------------------------------
 
 
@@ -430,7 +399,6 @@ def test_runs_stand_beside_each_other_with_mean_and_deviation(tmp_path):
 
 HAND = HandLayout.paper24()
 CHANNELS = HAND.to_rows()
-GAUGES, FILMS = HAND.names[:14], HAND.names[14:]
 
 
 def recording_of(seed=0):
@@ -441,38 +409,6 @@ def recording_of(seed=0):
     slides, handled = ((2.0, 4.0), (5.0, 6.5)), ((6.75, 7.5),)
     samples, speeds = torch.from_numpy(volts), [20.0, 40.0]
     return Recording(samples, 2000.0, "M1", speeds, (2.0, 5.0), slides, non_slip_s=handled)
-
-
-def lines_of(axes):
-    """Lines of channels: those with a channel's name."""
-    return {line.get_label(): line for line in axes.lines if line.get_label() in HAND.names}
-
-
-def test_gauges_stand_left_films_right_one_recording_a_row_with_every_extreme(drawn, tmp_path):
-    recording, path = recording_of(), tmp_path / "a.png"
-    rows = [("M1", recording), ("M6", recording_of(seed=1))]
-    signals_figure(rows, CHANNELS, path, title="SIMULATED")
-    assert_png(path)
-    (figure,) = drawn
-    panels = np.array(figure.axes).reshape(2, 3)
-    for (measured, gauges, films), name in zip(panels, ("M1", "M6"), strict=True):
-        assert measured.get_ylabel() == f"{name}\nvolts"
-        assert tuple(lines_of(measured)) == tuple(lines_of(gauges)) == GAUGES
-        assert tuple(lines_of(films)) == FILMS
-        assert [label.get_text() for label in films.get_yticklabels()] == list(FILMS)
-        assert (np.diff(films.get_yticks()) == -1).all()  # the first lane on top
-    assert figure.get_suptitle() == "SIMULATED"
-    scales = {}
-    for own, name in zip(recording.samples.numpy(), HAND.names, strict=True):
-        if name in GAUGES:
-            line = lines_of(panels[0, 0])[name]
-            assert np.isin(line.get_ydata(), own).all()
-        panel = panels[0, 1 if name in GAUGES else 2]
-        lane = lines_of(panel)[name].get_ydata()
-        scale = np.ptp(own) / np.ptp(lane)  # the burst is there, all lanes on one scale
-        assert scale == pytest.approx(scales.setdefault(panel, scale), rel=1e-9)
-        assert panel.get_title(loc="right") == f"lanes {scale:.2g} V apart"
-        assert len(lane) < len(own) / 5
 
 
 @pytest.mark.parametrize(

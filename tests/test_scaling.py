@@ -6,8 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactslip_torch.features.ops import signed_log
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.runtime import signed_log
 
 
 def fit(rows, **options):

@@ -16,8 +16,6 @@ from tactslip_torch.features.selection import (
     t_scores,
 )
 
-VARIANCES = ["pooled", "welch"]
-
 
 def draw(rng, num_bins=80, num_features=12, share=0.3):
     labels = (rng.uniform(size=num_bins) < share).astype(int)
@@ -39,18 +37,18 @@ def double(features):
 
 
 def assert_same(actual, expected):
-    """To rounding, in units of the largest value of each feature."""
+    """To rounding: deviations are known no better than the means that they are taken from."""
     assert torch.equal(actual.count, expected.count)
     torch.testing.assert_close(actual.mean, expected.mean, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(actual.sum_sq_dev, expected.sum_sq_dev, rtol=1e-9, atol=1e-12)
+    close = {"rtol": 1e-9, "atol": 1e-12 + 1e-14 * float(expected.mean.abs().max())}
+    torch.testing.assert_close(actual.sum_sq_dev, expected.sum_sq_dev, **close)
 
 
-@pytest.mark.parametrize("variance", VARIANCES)
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.8])
-def test_scores_equal_scipy(variance, share, rng):
+def test_scores_equal_scipy(share, rng):
     features, labels = draw(rng, share=share)
-    actual = t_scores(moments_of(features, labels), variance)
-    expected = oracles.t_scores(double(features), labels, variance)
+    actual = t_scores(moments_of(features, labels))
+    expected = oracles.t_scores(double(features), labels)
     np.testing.assert_allclose(actual, expected, rtol=1e-10)
 
 
@@ -77,13 +75,12 @@ def test_merged_parts_equal_the_whole_in_any_split_and_order(cuts, order, seed, 
         assert_same(grown, moments_of(features[:b], labels[:b]))  # also between updates
 
 
-@pytest.mark.parametrize("variance", VARIANCES)
-def test_a_feature_that_never_moves(variance):
+def test_a_feature_that_never_moves():
     labels = torch.tensor([0, 0, 0, 1, 1])
     features = torch.zeros(5, 3)
     features[:, 1] = 7.0
     features[3:, 2] = 1.0
-    assert t_scores(moments_of(features, labels), variance).tolist() == [0, 0, math.inf]
+    assert t_scores(moments_of(features, labels)).tolist() == [0, 0, math.inf]
 
 
 some_scores = st.sampled_from([0.0, 1.0, 2.5, math.inf, math.nan]) | st.floats(0, 9)
@@ -118,7 +115,6 @@ BROKEN = torch.zeros(5, 3).index_put((torch.tensor(4), torch.tensor(2)), torch.t
 REFUSED = [
     (t_scores, [labelled(1, 1, 1)], "no non-slip bin"),
     (t_scores, [labelled(0, 0, 0)], "no slip bin"),
-    (t_scores, [labelled(0, 1), "student"], "'pooled' or 'welch', got 'student'"),
     (updated, [torch.zeros(5, 4)], r"\[N, 3\] and .*\(5, 4\) and \(5,\)"),
     (updated, [BINS, 4], r"\[N, 3\] and .*\(5, 3\) and \(4,\)"),
     (updated, [BINS, (5, 1)], r"\(5, 3\) and \(5, 1\)"),

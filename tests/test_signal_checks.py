@@ -42,6 +42,7 @@ def shuffled(samples):
     return samples[:, np.random.default_rng(0).permutation(samples.shape[1])]
 
 
+@pytest.mark.slow
 def test_checks_hold_on_recordings_and_fail_on_shuffled_ones(recordings):
     for of, holds in ((recordings, True), (changed(recordings, shuffled), False)):
         results = {check["name"]: check for check in check_signals(of)}
@@ -54,6 +55,7 @@ def test_checks_hold_on_recordings_and_fail_on_shuffled_ones(recordings):
     assert results["d1"]["values"].keys() == recordings.keys()
 
 
+@pytest.mark.slow
 def test_checks_of_materials_that_are_not_there_are_left_out(recordings):
     names = {check["name"] for check in check_signals({"M1": recordings["M1"]})}
     gone = {"pvdf_abrupt", "pvdf_abrupt_contrast", "barely"}

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from streams import detector_of, onset_of
+from streams import onset_of
 
 from tactslip_torch import (
     SlipClassifier,
@@ -317,18 +317,3 @@ def test_min_alive_can_be_set(detector, volts):
     assert not own.predict_raw(raw).is_valid.any()
     with pytest.raises(ValueError, match="min_alive is 11, of 10 channels that count"):
         own.sensing = replace(own.sensing, min_alive=11)
-
-
-def test_unpooled_columns_of_lost_channels_take_their_training_means():
-    own = detector_of()
-    bins = torch.randn(7, 4, 100, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    own.imputation.copy_(torch.linspace(-1, 1, len(own.imputation)))
-    lost = bins.clone()
-    lost[:, 2] = 3.0  # silent
-    other = bins.clone()
-    other[:, 2] = torch.nan
-    found, missing = own.predict(lost), own.predict(other)
-    torch.testing.assert_close(found.score, missing.score)
-    assert found.channels_lost[:, 2].all()
-    z = own.scaled(own.extractor(bins), found.channels_lost)
-    torch.testing.assert_close(found.score, own.head(z))

@@ -170,17 +170,6 @@ def test_fast_evidence_in_any_cut_is_that_of_the_whole_recording(bad, dtype):
         assert torch.equal(found.by_onset, expected.by_onset)
 
 
-@pytest.mark.parametrize("masked", [["PVDF1"], ["PVDF1", "PVDF2"]])
-def test_fast_evidence_leaves_out_channels_that_are_masked(masked):
-    samples = signal(6000, 6)
-    stream = stream_of(settings=WITH_ONSET, masked_channels=masked)
-    is_masked = torch.tensor([name in masked for name in DETECTOR.pool.hand.names])
-    expected = offline(DETECTOR, WITH_ONSET, samples, is_masked).onset_score
-    found = in_pieces(stream, samples, range(0, 6000, 130)).onset_score
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
-    assert bool((found > -1e30).any()) == (len(masked) < 2)
-
-
 # Times ------------------------------------------------------------------------------------------
 
 

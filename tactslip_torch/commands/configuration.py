@@ -23,6 +23,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from tactslip_torch.commands.own_folder import HAND_FILE, OF_HAND, with_folder
 from tactslip_torch.commands.packaged import packaged_folder
 
 _COMMENTED = re.compile(r"( *)(?:- )?([\w@/]+):(?: +([^#\s].*?))?(?: +# (.*))?$")
@@ -36,7 +37,7 @@ every command also takes:
   TACTSLIP_TRACEBACK=1            environment variable: errors show where they were raised"""
 
 
-class Mistake(ValueError):
+class _Mistake(ValueError):
     """A command line that cannot be carried out; its text is one line for the user."""
 
 
@@ -46,12 +47,14 @@ class CommandLine(NamedTuple):
     Attributes:
         command: the first word.
         arguments: for ``hydra.main``: overrides, then options.
+        typed: the arguments as they were given.
         options: of the command line, such as ``multirun``.
         config: composed, with Hydra's own section; of several values each key has the first.
     """
 
     command: str
     arguments: list[str]
+    typed: list[str]
     options: Namespace
     config: DictConfig
 
@@ -242,15 +245,17 @@ def _row(name: str, text: str) -> list[str]:
 
 class _Parser(ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        raise Mistake(message)
+        raise _Mistake(message)
 
 
 def checked(command: str, arguments: Sequence[str]) -> CommandLine:
     """A command line, read and composed.
 
     Raises:
-        Mistake: if it cannot be composed.
+        ValueError: if it cannot be composed.
     """
+    typed = list(arguments)
+    arguments = with_folder(command, arguments)
     if "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("RANK", "0") != "0":
         nowhere = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
         arguments = [*nowhere, *arguments]
@@ -265,9 +270,9 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
         key, _, value = unknown[0].lstrip("-").partition("=")
         near = _nearest(command, key.replace("-", "_")) or "KEY"
         hint = f"write {near}={value or 'VALUE'}, without dashes"
-        raise Mistake(f"{command} has no option {unknown[0]}; {hint}")
+        raise _Mistake(f"{command} has no option {unknown[0]}; {hint}")
     if options.config_dir is not None and not Path(options.config_dir).is_dir():
-        raise Mistake(f"--config-dir {options.config_dir}: there is no such folder")
+        raise _Mistake(f"--config-dir {options.config_dir}: there is no such folder")
     rest = list(arguments)
     for override in options.overrides:
         rest.remove(override)
@@ -275,8 +280,12 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
     known = {key.name.partition(".")[0] for key in keys_of(command, config) if key.description}
     for name in config:
         if str(name) not in known.union(_groups(config.hydra), presets(), ("hydra",)):
-            raise Mistake(_no_key(command, str(name), config))
-    return CommandLine(command, [*overrides, *rest], options, config)
+            raise _Mistake(_no_key(command, str(name), config))
+    if list(arguments) != typed:  # of a hand.yaml
+        for own in keys_of(command, config):
+            if not own.description and own.name.partition(".")[0] in OF_HAND:
+                raise _Mistake(f"{HAND_FILE}: {_no_key(command, own.name, config)}")
+    return CommandLine(command, [*overrides, *rest], typed, options, config)
 
 
 def _composed(command: str, options: Namespace) -> tuple[list[str], DictConfig]:
@@ -299,7 +308,7 @@ def _composed(command: str, options: Namespace) -> tuple[list[str], DictConfig]:
                 known = options_of(key.lstrip("+"))
                 for option in others if known and not options.config_dir else ():
                     if option not in known:
-                        raise Mistake(_unknown(key.lstrip("+"), option, known)) from error
+                        raise _Mistake(_unknown(key.lstrip("+"), option, known)) from error
                 continue
             word = error.override if isinstance(error, OverrideParseException) else ""
             key, found, value = word.partition("=")
@@ -310,7 +319,7 @@ def _composed(command: str, options: Namespace) -> tuple[list[str], DictConfig]:
                 for words in (overrides, tried):
                     words[words.index(word)] = quoted
                 continue
-            raise Mistake(_translated(command, tried, error)) from error
+            raise _Mistake(_translated(command, tried, error)) from error
 
 
 def _translated(command: str, overrides: Sequence[str], error: Exception) -> str:
@@ -404,7 +413,7 @@ def check_folder(line: CommandLine) -> None:
     """Refuse a results folder that cannot be made; Hydra alone would show a trace.
 
     Raises:
-        Mistake: that says why.
+        ValueError: that says why.
     """
     of = "sweep" if line.options.multirun else "run"
     where: Any = OmegaConf.to_container(line.config.hydra[of])
@@ -417,4 +426,4 @@ def check_folder(line: CommandLine) -> None:
                 pass
     except OSError as error:
         why = f"cannot write to hydra.{of}.dir={folder}: {error.strerror} at {nearest}"
-        raise Mistake(why) from error
+        raise _Mistake(why) from error

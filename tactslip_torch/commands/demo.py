@@ -55,7 +55,7 @@ def demo(folder: Path) -> None:
         f"page          needs Node 18 or later and, once, the internet:\n"
         f"              cd {page} && npm ci && node serve.mjs\n"
         f"              then open the address it prints: the recording plays\n"
-        f'live          needs pip install "tactslip-torch[live]":\n'
+        f"live          needs pip install websockets:\n"
         f"              tactslip stream model={model} source={place} serve=true repeat=true"
     )
 

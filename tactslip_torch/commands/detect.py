@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
@@ -62,6 +63,7 @@ _LOG = logging.getLogger(__name__)
 
 FORMAT = "tactslip_torch onsets 1"
 _PIECE_S = 1.0
+_TRAINED = "trained"  # of a setting: as in the detector's training
 _RULES = EventRules()
 
 
@@ -105,7 +107,7 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
             f"mcap must be true or false, got {config.mcap!r}; files are called as their recordings"
         )
     detector = SlipDetector.load(config.model, backend=config.backend)
-    reading = Reading.of(plain_section(config.reading))
+    reading = reading_of(config, detector)
     context = _DetectionContext(detector, settings_of(config, detector), reading, config, folder)
     paths = recording_files(Path(str(config.input)))
     save_config(config, folder)
@@ -262,6 +264,24 @@ def plain_section(section: Any) -> Any:
     """A section of a configuration in plain Python types; what is none is given back."""
     is_section = OmegaConf.is_config(section)
     return OmegaConf.to_container(section, resolve=True) if is_section else section
+
+
+def reading_of(config: DictConfig, detector: SlipDetector) -> Reading:
+    """How files are read: as in the detector's training, but for what is given.
+
+    Raises:
+        ValueError: for a key or value that is none.
+    """
+    given = plain_section(config.reading)
+    if isinstance(given, dict):
+        given = {key: value for key, value in given.items() if value != _TRAINED}
+    trained = detector.info.get("reading") or {}
+    known = asdict(Reading.of(trained))
+    for key, value in (given or {}).items():
+        if trained and value != known.get(key):
+            note = f"note: reading.{key}={value}; in training it was {known.get(key)}"
+            print(note, file=sys.stderr)
+    return Reading.of(trained | given if isinstance(given, dict) else given)
 
 
 def settings_of(config: DictConfig, detector: SlipDetector) -> AlarmSettings:

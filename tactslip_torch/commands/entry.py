@@ -65,7 +65,7 @@ def entry_point(
                     try:
                         found = run(config, folder)
                     except Stopped as stop:
-                        again = shlex.join(["tactslip", command, *line.arguments])
+                        again = shlex.join(["tactslip", command, *line.typed])
                         raise stop.saying(saved(config, folder, again)) from None
                 if HydraConfig.get().mode == RunMode.MULTIRUN and _are_scores(found):
                     of_simulation = "simulation" in str(OmegaConf.select(config, "data._target_"))

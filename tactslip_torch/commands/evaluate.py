@@ -1,4 +1,4 @@
-"""Evaluate a saved detector: ``python -m tactslip_torch evaluate model=detector.pt split=unseen4``.
+"""Evaluate a saved detector: ``tactslip evaluate FOLDER model=detector.pt``.
 
 Prints the tables and writes the figures that ``train`` does, for any set, labels and split. Says so
 where recordings the detector was trained on are among those it is evaluated on. Recordings that

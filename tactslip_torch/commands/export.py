@@ -11,11 +11,15 @@ from tactslip_torch.deploy.export import export_detector, summary, wanted_graphs
 from tactslip_torch.model.detector import SlipDetector
 
 
-def export(config: DictConfig, _: Path) -> None:
-    """Write the graphs of ``config.model``, each with its sidecar, and print a line on each."""
+def export(config: DictConfig, results: Path) -> None:
+    """Write the graphs of ``config.model``, each with its sidecar, and print a line on each.
+
+    They go where ``output`` or ``hydra.run.dir`` says, else beside the detector.
+    """
     source = Path(config.model)
     detector = SlipDetector.load(source)
-    folder = Path(config.output or source.parent)
+    is_here = results.resolve() == Path.cwd().resolve()
+    folder = Path(config.output or (source.parent if is_here else results))
     if folder.suffix == ".onnx" or folder.is_file():
         raise ValueError(f"output must be a folder, got {folder}; the files have their names")
     graphs = wanted_graphs(config.graph, detector)

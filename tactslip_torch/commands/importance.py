@@ -2,6 +2,7 @@
 
 The detector stays as it is; what is masked counts as missing. It is evaluated on bins of its test
 and held-out recordings, as many of each recording and class; a decision that is not valid is wrong.
+Where a mask leaves no decision valid, nothing is said of it.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def importance(config: DictConfig, folder: Path) -> dict[str, Any]:
 
     Returns:
         The content of ``sensors.json``: ``rows`` with ``unit``, ``name``, and the balanced accuracy
-        by role.
+        by role, null where no decision is valid.
 
     Raises:
         ValueError: for bad input, in one line.
@@ -60,9 +61,9 @@ def importance(config: DictConfig, folder: Path) -> dict[str, Any]:
     masks = _masks(source.hand)
 
     def evaluated(recording: RecordingId) -> Tensor:
-        """Confusions by role and mask, ``[R, M, 2, 2]``."""
+        """Confusions by role, mask and whether decisions were valid, ``[R, M, 2, 2, 2]``."""
         bins, laid = maker.filtered_bins(recording)
-        counts = torch.zeros(len(_ROLES), len(masks), 2, 2, dtype=torch.long)
+        counts = torch.zeros(len(_ROLES), len(masks), 2, 2, 2, dtype=torch.long)
         roles = fold.bin_roles(recording, len(bins))
         for place, role in enumerate(_ROLES):
             of_class = [(roles[role] & (laid.is_slip == value)).nonzero()[:, 0] for value in (0, 1)]
@@ -71,17 +72,19 @@ def importance(config: DictConfig, folder: Path) -> dict[str, Any]:
                 decided = detector.predict(bins[some], masked_channels=channels or None)
                 is_slip = laid.is_slip[some]
                 says_slip = torch.where(decided.is_valid, decided.score >= 0, ~is_slip)
-                counts[place, number] = torch.tensor(confusion_matrix(is_slip, says_slip))
+                for valid, mine in enumerate((~decided.is_valid, decided.is_valid)):
+                    table = confusion_matrix(is_slip[mine], says_slip[mine])
+                    counts[place, number, valid] = torch.tensor(table)
         return counts
 
     save_config(config, folder)
     recordings = fold.having(*_ROLES)
     parts = in_processes(evaluated, recordings, "recordings", "recording", config.num_workers)
     total = torch.stack(list(parts)).sum(0)
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"unit": unit, "name": name}
         | {
-            role: split_metrics(of.tolist())["balanced_accuracy"]
+            role: split_metrics(of.sum(0).tolist())["balanced_accuracy"] if of[1].any() else None
             for role, of in zip(_ROLES, total[:, number], strict=True)
         }
         for number, (unit, name) in enumerate(masks)
@@ -116,9 +119,11 @@ def _figure(content: Mapping[str, Any], path: Path) -> None:
     figure = style.new_figure(8, 1.5 + 0.2 * len(rows), title, simulated=content["simulated"])
     panels = figure.subplots(1, 2, sharey=True)
     for axes, role, colour in zip(panels, _ROLES, (style.BLUE, style.VERMILION), strict=True):
-        known = whole[role] is not None
-        lost = [100 * (whole[role] - row[role]) if known else 0.0 for row in rows]
-        axes.barh(range(len(rows)), lost, color=colour)
+        for lane, row in enumerate(rows):
+            if whole[role] is None or row[role] is None:
+                axes.text(0.0, lane, " -", va="center")
+            else:
+                axes.barh(lane, 100 * (whole[role] - row[role]), color=colour)
         axes.set_title(f"{role}: {style.percent(whole[role])} % with all")
         axes.set_xlabel("percent points lost")
     style.lanes(panels[0], [f"{row['unit']} {row['name']}" for row in rows])

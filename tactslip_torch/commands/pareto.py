@@ -16,10 +16,11 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import get_method, instantiate
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, save_config
+from tactslip_torch.commands.train import train
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.pareto import (
     Candidate,
@@ -99,7 +100,7 @@ def _trained(
     if size is not None:
         own.recipe.num_features = size
     with redirect_stdout(io.StringIO()):
-        get_method("tactslip_torch.commands.train.train")(own, folder)
+        train(own, folder)
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     rows = metrics.get("validation")
     if not rows:

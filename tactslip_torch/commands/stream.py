@@ -19,10 +19,9 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from tactslip_torch.commands.detect import plain_section, settings_of
+from tactslip_torch.commands.detect import plain_section, reading_of, settings_of
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.commands.packaged import hosts_dir
-from tactslip_torch.data.formats import Reading
 from tactslip_torch.live.frames import Frames
 from tactslip_torch.live.mcap_log import McapLog
 from tactslip_torch.live.pump import watch
@@ -103,7 +102,7 @@ def _source(config: DictConfig, detector: SlipDetector) -> Source:
         detector,
         Frames.of(plain_section(config.frame)),
         baud=config.baud,
-        reading=Reading.of(plain_section(config.reading)),
+        reading=reading_of(config, detector),
         speed=config.speed,
         repeat=config.repeat,
     )

@@ -15,7 +15,7 @@ from typing import Any, get_args
 
 import lightning as L
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.deploy.check import GraphKind
@@ -36,6 +36,12 @@ from tactslip_torch.training.experiment import (
 )
 
 log = logging.getLogger(__name__)
+
+_OF_A_HAND = (
+    *("pattern", "labels", "rename", "channels", "kind", "adapting", "units"),
+    *("skip_s", "slide_s"),
+)
+"""Settings of ``data`` that are the same for all recordings of a hand."""
 
 
 def train(config: DictConfig, folder: Path) -> dict[str, float]:
@@ -68,8 +74,8 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         write_tensorboard(folder, config, metrics)
         print_results(metrics, features)
         print(f"\nresults in {folder}")
-    folds = metrics.get("folds", {"": metrics}).values()
-    exports = [graph for fold in folds for graph in fold["onnx"].values()]
+    folds = metrics.get("folds", {}).values()
+    exports = [graph for fold in (metrics, *folds) for graph in fold.get("onnx", {}).values()]
     if problems := [graph for graph in exports if isinstance(graph, str)]:
         raise ValueError(f"an ONNX file was not written, all other results are: {problems[0]}")
     return {
@@ -95,6 +101,8 @@ def _experiment(config: DictConfig) -> Experiment:
     recipe.allowed(maker.pool)  # refused before any work
     alarm: CalibratedAlarm | DebouncedAlarm | None
     alarm = instantiate(config.onset, _convert_="all") or None
+    if type(config.train_on_all) is not bool:
+        raise ValueError(f"train_on_all must be true or false, got {config.train_on_all!r}")
     if isinstance(alarm, CalibratedAlarm) and len(folds) > 1:
         raise ValueError(
             f"onset=alarms sets the alarm of one detector, this split makes {len(folds)}; take "
@@ -113,11 +121,21 @@ def _experiment(config: DictConfig) -> Experiment:
             "experiment": config.name,
             "seed": config.seed,
             "features_dtype": config.features.dtype,
+            **({} if source.is_simulated else _reading_settings(config)),
         },
         num_workers=config.num_workers,
         with_baselines=config.baselines,
         export=export_fold if config.export else None,
+        train_on_all=config.train_on_all,
     )
+
+
+def _reading_settings(config: DictConfig) -> dict[str, Any]:
+    """How recordings are read and labelled, for a detector's ``info``: it reads others so too."""
+    plain: Any = OmegaConf.to_container(config, resolve=True)
+    data = {key: value for key, value in plain["data"].items() if key in _OF_A_HAND}
+    labels = {key: value for key, value in plain["labels"].items() if not key.startswith("_")}
+    return {"reading": plain["data"].get("reading") or {}, "data": data, "labels": labels}
 
 
 def _set_alarm(

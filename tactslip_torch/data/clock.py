@@ -35,7 +35,7 @@ _FIT_ERR = 2e-6
 _SAID_ERR = 1e-5
 
 
-class Gap(NamedTuple):
+class _Gap(NamedTuple):
     """Samples that are missing.
 
     Args:
@@ -62,12 +62,12 @@ class Clock(NamedTuple):
 
     sample_rate_hz: float
     num_samples: int
-    gaps: tuple[Gap, ...] = ()
+    gaps: tuple[_Gap, ...] = ()
     jitter_s: float = 0.0
 
     def times(self, per_row: int) -> Clock:
         """The clock of samples of which each of these stands for so many, one after the other."""
-        gaps = tuple(Gap(*(number * per_row for number in gap)) for gap in self.gaps)
+        gaps = tuple(_Gap(*(number * per_row for number in gap)) for gap in self.gaps)
         rate_hz = self.sample_rate_hz * per_row
         return Clock(rate_hz, self.num_samples * per_row, gaps, self.jitter_s)
 
@@ -125,7 +125,7 @@ def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "tim
 
 def _gaps_in(
     late: _Numbers, step_s: float, unit: float, name: str
-) -> tuple[tuple[Gap, ...], float]:
+) -> tuple[tuple[_Gap, ...], float]:
     """Where samples are missing, and by how many steps one came late that was made up for.
 
     Where lateness changes and stays so, samples are missing: as many as its mean behind that place
@@ -153,7 +153,7 @@ def _gaps_in(
     beat = 1 / slip if slip > 2 / _MOST_FOR_STEP else 0.0  # samples until rounding repeats
     reach = max(_WINDOW, round(2 * beat))
     is_change = np.abs(np.diff(calm, prepend=calm[0])) > 0.5 + spread + unit
-    gaps: list[Gap] = []
+    gaps: list[_Gap] = []
     total = 0
     level = calm.copy()  # missing samples taken off
     for place, until in pairwise([*is_change.nonzero()[0].tolist(), len(late)]):
@@ -166,7 +166,7 @@ def _gaps_in(
                 f"{1 / step_s:.6g} Hz; remove what is there twice, or {_hint()}"
             )
         if missing > total:
-            gaps.append(Gap(place + total, missing - total, place))
+            gaps.append(_Gap(place + total, missing - total, place))
             total = missing
         level[place:until] -= total
     return tuple(gaps), float(np.abs(late - calm).max())

@@ -54,8 +54,6 @@ from tactslip_torch.signals.resampling import resample
 
 log = logging.getLogger(__name__)
 
-_NOWHERE = "unknown"
-"""The finger and segment of a channel that nobody stated."""
 _RATES_HZ = 1.0, 1e6
 """Sample rates that are believed; beyond, times are in another unit than they are taken for."""
 _RATE_ERROR = 0.01
@@ -251,7 +249,7 @@ def _hand_of(opened: Opened, given: _Given) -> tuple[HandLayout, Sequence[int]]:
             return opened.archived.hand, range(num)
         adapting = given.adapting or KNOWN_KINDS.get(given.kind, "slow")
         names = own or [f"ch{number + 1}" for number in range(num)]
-        channels = [Channel(name, given.kind, _NOWHERE, _NOWHERE, adapting) for name in names]
+        channels = [Channel(name, given.kind, adapting=adapting) for name in names]
         return HandLayout(tuple(channels)), range(num)
     wanted = given.hand.names
     places = {name: place_of(name, own) for name in wanted}

@@ -11,6 +11,9 @@ from torch import Tensor
 
 from tactslip_torch.hand import HandLayout
 
+PAPER_SCENE = "paper"
+"""The scene of recordings that are the paper's protocol."""
+
 
 @dataclass(frozen=True, order=True)
 class RecordingId:
@@ -30,11 +33,11 @@ class RecordingId:
 
     material: str
     cycle: int
-    scene: str = "paper"
+    scene: str = PAPER_SCENE
     session: str = ""
 
     def __str__(self) -> str:
-        scene = "" if self.scene == "paper" else f"/{self.scene}"
+        scene = "" if self.scene == PAPER_SCENE else f"/{self.scene}"
         session = f"@{self.session}" if self.session else ""
         return f"{self.material}/{self.cycle}{scene}{session}"
 

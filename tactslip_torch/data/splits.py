@@ -9,16 +9,16 @@ from __future__ import annotations
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.runtime import check_share
+from tactslip_torch.data.recording import PAPER_SCENE, RecordingId
+from tactslip_torch.runtime import check_choice, check_number, check_share
 
+GroupBy = Literal["material", "session", "recording"]
 ROLES = ("train", "test", "unseen")
-PAPER_SCENE = RecordingId.scene
-"""The scene of recordings that are the paper's protocol."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +155,64 @@ def leave_one_material_out(
             )
         folds.append(Split(f"without_{left_out}", roles))
     return folds
+
+
+def leave_groups_out(
+    recordings: Sequence[RecordingId], *, by: GroupBy | None = None, folds: int = 10
+) -> list[Split]:
+    """Each group left out once, the others train; of many groups several are left out together.
+
+    Args:
+        recordings: of the set.
+        by: what a group is: a ``"material"`` (an object), a ``"session"``, or a ``"recording"``.
+            ``None``: the material where there are three or more, else the recording.
+        folds: so many at most. Groups are dealt out so that folds have about as many recordings.
+
+    Returns:
+        Folds in which what is left out is ``unseen``; single recordings, of whose group others
+        train, are ``test``.
+
+    Raises:
+        ValueError: if there are not two groups, or ``by`` or ``folds`` cannot be.
+    """
+    check_choice("split.by", by, (*get_args(GroupBy), None))
+    check_number("split.folds", folds, least=2, whole=True)
+    if by is None:
+        by = "material" if len({r.material for r in recordings}) > 2 else "recording"
+    role = "test" if by == "recording" else "unseen"
+    groups: dict[str, list[RecordingId]] = {}
+    for recording in sorted(recordings):
+        name = str(recording) if by == "recording" else str(getattr(recording, by) or 1)
+        groups.setdefault(name, []).append(recording)
+    if len(groups) < 2:
+        raise ValueError(
+            f"split.by={by} leaves groups out and needs two, got {len(groups)} "
+            f"({', '.join(groups)}); give split.by={'session' if by == 'material' else 'material'} "
+            "or split.by=recording, or add recordings of another"
+        )
+    left_out: list[dict[str, list[RecordingId]]] = [{} for _ in range(min(folds, len(groups)))]
+    for name, members in sorted(groups.items(), key=lambda group: -len(group[1])):
+        emptiest = min(left_out, key=lambda fold: sum(map(len, fold.values())))
+        emptiest[name] = members
+    splits = []
+    for number, fold in enumerate(left_out, 1):
+        away = {recording for members in fold.values() for recording in members}
+        roles = {r: role if r in away else "train" for r in sorted(recordings)}
+        is_one = len(fold) == 1 and by != "recording"  # whose names have strokes
+        splits.append(Split(f"without_{next(iter(fold))}" if is_one else f"fold_{number}", roles))
+    return splits
+
+
+def everything(
+    recordings: Sequence[RecordingId], *, role: str = "test", name: str = "all"
+) -> list[Split]:
+    """One fold in which every recording has the same role.
+
+    Raises:
+        ValueError: if there is no such role.
+    """
+    check_choice("split.role", role, ROLES)
+    return [Split(name, dict.fromkeys(sorted(recordings), role))]
 
 
 def confound(

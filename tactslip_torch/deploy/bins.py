@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tactslip_torch.deploy.value import BOOL, F32, F64, Graph, Value
 from tactslip_torch.features.bank import Bank, Frame, Samples
-from tactslip_torch.features.ops import TINY
+from tactslip_torch.features.descriptors import TINY
 from tactslip_torch.features.pooling import over_channels
 from tactslip_torch.features.sensing import (
     FEWEST_SAMPLES,

@@ -153,28 +153,22 @@ class Graph:
         step: Callable[[list[Value], list[Value]], tuple[Sequence[Value], Sequence[Value]]],
         state: Sequence[Value],
         rows: Sequence[Value],
-        shapes: Sequence[Shape] | None = None,
     ) -> tuple[list[Value], list[Value]]:
         """Walk along the first axis of ``rows``: a state goes on, and results are put together.
 
         Args:
             step: of the state and an entry of each row makes the next state and results ``[]``.
             state: before the first entry.
-            rows: ``[k, ...]`` each; onnxruntime refuses k = 0, so leave an empty walk out by
+            rows: ``[k]`` each; onnxruntime refuses k = 0, so leave an empty walk out by
                 ``if_``.
-            shapes: of the parts of the state and of an entry of each row; by default scalars.
 
         Returns:
             The state after the last entry, and results ``[k]``.
         """
-        shapes = [()] * (len(state) + len(rows)) if shapes is None else shapes
         self._bodies.append(_Body())
-        given = [
-            self.input(self._new_name(), value.dtype, shape)
-            for value, shape in zip((*state, *rows), shapes, strict=True)
-        ]
+        given = [self.input(self._new_name(), value.dtype, ()) for value in (*state, *rows)]
         after, results = step(given[: len(state)], given[len(state) :])
-        self._hand_out([*after, *results], [*shapes[: len(state)], *([()] * len(results))])
+        self._hand_out([*after, *results], [()] * (len(after) + len(results)))
         body = self._bodies.pop().proto()
         dtypes = [value.dtype for value in (*after, *results)]
         made = self.ops("Scan", *state, *rows, dtypes=dtypes, body=body, num_scan_inputs=len(rows))

@@ -23,19 +23,16 @@ from tactslip_torch.features.descriptors import (
     SPECTRUM_DESCRIPTORS,
     STEPPED,
     TIME_DESCRIPTORS,
+    TINY,
     Rows,
     band_energy_ratios,
-)
-from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.ops import (
-    TINY,
-    bounded_gradient,
     like,
-    power_of_two_below,
     root,
     taken,
 )
+from tactslip_torch.features.names import FeatureName
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.runtime import ascending, is_traced
 from tactslip_torch.signals.wavelet import (
     SpectrumMethod,
     Wavelet,
@@ -73,7 +70,7 @@ def pool_names(hand: HandLayout, level: int) -> tuple[FeatureName, ...]:
     return tuple(names)
 
 
-class Row(NamedTuple):
+class _Row(NamedTuple):
     """Values that are described together: a slow channel's bin, a fast one's branch or spectrum.
 
     Attributes:
@@ -87,7 +84,7 @@ class Row(NamedTuple):
     branch: int
 
 
-class Wanted(NamedTuple):
+class _Wanted(NamedTuple):
     """A descriptor of a row, and the column it goes to."""
 
     row: int
@@ -95,7 +92,7 @@ class Wanted(NamedTuple):
     place: int
 
 
-class Share(NamedTuple):
+class _Share(NamedTuple):
     """A band energy ratio of a fast channel, and the column it goes to."""
 
     channel: int
@@ -117,9 +114,9 @@ class Plan:
     """
 
     channels: tuple[int, ...]
-    rows: tuple[Row, ...]
-    wanted: tuple[Wanted, ...]
-    shares: tuple[Share, ...]
+    rows: tuple[_Row, ...]
+    wanted: tuple[_Wanted, ...]
+    shares: tuple[_Share, ...]
     num_features: int
 
     @property
@@ -141,7 +138,7 @@ def make_plan(hand: HandLayout, level: int, names: Sequence[FeatureName | str]) 
 
     Example:
         >>> make_plan(HandLayout.paper24(), 4, ["PVDF3 A2 freq kurtosis"]).rows
-        (Row(kind='freq', channel=16, branch=2),)
+        (_Row(kind='freq', channel=16, branch=2),)
     """
     known = {str(name): name for name in pool_names(hand, level)}
     if not names:
@@ -155,11 +152,11 @@ def make_plan(hand: HandLayout, level: int, names: Sequence[FeatureName | str]) 
         )
     branches = {name: index for index, name in enumerate(branch_names(level))} | {"raw": -1}
     channel_of = {name: index for index, name in enumerate(hand.names)}
-    found: list[tuple[Row, str]] = []
+    found: list[tuple[_Row, str]] = []
     for name in (known[str(name)] for name in names):
         branch = branches[name.component]
         kind: RowKind = "slow" if branch < 0 else "time" if name.domain == "time" else "freq"
-        found.append((Row(kind, channel_of[name.channel], branch), name.descriptor))
+        found.append((_Row(kind, channel_of[name.channel], branch), name.descriptor))
     is_share = [descriptor == "band_energy_ratio" for _, descriptor in found]
     rows = sorted(
         {row for (row, _), shared in zip(found, is_share, strict=True) if not shared},
@@ -169,9 +166,9 @@ def make_plan(hand: HandLayout, level: int, names: Sequence[FeatureName | str]) 
     wanted, shares = [], []
     for place, ((row, descriptor), shared) in enumerate(zip(found, is_share, strict=True)):
         if shared:
-            shares.append(Share(row.channel, row.branch, place))
+            shares.append(_Share(row.channel, row.branch, place))
         else:
-            wanted.append(Wanted(place_of[row], descriptor, place))
+            wanted.append(_Wanted(place_of[row], descriptor, place))
     channels = tuple(sorted({row.channel for row, _ in found}))
     return Plan(channels, tuple(rows), tuple(wanted), tuple(shares), len(found))
 
@@ -348,6 +345,33 @@ class Samples(NamedTuple):
     unit: Tensor | None
 
 
+def power_of_two_below(magnitude: Tensor) -> Tensor:
+    """The largest power of two that is no larger, by which to divide rounds nothing; no gradient.
+
+    Of magnitudes below 1e-300, 0 among them, that of 1e-300 (the dtype's smallest normal number).
+    """
+    tiny = max(TINY, torch.finfo(magnitude.dtype).tiny)
+    return magnitude.detach().clamp(min=tiny).log2().floor().exp2()
+
+
+def bounded_gradient(x: Tensor) -> Tensor:
+    """``x``, whose gradient saturates at the largest finite number of the dtype.
+
+    The derivative of a shape is of order 1/span, which for denormals no float can hold. Backward
+    only: derivatives taken forwards become Inf there.
+
+    Shape:
+        - x, output: ``[*]``
+    """
+    if not (x.requires_grad and torch.is_grad_enabled()) or is_traced():
+        return x
+    x = x.view_as(x)
+    largest = torch.finfo(x.dtype).max
+    # autograd hands on None for a gradient that is undefined
+    x.register_hook(lambda g: None if g is None else g.clamp(-largest, largest))
+    return x
+
+
 class Bank:
     """Makes the features of a plan.
 
@@ -369,7 +393,7 @@ class Bank:
         self.dtype = dtype
         self.frames = tuple(frames)
         self._plan = plan
-        wanted: dict[Row, set[str]] = {row: set() for row in plan.rows}
+        wanted: dict[_Row, set[str]] = {row: set() for row in plan.rows}
         for each in plan.wanted:
             wanted[plan.rows[each.row]].add(each.descriptor)
         families = (_Family(maps, wanted, frames, is_fast) for is_fast in (False, True))
@@ -396,7 +420,7 @@ class Bank:
             order[each.place] = column[plan.rows[each.row], each.descriptor]
             channel[each.place] = plan.rows[each.row].channel
         for share in plan.shares:
-            order[share.place] = column[Row("freq", share.channel, share.branch), "ratio"]
+            order[share.place] = column[_Row("freq", share.channel, share.branch), "ratio"]
             channel[share.place] = share.channel
         self._order = _index(order, len(made))
         self._channel = torch.tensor(channel)
@@ -465,7 +489,7 @@ class _Family:
     """
 
     def __init__(
-        self, maps: LinearMaps, wanted: Iterable[Row], frames: Sequence[Frame], is_fast: bool
+        self, maps: LinearMaps, wanted: Iterable[_Row], frames: Sequence[Frame], is_fast: bool
     ) -> None:
         self.num = maps.num_samples
         self.frames = [i for i, frame in enumerate(frames) if frame.is_fast == is_fast]
@@ -546,7 +570,7 @@ class _RowSet:
         self,
         families: Sequence[_Family],
         maps: LinearMaps,
-        wanted: Mapping[Row, set[str]],
+        wanted: Mapping[_Row, set[str]],
         is_freq: bool,
         dtype: torch.dtype,
     ) -> None:
@@ -554,14 +578,14 @@ class _RowSet:
         self._dtype = dtype
         self._maps = maps
         self._pieces: list[tuple[int, slice, Tensor | None, Tensor | None]] = []
-        rows, cells, owners = list[Row](), list[int](), list[int]()
+        rows, cells, owners = list[_Row](), list[int](), list[int]()
         num_cells = num_owners = 0
         self._families: list[int] = []
         for number, family in enumerate(families):
             num_blocks = len(family.blocks)
             for place, branch in enumerate(family.blocks):
                 kind: RowKind = "freq" if is_freq else "slow" if branch < 0 else "time"
-                own = [Row(kind, channel, branch) for channel in family.channels]
+                own = [_Row(kind, channel, branch) for channel in family.channels]
                 chosen = [i for i, row in enumerate(own) if row in wanted]
                 if not chosen:
                     continue
@@ -586,7 +610,7 @@ class _RowSet:
         shared = [name for name in ordered if self._is_sorted and name in SORTED]
         groups = [[name for name in ordered if name not in _OWN_ROWS], shared]
         groups += [[name] for name in ordered if name in _OWN_ROWS and name not in shared]
-        self.made: list[tuple[Row, str]] = []
+        self.made: list[tuple[_Row, str]] = []
         self._groups: list[tuple[list[str], Tensor | None]] = []
         for group in filter(None, groups):
             is_of_all = group[0] not in _OWN_ROWS
@@ -604,6 +628,8 @@ class _RowSet:
         made = []
         for names, index in self._groups:
             own = rows.take(index)
+            if names[0] in SORTED and (self._is_sorted or isinstance(own.values, Tensor)):
+                own = replace(own, in_order=ascending(own.values, own.num))
             if names == ["correlation"]:
                 own = replace(
                     own, filtered=taken(families[-1].filtered(self._dtype), self._correlated, -2)
@@ -644,7 +670,6 @@ class _RowSet:
             scale / length,
             amplitude=amplitude,
             frequency_hz=self._maps.frequency_hz if is_freq else None,
-            is_sorted=self._is_sorted,
         )
 
     def _of_cells(self, tables: Sequence[Tensor]) -> Tensor:
@@ -659,7 +684,7 @@ class _Ratios:
         own = [i for i, channel in enumerate(frame.channels) if channel in plan.share_channels]
         branches = range(len(maps.branches))
         self.made = [
-            (Row("freq", frame.channels[i], branch), "ratio") for i in own for branch in branches
+            (_Row("freq", frame.channels[i], branch), "ratio") for i in own for branch in branches
         ]
         if not own:
             return

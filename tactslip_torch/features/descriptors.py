@@ -21,14 +21,58 @@ from functools import cached_property, lru_cache
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.ops import ascending, counted, like, looked_up, root, taken
-
+TINY = 1e-300
+"""Instead of 0 in a divisor, where a quotient of 0 is to be 0."""
 _ENTROPY_LEVELS = 255
 _RUN_TOLERANCE = 1e-12
 _HALF_SLACK = 1e-6
 _CV_FLOOR = 1e-6
 _CV_ZERO = 1e-12
 _NEXT_TO_NOTHING = 1e-60  # instead of 0 in a divisor; variances of rows are 0 or far above
+
+
+# Operations that torch has not under one name. Each asks once whether it is given a tensor, or a
+# value of a graph (deploy/value.py); both take part in all others that are used below.
+
+
+def root(square: Tensor) -> Tensor:
+    """Square root, whose derivative at 0 is 0."""
+    if not isinstance(square, Tensor):
+        return square.sqrt()
+    is_zero = square.detach() <= 0  # not so for NaN
+    return torch.where(is_zero, 0.0, torch.where(is_zero, 1.0, square).sqrt())
+
+
+def taken(x: Tensor, index: Tensor | None, axis: int) -> Tensor:
+    """Entries at constant places along an axis; ``None`` is all of them."""
+    if index is None:
+        return x
+    if not isinstance(x, Tensor):
+        return x.take(index.tolist(), axis)
+    return x.index_select(axis, index.to(x.device))
+
+
+def _looked_up(table: Tensor, index: Tensor) -> Tensor:
+    """Entries of a constant table ``[n]`` at places that were computed, in the shape of these."""
+    return table.to(index.device)[index] if isinstance(index, Tensor) else index.entries_of(table)
+
+
+def _counted(index: Tensor, num: int) -> Tensor:
+    """How often each of the numbers 0 to ``num - 1`` occurs along the last axis.
+
+    Shape:
+        - index: ``[*, n]``, whole numbers in that range
+        - output: ``[*, num]``
+    """
+    if not isinstance(index, Tensor):
+        return index.counted(num)
+    none = index.new_zeros(*index.shape[:-1], num)
+    return none.scatter_add(-1, index, torch.ones_like(index))
+
+
+def like(constant: Tensor, x: Tensor) -> Tensor:
+    """A constant with the dtype and the device of what it meets; a value of a graph asks itself."""
+    return constant.to(x) if isinstance(x, Tensor) else constant
 
 
 @dataclass
@@ -47,10 +91,10 @@ class Rows:
         filtered: bin less its mean, of order one, with which ``correlation`` correlates.
         amplitude: of spectra, the values with their mean.
         frequency_hz: of the lines of spectra.
-        is_sorted: whether ``ascending`` is asked for, so that ``ranked`` may take it.
+        in_order: the values in ascending order, where a descriptor of sorted values is wanted.
 
     Shape:
-        - values, filtered, amplitude: ``[*, R, n]``; mean, unit, scale: ``[*, R]``;
+        - values, filtered, amplitude, in_order: ``[*, R, n]``; mean, unit, scale: ``[*, R]``;
           frequency_hz: ``[n]``
     """
 
@@ -62,7 +106,7 @@ class Rows:
     filtered: Tensor | None = None
     amplitude: Tensor | None = None
     frequency_hz: Tensor | None = None
-    is_sorted: bool = False
+    in_order: Tensor | None = None
 
     def take(self, index: Tensor | None) -> Rows:
         """Some of the rows, by their places; all of them for ``None``."""
@@ -78,19 +122,21 @@ class Rows:
             amplitude=None if self.amplitude is None else taken(self.amplitude, index, -2),
         )
 
-    @cached_property
+    @property
     def ascending(self) -> Tensor:
         """Values in ascending order, ``[*, R, n]``."""
-        return ascending(self.values, self.num)
+        if self.in_order is None:
+            raise ValueError("mode and iqr need the values in ascending order")
+        return self.in_order
 
     def ranked(self, first: int, count: int) -> Tensor:
         """Values at ``count`` places of the ascending order, from ``first`` on, ``[*, R, count]``.
 
-        A graph selects quicker than it sorts.
+        A graph whose values are not in order selects quicker than it sorts.
         """
-        if self.is_sorted or isinstance(self.values, Tensor):
-            return self.ascending[..., first : first + count]
-        return self.values.ranked(first, count)
+        if self.in_order is not None:
+            return self.in_order[..., first : first + count]
+        return self.values.ranked(first, count)  # type: ignore[attr-defined,no-any-return]
 
     @cached_property
     def squares(self) -> Tensor:
@@ -121,18 +167,18 @@ class Rows:
 # Each function takes rows and gives one number for each, [*, R], float64, in volts or its own unit.
 
 
-def mean(x: Rows) -> Tensor:
+def _mean(x: Rows) -> Tensor:
     """Arithmetic mean."""
     return x.mean * x.unit
 
 
-def median(x: Rows) -> Tensor:
+def _median(x: Rows) -> Tensor:
     """Middle value, or the mean of the two middle values for even ``n``."""
     middle = x.ranked((x.num - 1) // 2, 2 - x.num % 2).mean(-1)
     return (middle.double() + x.mean) * x.unit
 
 
-def mode(x: Rows) -> Tensor:
+def _mode(x: Rows) -> Tensor:
     """Most frequent value, the smallest of ties; the minimum if all are distinct.
 
     Sorted values no further than 1e-12 of ``scale`` from their neighbour form one run (ours),
@@ -142,27 +188,27 @@ def mode(x: Rows) -> Tensor:
     tolerance = _RUN_TOLERANCE * x.scale
     before = torch.cat([x.ascending[..., :1], x.ascending[..., :-1]], dim=-1)
     run = (x.ascending - before > tolerance[..., None]).long().cumsum(-1)
-    longest = counted(run, x.num).argmax(-1, keepdim=True)  # the first of equals
+    longest = _counted(run, x.num).argmax(-1, keepdim=True)  # the first of equals
     start = (run < longest).long().sum(-1, keepdim=True)
     return (x.ascending.gather(-1, start).squeeze(-1).double() + x.mean) * x.unit
 
 
-def range_(x: Rows) -> Tensor:
+def _range(x: Rows) -> Tensor:
     """Largest minus smallest value."""
     return (x.values.amax(-1) - x.values.amin(-1)).double() * x.unit
 
 
-def mean_deviation(x: Rows) -> Tensor:
+def _mean_deviation(x: Rows) -> Tensor:
     """Mean absolute deviation from the mean."""
     return x.values.abs().mean(-1).double() * x.unit
 
 
-def std(x: Rows) -> Tensor:
+def _std(x: Rows) -> Tensor:
     """Standard deviation with ``n - 1`` in the denominator."""
     return x.std * x.unit
 
 
-def cv(x: Rows) -> Tensor:
+def _cv(x: Rows) -> Tensor:
     """Coefficient of variation, ``std / mean``, signed.
 
     The mean's magnitude counts as at least 1e-6 of the rms, and a mean within 1e-12 of the rms, the
@@ -173,7 +219,7 @@ def cv(x: Rows) -> Tensor:
     return x.std / torch.where(is_negative, -floor, floor)
 
 
-def iqr(x: Rows) -> Tensor:
+def _iqr(x: Rows) -> Tensor:
     """Interquartile range, quantiles at Hazen positions ``q n + 1/2``."""
 
     def at(quantile: float) -> Tensor:
@@ -187,25 +233,25 @@ def iqr(x: Rows) -> Tensor:
     return (at(0.75) - at(0.25)).double() * x.unit
 
 
-def skewness(x: Rows) -> Tensor:
+def _skewness(x: Rows) -> Tensor:
     """Third central moment over the 3/2 power of the second; 0 for a constant."""
     third = (x.squares * x.values).mean(-1).double()
     return third / (x.safe_variance * x.safe_variance.sqrt())
 
 
-def kurtosis(x: Rows) -> Tensor:
+def _kurtosis(x: Rows) -> Tensor:
     """Fourth central moment over the squared second, not excess; 3 for a constant."""
     fourth = (x.squares * x.squares).mean(-1).double()
     is_constant = (x.variance <= 0.0).double()
     return fourth / (x.safe_variance * x.safe_variance) + is_constant * 3.0
 
 
-def energy(x: Rows) -> Tensor:
+def _energy(x: Rows) -> Tensor:
     """Sum of squares; Inf beyond the dtype."""
     return (x.mean * x.mean + x.variance) * float(x.num) * x.unit * x.unit
 
 
-def entropy(x: Rows) -> Tensor:
+def _entropy(x: Rows) -> Tensor:
     """Shannon entropy of the amplitude histogram in bits; 0 for a constant.
 
     Values are quantised to 256 levels between their extremes, halves (within 1e-6 of a level)
@@ -220,16 +266,16 @@ def entropy(x: Rows) -> Tensor:
     # the maximum always has the top level, which joins the second highest
     second = torch.where(level < float(_ENTROPY_LEVELS), level, 0.0).amax(-1, keepdim=True)
     cell = torch.where(level < second, level, second)  # of a NaN too one of the numbers
-    bits = looked_up(_entropy_terms(x.num), counted(cell.long(), _ENTROPY_LEVELS)).sum(-1)
+    bits = _looked_up(_entropy_terms(x.num), _counted(cell.long(), _ENTROPY_LEVELS)).sum(-1)
     return bits * (span.squeeze(-1) > 0.0).double()
 
 
-def peak_factor(x: Rows) -> Tensor:
+def _peak_factor(x: Rows) -> Tensor:
     """Signed maximum over the root mean square; 0 for a zero row."""
     return (x.values.amax(-1).double() + x.mean) / x.rms
 
 
-def correlation(x: Rows) -> Tensor:
+def _correlation(x: Rows) -> Tensor:
     """Pearson correlation of a branch with the filtered bin; 0 if either is constant."""
     if x.filtered is None:
         raise ValueError("correlation needs the filtered bin that rows are branches of")
@@ -238,20 +284,20 @@ def correlation(x: Rows) -> Tensor:
     return covariance / (x.safe_variance * other).sqrt()
 
 
-def spectral_centroid(x: Rows) -> Tensor:
+def _spectral_centroid(x: Rows) -> Tensor:
     """Mean frequency with amplitudes as weights, hertz; 0 for a zero spectrum."""
     amplitude, frequency_hz = _spectrum(x)
     total = (x.mean * float(x.num)).clamp(min=_NEXT_TO_NOTHING)
     return (amplitude * frequency_hz).sum(-1).double() / total
 
 
-def spectral_spread(x: Rows) -> Tensor:
+def _spectral_spread(x: Rows) -> Tensor:
     """Root of the weighted mean squared distance from the centroid, hertz.
 
     0, without gradient, for a zero spectrum and for a single line.
     """
     amplitude, frequency_hz = _spectrum(x)
-    distance = spectral_centroid(x).type_as(amplitude)[..., None] - frequency_hz
+    distance = _spectral_centroid(x).type_as(amplitude)[..., None] - frequency_hz
     total = (x.mean * float(x.num)).clamp(min=_NEXT_TO_NOTHING)
     return root((amplitude * distance * distance).sum(-1).double() / total)
 
@@ -279,22 +325,22 @@ def _entropy_terms(num: int) -> Tensor:
 
 
 DESCRIPTORS: dict[str, Callable[[Rows], Tensor]] = {
-    "mean": mean,
-    "median": median,
-    "mode": mode,
-    "range": range_,
-    "mean_deviation": mean_deviation,
-    "std": std,
-    "cv": cv,
-    "iqr": iqr,
-    "skewness": skewness,
-    "kurtosis": kurtosis,
-    "energy": energy,
-    "entropy": entropy,
-    "peak_factor": peak_factor,
-    "correlation": correlation,
-    "spectral_centroid": spectral_centroid,
-    "spectral_spread": spectral_spread,
+    "mean": _mean,
+    "median": _median,
+    "mode": _mode,
+    "range": _range,
+    "mean_deviation": _mean_deviation,
+    "std": _std,
+    "cv": _cv,
+    "iqr": _iqr,
+    "skewness": _skewness,
+    "kurtosis": _kurtosis,
+    "energy": _energy,
+    "entropy": _entropy,
+    "peak_factor": _peak_factor,
+    "correlation": _correlation,
+    "spectral_centroid": _spectral_centroid,
+    "spectral_spread": _spectral_spread,
 }
 """Every descriptor by its name, in the order of ``enum Descriptor`` (``native/engine.h``).
 

@@ -26,21 +26,16 @@ from tactslip_torch.features.bank import (
     Frame,
     LinearMaps,
     Plan,
+    bounded_gradient,
     linear_maps,
     make_plan,
     pool_names,
 )
 from tactslip_torch.features.descriptors import DESCRIPTORS
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.ops import (
-    bounded_gradient,
-    full_precision,
-    is_concrete,
-    saturating,
-)
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.native import BackendName
-from tactslip_torch.runtime import check_choice, for_each
+from tactslip_torch.runtime import check_choice, for_each, full_precision, is_concrete
 from tactslip_torch.signals.filtering import check_samples
 from tactslip_torch.signals.wavelet import (
     SpectrumMethod,
@@ -64,6 +59,14 @@ MOST_LEVELS = 4
 """Wavelet levels of the paper."""
 _FEW_BINS = 4  # so few are done here: another thread would take longer to start
 _CHUNK = {"native": 32, "torch": 16}  # bins of a thread at a time, whose memory fits the cache
+
+
+def saturating(x: Tensor, dtype: torch.dtype) -> Tensor:
+    """``x`` in another dtype; what is beyond its range becomes its largest finite number."""
+    most = torch.finfo(dtype).max
+    if torch.finfo(x.dtype).max <= most:
+        return x.to(dtype)
+    return x.clamp(-most, most).to(dtype)
 
 
 class FeaturePool(nn.Module):

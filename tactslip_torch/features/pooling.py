@@ -20,18 +20,17 @@ import torch
 from torch import Tensor, nn
 
 from tactslip_torch import native
+from tactslip_torch.features.descriptors import like, root
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.ops import (
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.runtime import (
     are_unchanged,
     ascending,
+    for_each,
     is_concrete,
-    like,
-    root,
     signed_log,
     stamps_of,
 )
-from tactslip_torch.hand import HandLayout
-from tactslip_torch.runtime import for_each
 
 STATISTICS = ("mean", "std", "min", "max", "median")
 SORTED = "sorted"

@@ -1,17 +1,20 @@
-"""Which features to keep: a t-test on class moments (paper section IV-D).
+"""Which features to keep: those that match, and the best by a t-test (paper section IV-D).
 
 Moments are gathered in passes over recordings and merge.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-ScoreVariance = Literal["pooled", "welch"]
+from tactslip_torch.features.names import FeatureName
+from tactslip_torch.hand import HandLayout
+
 CLASS_NAMES = ("non-slip", "slip")
+_ATTRIBUTES = ("kind", "finger", "channel", "component", "domain", "descriptor")
 
 
 class ClassMoments:
@@ -88,36 +91,29 @@ class ClassMoments:
         self.count = count
 
 
-def t_scores(moments: ClassMoments, variance: ScoreVariance = "pooled") -> Tensor:
-    """Absolute two-sample t statistic of every feature.
+def t_scores(moments: ClassMoments) -> Tensor:
+    """Absolute two-sample t statistic of every feature, of the pooled variance.
 
     Where both variances are 0 the score is 0 for equal means and +inf otherwise.
 
     Args:
         moments: of the training bins.
-        variance: ``"pooled"`` (MATLAB's ``rankfeatures``) or ``"welch"``; they agree for balanced
-            classes.
 
     Shape:
         - output: ``[F]``, float64
 
     Raises:
-        ValueError: if a class has no bin (named) or the variance is unknown.
+        ValueError: if a class has no bin (named).
 
     Reference:
-        ``scipy.stats.ttest_ind(equal_var=variance == "pooled").statistic``, absolute.
+        ``scipy.stats.ttest_ind(..).statistic``, absolute; MATLAB's ``rankfeatures``.
     """
     for name, count in zip(CLASS_NAMES, moments.count.tolist(), strict=True):
         if count < 1:
             raise ValueError(f"ranking features needs bins of both classes, got no {name} bin")
     count = moments.count[:, None]
-    if variance == "pooled":
-        freedom = (moments.count.sum() - 2).clamp(min=1)
-        square = moments.sum_sq_dev.sum(0) / freedom * (1 / count).sum(0)
-    elif variance == "welch":
-        square = (moments.sum_sq_dev / (count - 1).clamp(min=1) / count).sum(0)
-    else:
-        raise ValueError(f"variance must be 'pooled' or 'welch', got {variance!r}")
+    freedom = (moments.count.sum() - 2).clamp(min=1)
+    square = moments.sum_sq_dev.sum(0) / freedom * (1 / count).sum(0)
     apart = (moments.mean[1] - moments.mean[0]).abs()
     both_still = torch.where(apart == 0, 0.0, torch.inf).to(apart)
     return torch.where(square == 0, both_still + apart, apart / square.sqrt())
@@ -143,3 +139,59 @@ def rank_features(scores: Tensor, num: int) -> Tensor:
         raise ValueError(f"num must lie in 1..{len(scores)}, got {num}")
     comparable = torch.where(scores.isnan(), -1.0, scores).float()
     return comparable.argsort(descending=True, stable=True)[:num]
+
+
+def matching(
+    hand: HandLayout, names: Sequence[FeatureName], wanted: Mapping[str, str | Sequence[str]]
+) -> Tensor:
+    """Which features have, for every attribute that is named, one of its values, ``[F]``, bool.
+
+    Args:
+        hand: gives kind and finger of a channel.
+        names: of the features.
+        wanted: of each attribute a value or several, such as ``{"kind": "SG"}``.
+
+    Raises:
+        ValueError: for an unknown attribute, a value that no feature has, or values that no
+            feature has together.
+    """
+    mask = torch.ones(len(names), dtype=torch.bool)
+    checked = checked_attributes("wanted", wanted)
+    for attribute, values in checked.items():
+        having = [_attribute(hand, name, attribute) for name in names]
+        for value in values:
+            if value not in having:
+                known = ", ".join(dict.fromkeys(having))
+                raise ValueError(f"no feature has {attribute}={value!r}, expected some of {known}")
+        mask &= torch.tensor([value in values for value in having], dtype=torch.bool)
+    if not bool(mask.any()):
+        together = ", ".join(f"{name}={'|'.join(values)}" for name, values in checked.items())
+        raise ValueError(f"no feature has {together} together; ask for less")
+    return mask
+
+
+def checked_attributes(what: str, given: object) -> dict[str, tuple[str, ...]]:
+    """Values by attribute of features, each as several.
+
+    Raises:
+        ValueError: if it is none of these, or empty; named ``what`` in the message.
+    """
+    if not isinstance(given, Mapping) or not given:
+        raise ValueError(f"{what} must be like {{kind: SG, domain: [time, freq]}}, got {given!r}")
+    found = {}
+    for attribute, values in given.items():
+        if attribute not in _ATTRIBUTES:
+            known = ", ".join(_ATTRIBUTES)
+            raise ValueError(f"{what}: unknown {attribute!r}, expected some of {known}")
+        several = (values,) if isinstance(values, str) else values
+        is_list = isinstance(several, Sequence) and all(isinstance(value, str) for value in several)
+        if not is_list or not several:
+            raise ValueError(f"{what}.{attribute} must be a name or several, got {values!r}")
+        found[attribute] = tuple(several)
+    return found
+
+
+def _attribute(hand: HandLayout, name: FeatureName, attribute: str) -> str:
+    if attribute in ("kind", "finger"):
+        return str(getattr(hand.channel(name.channel), attribute))
+    return str(getattr(name, attribute))

@@ -136,7 +136,7 @@ class PageServer(Sink):
         token: str | None = None,
         report: Callable[[Event], object] = lambda event: None,
     ) -> None:
-        needs("websockets", "serve=true", "live")
+        needs("websockets", "serve=true")
         self._is_loopback = _is_loopback_name(host)
         if token is None and not self._is_loopback:
             token = secrets.token_urlsafe(16)

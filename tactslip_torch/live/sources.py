@@ -38,7 +38,7 @@ _AGAIN = f"tries again every {RETRY_S:g} s"
 KINDS = "serial:PORT, tcp:HOST:PORT, listen:PORT, ros2:TOPIC, stdin, or a file"
 
 
-def address_of(text: str, what: str, default_host: str = "127.0.0.1") -> tuple[str, int]:
+def address_of(text: str, what: str) -> tuple[str, int]:
     """Host and port of ``[HOST:]PORT``.
 
     Raises:
@@ -51,7 +51,7 @@ def address_of(text: str, what: str, default_host: str = "127.0.0.1") -> tuple[s
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or not int(port) < 1 << 16:
         raise ValueError(f"{what} needs [HOST:]PORT with a port from 0 to 65535, got {text!r}")
-    return host.strip("[]") or default_host, int(port)
+    return host.strip("[]") or "127.0.0.1", int(port)
 
 
 # Bytes -------------------------------------------------------------------------------------------
@@ -182,7 +182,7 @@ class SerialPort(_ByteSource):
         self, port: str, frames: Frames, detector: SlipDetector, baud: int = 115200
     ) -> None:
         check_number("baud", baud, whole=True)
-        self._serial = needs("serial", "a serial port", "live")
+        self._serial = needs("serial", "a serial port")
         self._port, self._baud = port, baud
         super().__init__(f"serial:{port}", frames, detector)
 
@@ -205,7 +205,7 @@ class SerialPort(_ByteSource):
         return _Connection(read, port.close)
 
     def _message(self, error: OSError) -> str:
-        there = needs("serial.tools.list_ports", "a serial port", "live").comports()
+        there = needs("serial.tools.list_ports", "a serial port").comports()
         names = ", ".join(sorted(each.device for each in there)) or "none"
         if error.errno == 2 or not Path(self._port).exists():
             return f"there is no serial port {self._port}; there are: {names}"

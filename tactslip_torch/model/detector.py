@@ -15,16 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.ops import (
-    are_unchanged,
-    full_precision,
-    is_all_false,
-    is_concrete,
-    is_traced,
-    saturating,
-    stamps_of,
-)
-from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pool import FeaturePool, saturating
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import (
     FEWEST_SAMPLES,
@@ -49,7 +40,15 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName, Channels, Filters, Machine, backend_of
 from tactslip_torch.package_files import DETECTOR as FORMAT
 from tactslip_torch.package_files import load_table, reading, save_table
-from tactslip_torch.runtime import PACKAGE
+from tactslip_torch.runtime import (
+    PACKAGE,
+    are_unchanged,
+    full_precision,
+    has_values,
+    is_concrete,
+    is_traced,
+    stamps_of,
+)
 from tactslip_torch.signals.filtering import ChannelFilter, check_samples
 
 MOST_BYTES = 2**30
@@ -395,11 +394,11 @@ class SlipDetector(nn.Module):
             alive & is_used, span, self.counted, self.sensing, range(len(self.pool.hand))
         )
         bins = self.pool.widen(bins)
-        is_whole = is_all_false(~is_known)
+        is_whole = _is_all_false(~is_known)
         if not is_whole:
             bins = torch.where(is_known[..., None], bins, 0.0)
         features = self._features(bins)
-        scaled = self.scaled(features, None if is_whole and is_all_false(is_lost) else is_lost)
+        scaled = self.scaled(features, None if is_whole and _is_all_false(is_lost) else is_lost)
         score = saturating(self.head(scaled), given)
         is_valid = is_valid & score.isfinite()
         score = torch.where(is_valid, score, torch.nan)
@@ -660,3 +659,8 @@ def counted_channels(hand: HandLayout, used: Sequence[int], is_pooled: bool) -> 
 
 _KNOWN_TO_ENGINE = (ChannelPooling, FeatureScaler, ChannelFilter, FeaturePool)
 _DTYPES: dict[torch.dtype, Any] = {torch.float32: np.float32, torch.float64: np.float64}
+
+
+def _is_all_false(mask: Tensor) -> bool:
+    """Whether a mask is known to hold nowhere, so that what depends on it can be passed over."""
+    return mask.device.type == "cpu" and has_values(mask) and not bool(mask.any())

@@ -22,7 +22,6 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from tactslip_torch.model.kernels import (
     PAPER_KERNEL,
@@ -39,13 +38,12 @@ log = logging.getLogger(__name__)
 Route = Literal["auto", "primal", "dual"]
 MOST_CONDITION = 1e10
 """Of all bins; above it scores of a group left out lose their digits."""
-_MOST_CHOLESKY = 1e12  # condition of what Cholesky may solve, and of a fit that is differentiated
+_MOST_CHOLESKY = 1e12  # condition of what Cholesky may solve
 _LARGEST_ERROR = 1e-2  # of a solution that is handed out
 _UNREPORTED_ERROR = 1e-3  # of a least-squares solution; a larger one is logged
 _EPS, _TINY = torch.finfo(torch.float64).eps, torch.finfo(torch.float64).tiny
 _GRAM_ROWS = 512
 _MOST_QUADRATIC = 1000  # features of a machine that always folds
-_CHUNK_BINS = 2048  # whose monomials are held at a time
 _LEAST_EIGENVALUE = 1e-6  # of I - H_gg; below, the rounding of the factor shows in the scores
 _CHUNK = 256  # bins in whole groups that are treated together, unless one group is larger
 
@@ -564,85 +562,6 @@ def _check_penalty(penalty: float) -> None:
 
 
 # Derivatives -------------------------------------------------------------------------------------
-
-
-def fit_quadratic(
-    z: Tensor,
-    targets: Tensor,
-    penalty: Tensor | float,
-    offset: Tensor | float = 0.5,
-    weights: Tensor | None = None,
-    route: Route = "auto",
-) -> QuadraticForm:
-    """The machine of ``fit_machine`` with ``Polynomial(2, offset)``, differentiable.
-
-    Its numbers, and so its scores, know where they come from: any number of times differentiable
-    in ``z``, real ``targets``, ``penalty``, ``offset`` and ``weights``.
-
-    Args:
-        z: scaled features of the bins; promoted to float64.
-        targets: +1 for slip and -1 for non-slip, or any numbers; bool is taken as ``is_slip``.
-        penalty: the paper's ``C``, positive and finite; a number or a tensor of one.
-        offset: the kernel's ``c``, at least 0; likewise; positive if the primal is to
-            have a derivative by it.
-        weights: positive weight of each bin; default 1.
-        route: as ``fit_machine``.
-
-    Shape:
-        - z: ``[N, K]``; targets, weights: ``[N]``
-
-    Raises:
-        ValueError: if shapes disagree, a value is outside its range or not finite, or the
-            condition is above 1e12.
-
-    Example:
-        >>> z = torch.tensor([[0.9], [0.2], [-0.7]]).double()
-        >>> penalty = torch.tensor(1.0, requires_grad=True)
-        >>> machine = fit_quadratic(z, torch.tensor([True, True, False]), penalty)
-        >>> (slope,) = torch.autograd.grad(machine(z).square().sum(), penalty)
-        >>> bool(slope > 0)  # a larger C follows the targets more closely
-        True
-    """
-    z = z.double()
-    if targets.dtype == torch.bool:
-        targets = torch.where(targets, 1.0, -1.0)
-    targets = targets.to(z)
-    c, offset = (torch.as_tensor(x, dtype=z.dtype, device=z.device) for x in (penalty, offset))
-    bins = TrainingBins(z.detach(), targets.detach() > 0, weights).double()
-    if len(z) == 0:
-        raise ValueError("a machine needs training bins, got none; add bins of both classes")
-    _check_penalty(c.item())
-    weights = bins.sample_weight
-    kernel = Polynomial(2, offset.item())
-    is_dual = _is_dual(route, kernel, *z.shape)
-    kernel = Polynomial(2, offset)  # type: ignore[arg-type]  # a tensor, to be derived by
-    if is_dual:
-        system, right, ridge = kernel(z, z), targets, 1 / (c * weights)
-    else:
-        if offset.requires_grad and not offset.item() > 0:
-            raise ValueError(
-                f"through the primal the machine has no derivative by an offset (the paper's c) of "
-                f"{offset.item():g}; take a positive one, or route='dual'"
-            )
-
-        def normal(z: Tensor, weights: Tensor, offset: Tensor) -> Tensor:
-            monomials = Polynomial(2, offset).monomials(z)  # type: ignore[arg-type]
-            return monomials.mT @ (monomials * weights[:, None])
-
-        chunks = zip(z.split(_CHUNK_BINS), weights.split(_CHUNK_BINS), strict=True)
-        system = torch.stack(
-            [checkpoint(normal, *chunk, offset, use_reentrant=False) for chunk in chunks]
-        ).sum(0)
-        right, ridge = kernel.sum_of_monomials(z, weights * targets), (1 / c).expand(len(system))
-    weighted, name = (weights, "gram") if is_dual else (None, "X'WX")
-    report = solve_symmetric(
-        system, right, c.item(), weighted, name=name, most_condition=_MOST_CHOLESKY
-    ).report
-    lower = torch.linalg.cholesky(system + ridge.diag())
-    solved = torch.cholesky_solve(right[:, None], lower)[:, 0]
-    machine = collapse(z, solved, kernel) if is_dual else kernel.head(solved, z.shape[1])
-    machine.solved = report
-    return machine
 
 
 def held_out_scores(

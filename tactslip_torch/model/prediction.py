@@ -8,8 +8,7 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.ops import full_precision, is_concrete
-from tactslip_torch.runtime import thread_map
+from tactslip_torch.runtime import full_precision, is_concrete, thread_map
 from tactslip_torch.signals.filtering import refuse_nonfinite
 
 ChannelMask = Sequence[str] | Tensor

@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.ops import ascending, is_concrete, signed_log
+from tactslip_torch.runtime import ascending, is_concrete, signed_log
 
 _COLUMNS = 128  # sorted at a time, which keeps memory small
 

@@ -17,7 +17,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.ops import power_of_two_below
+from tactslip_torch.features.bank import power_of_two_below
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import LARGEST_SAMPLE, Sensing, is_alive
 from tactslip_torch.model.prediction import Prediction

@@ -22,7 +22,6 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import Sensing, without_stuck
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Platt, calibration_from_dict, probability
-from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.onset.evidence import OnsetClassifier
 from tactslip_torch.onset.rules import (
@@ -39,6 +38,7 @@ from tactslip_torch.signals.filtering import ChannelFilter, extended
 
 LARGEST = 1e30
 """Size of a log likelihood ratio, at most."""
+_CHUNK_BINS = 1024  # at once, for memory
 KEY = "alarm"
 """Under which ``SlipDetector.info`` keeps the settings."""
 
@@ -160,7 +160,7 @@ class AlarmSettings:
             raise ValueError(f"no alarm settings of this version: {error}") from error
 
     @classmethod
-    def of(cls, detector: SlipDetector) -> AlarmSettings:
+    def of(cls, detector: HasInfo) -> AlarmSettings:
         """The settings in a detector's file.
 
         Raises:
@@ -172,6 +172,18 @@ class AlarmSettings:
                 "with onset=debounced, which is set for no rate"
             )
         return cls.from_dict(detector.info[KEY], detector.pool.hand, detector.pool.sample_rate_hz)
+
+
+class HasInfo(Protocol):
+    """What alarm settings are read from: ``SlipDetector``, with the content of its file."""
+
+    @property
+    def pool(self) -> FeaturePool:
+        """Of which hand, at which rate."""
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """JSON-able values by name."""
 
 
 class Scorer(Protocol):
@@ -201,9 +213,7 @@ class Scorer(Protocol):
         """Score raw bins with their context, ``[N, C, W]``, as they were ``given`` in a dtype."""
 
 
-def score_stream(
-    detector: Scorer, samples: Tensor, hop_samples: int, chunk: int = 1024
-) -> Prediction:
+def score_stream(detector: Scorer, samples: Tensor, hop_samples: int) -> Prediction:
     """Predict every bin of a recording that begins a whole number of hops from its start.
 
     Before and behind it lies what its filter takes to lie there (``extended``). A channel is lost
@@ -214,22 +224,21 @@ def score_stream(
         detector: that predicts.
         samples: the recording, volts; may hold NaN.
         hop_samples: distance of the bins' starts.
-        chunk: bins at once, for memory.
 
     Shape:
         - samples: ``[C, T]``, float32 or float64
         - output: of N bins, in order
 
     Raises:
-        ValueError: if hop or chunk is no positive number, or samples are not of this hand.
+        ValueError: if the hop is no positive number, or samples are not of this hand.
     """
     lengths = detector.channel_filter.window_lengths
     if samples.ndim != 2 or len(samples) != len(lengths):
         raise ValueError(
             f"expected a recording [{len(lengths)}, T] (channels, time), got {tuple(samples.shape)}"
         )
-    if hop_samples < 1 or chunk < 1:
-        raise ValueError(f"hop_samples and chunk must be positive, got {hop_samples} and {chunk}")
+    if hop_samples < 1:
+        raise ValueError(f"hop_samples must be positive, got {hop_samples}")
     used, length = detector.needed_index.tolist(), detector.pool.bin_samples
     with torch.no_grad():
         samples = samples.detach()
@@ -238,7 +247,8 @@ def score_stream(
             return Prediction(empty, empty.bool(), empty.bool(), none.bool(), none.double())
         bins = _raw_bins(detector, samples, hop_samples)
         parts = [
-            detector.predict_raw(x, given=samples.dtype) for x in bins.transpose(0, 1).split(chunk)
+            detector.predict_raw(x, given=samples.dtype)
+            for x in bins.transpose(0, 1).split(_CHUNK_BINS)
         ]
         return Prediction(*map(torch.cat, zip(*parts, strict=True)))
 
@@ -262,7 +272,6 @@ class Alarm:
         probability: that the deciding bin is slip; NaN, as the two others, where the onset
             classifier decided alone.
         statistic: of the rule.
-        is_valid: always: a decision that is not valid raises no alarm.
         in_range: whether the channels moved about as much as in training.
         channels_lost: names of the channels that were left out.
         raised_by: ``"onset"``, the classifier of fast evidence, or ``"status"``, that of bins.
@@ -273,7 +282,6 @@ class Alarm:
     score: float
     probability: float
     statistic: float
-    is_valid: bool
     in_range: bool
     channels_lost: tuple[str, ...] = ()
     raised_by: str = "status"
@@ -330,7 +338,6 @@ class Decisions(NamedTuple):
                 score=float(self.score[i]),
                 probability=float(self.probability[i]),
                 statistic=float(self.statistic[i]),
-                is_valid=bool(self.is_valid[i]),
                 in_range=bool(self.in_range[i]),
                 channels_lost=self.names_lost(i),
                 raised_by="onset" if self.by_onset[i] else "status",
@@ -618,9 +625,7 @@ class StreamStatistic(NamedTuple):
     statistic: Tensor
 
 
-def stream_statistic(
-    detector: SlipDetector, settings: AlarmSettings, samples: Tensor
-) -> StreamStatistic:
+def stream_statistic(detector: Scorer, settings: AlarmSettings, samples: Tensor) -> StreamStatistic:
     """Every decision on whole recordings, differentiable in the raw samples.
 
     Gradients are those of the values: 0 through a feature that is clipped, through a channel that
@@ -643,7 +648,7 @@ def stream_statistic(
     Example:
         The gradient of the highest statistic, volt by volt, summed up for each channel:
 
-        >>> detector = SlipDetector.load("onset.pt")  # doctest: +SKIP
+        >>> detector = tactslip_torch.SlipDetector.load("onset.pt")  # doctest: +SKIP
         >>> samples = recording.samples.clone().requires_grad_()  # doctest: +SKIP
         >>> found = stream_statistic(detector, AlarmSettings.of(detector), samples)
         ... # doctest: +SKIP

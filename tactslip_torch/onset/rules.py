@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactslip_torch.runtime import check_share
+from tactslip_torch.runtime import check_number, check_share
 
 HOLD_S = 0.25
 """Lost samples in a row up to which a rule keeps its state; beyond, it begins anew."""
@@ -263,34 +263,40 @@ class Budget:
         limit: alarms an hour in which nothing slips; of a share, alarms a knock.
         is_share: whether it is a share of knocks.
         confidence: with which the limit is to hold.
+        dispersion: variance of the counts of alarms by their mean, at least 1. Alarms that come in
+            bunches tell as much as so many fewer that do not.
 
     Raises:
-        ValueError: if the limit or the confidence is out of range.
+        ValueError: if the limit, the confidence or the dispersion is out of range.
     """
 
     scene: str
     limit: float
     is_share: bool = False
     confidence: float = 0.95
+    dispersion: float = 1.0
 
     def __post_init__(self) -> None:
         if not (0 < self.limit < math.inf and (self.limit < 1 or not self.is_share)):
             most = "between 0 and 1" if self.is_share else "positive"
             raise ValueError(f"onset.budget of {self.scene} must be {most}, got {self.limit}")
         check_share("onset.confidence", self.confidence)
+        check_number("dispersion", self.dispersion, least=1)
 
     def bound(self, alarms: int, amount: float) -> float:
         """The upper confidence bound of what so many alarms in so many hours, or knocks, show.
 
         Reference:
             Garwood (1936), Biometrika 28, 437-442; Clopper and Pearson (1934), 26, 404-413.
+            Dispersion: McCullagh and Nelder (1989), Generalized Linear Models, 6.2.3.
         """
         from scipy.special import betaincinv, gammaincinv  # of no need for a stream
 
         if not amount > 0:
             return math.inf
         if not self.is_share:
-            return float(gammaincinv(alarms + 1, self.confidence)) / amount
+            effective = float(gammaincinv(alarms / self.dispersion + 1, self.confidence))
+            return self.dispersion * effective / amount
         if alarms >= amount:
             return 1.0
         return float(betaincinv(alarms + 1, amount - alarms, self.confidence))
@@ -326,9 +332,15 @@ class Budget:
 
 def false_alarms(
     is_high: NDArray[np.bool_], is_quiet: NDArray[np.bool_], rearm: int, refractory: int
-) -> int:
-    """Alarms of a latch, raised where the first mask holds, in which the second does: ``[N]``."""
-    return int(is_quiet[_alarms(np.flatnonzero(is_high), rearm, refractory)].sum())
+) -> NDArray[np.int64]:
+    """Places of a latch's alarms, raised where the first mask holds, in which the second does.
+
+    Shape:
+        - is_high, is_quiet: ``[N]``
+        - output: ``[A]``, ascending
+    """
+    places = _alarms(np.flatnonzero(is_high), rearm, refractory)
+    return places[is_quiet[places]]
 
 
 def lowest_threshold(

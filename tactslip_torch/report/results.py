@@ -146,7 +146,17 @@ def materials_table(metrics: _Metrics) -> str:
 
 
 def _trained_on_lines(metrics: _Metrics) -> list[str]:
-    """Which materials, sessions and scenes were trained on, a line each fold that says so."""
+    """Which materials, sessions and scenes were trained on, a line each fold that says so.
+
+    Of a detector that was trained on all recordings: which numbers are of it and which are not.
+    """
+    if number := metrics.get("num_recordings"):
+        folds = len(metrics.get("folds") or [metrics])
+        return [
+            f"test and unseen: {folds} folds, each of a detector trained without these recordings\n"
+            f"detector.pt: trained on all {number} recordings; no number above was measured on it, "
+            "test and unseen say what to expect of it"
+        ]
     lines = []
     for name, fold in (metrics.get("folds") or {"": metrics}).items():
         if known := fold.get("trained_on"):

@@ -124,6 +124,7 @@ def _savgol_edges(window_length: int, polyorder: int, align: Align) -> Edges:
     return Edges(fit[place[:before]], fit[place[before]], fit[window_length - after :])
 
 
+@lru_cache(maxsize=256)  # each channel and each recording asks again
 def past_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
     """Samples before a signal that make its filter one thing from end to end.
 

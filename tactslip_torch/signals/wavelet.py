@@ -263,20 +263,19 @@ def wavelet_steps(
     num_samples: int,
     wavelet: Wavelet = "rbio2.2",
     level: int = 4,
-    mode: ExtensionMode = "symmetric",
 ) -> _WaveletSteps:
     """The steps from a bin to its branches, float64. Do not write into them.
 
     Raises:
         ValueError: as ``wavelet_branches``.
     """
-    branch_matrix(num_samples, wavelet, level, mode)  # refuses what has no branches
+    branch_matrix(num_samples, wavelet, level)  # refuses what has no branches
     filters = _of_pywt(wavelet)
     low, high, out = [], [], []
     sizes = [num_samples]  # and of the coefficients of each level, finest first
     for _ in range(level):
         identity = torch.eye(sizes[-1], dtype=torch.float64)
-        approximation, detail = wavedec(identity, filters, mode=mode, level=1)
+        approximation, detail = wavedec(identity, filters, mode="symmetric", level=1)
         low.append(approximation.T.contiguous())
         high.append(detail.T.contiguous())
         sizes.append(len(low[-1]))

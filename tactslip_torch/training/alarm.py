@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.data.labels import whole_samples
-from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
-from tactslip_torch.data.splits import PAPER_SCENE
+from tactslip_torch.data.recording import PAPER_SCENE, RecordingId, RecordingSource, Timeline
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.calibration import (
     Platt,
@@ -284,7 +283,7 @@ def threshold_curve(
     points = list[list[float]]()
     for value in dict.fromkeys(falling[ranks].tolist()):
         alarms = sum(
-            false_alarms((own >= value) | other, np.ones(len(own), bool), **times)
+            len(false_alarms((own >= value) | other, np.ones(len(own), bool), **times))
             for own, other in zip(scores, raised, strict=True)
         )
         rate = alarms / hours
@@ -361,6 +360,166 @@ def _lead_s(
             until_s = onset_s + EventRules().found_within_s
             errors += [at - onset_s for alarm_s, at in alarms if first_s <= alarm_s <= until_s][:1]
     return statistics.median(errors) if errors else 0.0
+
+
+# Thresholds within budgets -----------------------------------------------------------------------
+
+
+def within_budgets(
+    settings: AlarmSettings,
+    streams: Sequence[Stream],
+    timing: Timing,
+    budgets: Sequence[Budget],
+) -> AlarmSettings:
+    """Settings with the lowest thresholds that keep every budget, and what they gave as metadata.
+
+    With an onset classifier bins alone use at most half of each. A threshold that the rule cannot
+    reach is infinite. A ``Cusum`` without ceiling gets one above its threshold. A sum that is
+    capped is sooner low again, so what was one alarm can be two; the threshold is raised until
+    budgets are kept.
+
+    Args:
+        settings: calibration, rule and onset classifier; their thresholds do not count.
+        streams: of each budget those of its scene, scored.
+        timing: of the scores.
+        budgets: the first is of recordings without slip, whose rate is stated.
+
+    Raises:
+        ValueError: if streams are too few to show a budget.
+    """
+    rule, onset = settings.rule, settings.onset
+    settings = replace(settings, threshold=math.inf)
+    scored = _budget_scores(streams, settings, timing, budgets)
+    part = _OF_BINS if onset else 1.0
+    value = _lowest(scored, settings, timing, "statistic", of_allowed=part)
+    value = max(value, _LEAST_THRESHOLD)
+    while True:
+        value, made = value if value <= rule.ceiling else math.inf, rule
+        if isinstance(rule, Cusum) and rule.ceiling == math.inf:
+            made = replace(rule, ceiling=_CEILING * value)
+        settings = replace(settings, rule=made, threshold=value)
+        scored = _budget_scores(streams, settings, timing, budgets)
+        if onset:
+            threshold = _lowest(scored, settings, timing, "onset_score")
+            settings = replace(settings, onset=replace(onset, threshold=threshold))
+        settings = _with_counts(settings, scored, timing)
+        if all(row["alarms"] <= row["allowed"] for row in settings.metadata["budget"]):
+            return settings
+        value *= _STEP
+
+
+@dataclass
+class _Scores:
+    """Of the recordings of a budget's scene, each a row of decisions; ``amount`` of it there is."""
+
+    budget: Budget
+    statistic: list[NDArray[Any]] = field(default_factory=list)
+    onset_score: list[NDArray[Any]] = field(default_factory=list)
+    is_quiet: list[NDArray[np.bool_]] = field(default_factory=list)
+    amount: float = 0
+    allowed: int = 0
+
+    def raised(self, settings: AlarmSettings) -> list[NDArray[np.bool_]]:
+        """Where bins alone would raise an alarm."""
+        return [own >= settings.threshold for own in self.statistic]
+
+    def alarms(self, settings: AlarmSettings, times: Mapping[str, int]) -> list[int]:
+        """False alarms of each recording."""
+        raised, onset = self.raised(settings), settings.onset
+        if onset is not None:
+            raised = [
+                of_bins | (own >= onset.threshold)
+                for of_bins, own in zip(raised, self.onset_score, strict=True)
+            ]
+        pairs = zip(raised, self.is_quiet, strict=True)
+        return [len(false_alarms(is_high, is_quiet, **times)) for is_high, is_quiet in pairs]
+
+
+def _decisions_h(settings: AlarmSettings, timing: Timing) -> float:
+    """Decisions of an hour."""
+    return 3600 * timing.sample_rate_hz / settings.decision_samples
+
+
+def _budget_scores(
+    streams: Sequence[Stream],
+    settings: AlarmSettings,
+    timing: Timing,
+    budgets: Sequence[Budget],
+) -> list[_Scores]:
+    """What thresholds are set on, of each budget."""
+    settle_s = (timing.bin_samples + timing.look_ahead) / timing.sample_rate_hz + _SETTLE_S
+    found = []
+    for budget in budgets:
+        scores = _Scores(budget)
+        own = [stream for stream in streams if stream.recording.scene == budget.scene]
+        for stream, made in decide(own, settings, timing):
+            time_s, times = made.available_s.numpy(), stream.times
+            quiet = np.ones(len(time_s), bool)
+            firsts = first_releases(times.onsets_s, times.released_s)
+            for first_s, (_, end_s) in zip(firsts, times.sliding_s, strict=True):
+                before_s = first_s - EventRules().early_s
+                quiet &= (time_s < before_s) | (time_s > end_s + settle_s)
+            scores.statistic.append(made.statistic.numpy())
+            scores.onset_score.append(made.onset_score.numpy())
+            scores.is_quiet.append(quiet)
+            hours = int(quiet.sum()) / _decisions_h(settings, timing)
+            scores.amount += len(times.non_slip_s) if budget.is_share else hours
+        scores.allowed = budget.allowed(scores.amount)
+        found.append(scores)
+    return found
+
+
+def _lowest(
+    scored: Sequence[_Scores],
+    settings: AlarmSettings,
+    timing: Timing,
+    name: str,
+    of_allowed: float = 1.0,
+) -> float:
+    """The lowest threshold of a score that keeps every budget, or so much of each."""
+    times = settings.latch_times(timing.sample_rate_hz)
+    return max(
+        lowest_threshold(
+            getattr(scores, name),
+            scores.is_quiet,
+            int(of_allowed * scores.allowed),
+            is_raised=scores.raised(settings) if name == "onset_score" else None,
+            **times,
+        )
+        for scores in scored
+    )
+
+
+def _with_counts(
+    settings: AlarmSettings, scored: Sequence[_Scores], timing: Timing
+) -> AlarmSettings:
+    """The settings, with what their thresholds gave on the recordings that they were set on."""
+    rows = list[dict[str, Any]]()
+    times, onset = settings.latch_times(timing.sample_rate_hz), settings.onset
+    for scores in scored:
+        budget, alarms = scores.budget, scores.alarms(settings, times)
+        rows.append(
+            {
+                "scene": budget.scene,
+                "is_share": budget.is_share,
+                "limit": budget.limit,
+                "amount": scores.amount,
+                "allowed": scores.allowed,
+                "alarms": sum(alarms),
+                "bound": budget.bound(sum(alarms), scores.amount),
+            }
+        )
+    usual = scored[0]
+    alarms = usual.alarms(settings, times)
+    hours = [len(own) / _decisions_h(settings, timing) for own in usual.is_quiet]
+    rate = Bootstrap(len(hours), _LEVEL).rate(alarms, hours)
+    calibrated = {
+        "value": settings.threshold if onset is None else onset.threshold,
+        "target_per_hour": usual.budget.limit,
+        "rate": {"alarms": sum(alarms), "hours": sum(hours), **(rate or {})},
+    }
+    metadata = {"slip_free": usual.budget.scene, "budget": rows, "calibrated": calibrated}
+    return replace(settings, metadata=metadata | {"confidence": usual.budget.confidence})
 
 
 # The stages behind a fit -------------------------------------------------------------------------
@@ -643,9 +802,11 @@ class CalibratedAlarm:
         for name in streams:
             if name != OURS:
                 settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timings[name].hop_samples)
-                scored = self._scored(streams[name], settings, timings[name], self.budgets)
-                settings = replace(settings, threshold=self._lowest(scored, settings, "statistic"))
-                methods[name] = name, self._with_counts(settings, scored)
+                of = timings[name]
+                scored = _budget_scores(streams[name], settings, of, self.budgets)
+                threshold = _lowest(scored, settings, of, "statistic")
+                settings = replace(settings, threshold=threshold)
+                methods[name] = name, _with_counts(settings, scored, of)
         return methods
 
     def calibrated(
@@ -659,31 +820,12 @@ class CalibratedAlarm:
         """Settings with their thresholds.
 
         With an onset classifier both thresholds, which together keep every budget; of bins alone,
-        as published, the one that keeps that of ``slip_free``. A threshold that the rule cannot
-        reach is infinite.
-
-        A ``Cusum`` without ceiling gets one above its threshold. A sum that is capped is sooner low
-        again, so what was one alarm can be two; the threshold is raised until budgets are kept.
+        as published, the one that keeps that of ``slip_free``.
         """
-        budgets = [x for x in self.budgets if onset or x.scene == self.slip_free]
+        usual, *others = sorted(self.budgets, key=lambda x: x.scene != self.slip_free)
+        budgets = [usual, *(others if onset else ())]
         settings = replace(self._settings(rule, calibration, timing.hop_samples), onset=onset)
-        scored = self._scored(streams, settings, timing, budgets)
-        value = self._lowest(scored, settings, "statistic", of_allowed=_OF_BINS if onset else 1.0)
-        value = max(value, _LEAST_THRESHOLD)
-        while True:
-            value, made = value if value <= rule.ceiling else math.inf, rule
-            if isinstance(rule, Cusum) and rule.ceiling == math.inf:
-                made = replace(rule, ceiling=_CEILING * value)
-            settings = replace(settings, rule=made, threshold=value)
-            scored = self._scored(streams, settings, timing, budgets)
-            if onset:
-                threshold = self._lowest(scored, settings, "onset_score")
-                settings = replace(settings, onset=replace(onset, threshold=threshold))
-            settings = self._with_counts(settings, scored)
-            rows = settings.metadata["budget"]
-            if all(row["alarms"] <= row["allowed"] for row in rows):
-                break
-            value *= _STEP
+        settings = within_budgets(settings, streams, timing, budgets)
         lead_s = _lead_s(streams, replace(settings, onset=None), timing, by_onset=False)
         settings = replace(settings, lead_s=lead_s)
         if settings.onset is None:
@@ -703,87 +845,6 @@ class CalibratedAlarm:
             self.rearm_s,
             self.refractory_s,
         )
-
-    def _scored(
-        self,
-        streams: Sequence[Stream],
-        settings: AlarmSettings,
-        timing: Timing,
-        budgets: Sequence[Budget],
-    ) -> list[_Scores]:
-        """What thresholds are set on, of each budget."""
-        settle_s = (timing.bin_samples + timing.look_ahead) / timing.sample_rate_hz + _SETTLE_S
-        decisions_h, found = self._decisions_h(settings), []
-        for budget in budgets:
-            scores = _Scores(budget)
-            own = [stream for stream in streams if stream.recording.scene == budget.scene]
-            for stream, made in decide(own, settings, timing):
-                time_s, times = made.available_s.numpy(), stream.times
-                quiet = np.ones(len(time_s), bool)
-                firsts = first_releases(times.onsets_s, times.released_s)
-                for first_s, (_, end_s) in zip(firsts, times.sliding_s, strict=True):
-                    before_s = first_s - EventRules().early_s
-                    quiet &= (time_s < before_s) | (time_s > end_s + settle_s)
-                scores.statistic.append(made.statistic.numpy())
-                scores.onset_score.append(made.onset_score.numpy())
-                scores.is_quiet.append(quiet)
-                hours = int(quiet.sum()) / decisions_h
-                scores.amount += len(times.non_slip_s) if budget.is_share else hours
-            found.append(scores)
-        return found
-
-    def _lowest(
-        self,
-        scored: Sequence[_Scores],
-        settings: AlarmSettings,
-        name: str,
-        of_allowed: float = 1.0,
-    ) -> float:
-        """The lowest threshold of a score that keeps every budget, or so much of each."""
-        times = settings.latch_times(self.streams.sample_rate_hz)
-        return max(
-            lowest_threshold(
-                getattr(scores, name),
-                scores.is_quiet,
-                int(of_allowed * scores.budget.allowed(scores.amount)),
-                is_raised=scores.raised(settings) if name == "onset_score" else None,
-                **times,
-            )
-            for scores in scored
-        )
-
-    def _with_counts(self, settings: AlarmSettings, scored: Sequence[_Scores]) -> AlarmSettings:
-        """The settings, with what their thresholds gave on the recordings that they were set on."""
-        rows = list[dict[str, Any]]()
-        times = settings.latch_times(self.streams.sample_rate_hz)
-        for scores in scored:
-            budget, alarms = scores.budget, scores.alarms(settings, times)
-            rows.append(
-                {
-                    "scene": budget.scene,
-                    "is_share": budget.is_share,
-                    "limit": budget.limit,
-                    "amount": scores.amount,
-                    "allowed": budget.allowed(scores.amount),
-                    "alarms": sum(alarms),
-                    "bound": budget.bound(sum(alarms), scores.amount),
-                }
-            )
-            if budget.scene == self.slip_free and not budget.is_share:
-                hours = [len(own) / self._decisions_h(settings) for own in scores.is_quiet]
-                rate = Bootstrap(len(hours), _LEVEL).rate(alarms, hours)
-                onset = settings.onset
-                calibrated = {
-                    "value": settings.threshold if onset is None else onset.threshold,
-                    "target_per_hour": budget.limit,
-                    "rate": {"alarms": sum(alarms), "hours": sum(hours), **(rate or {})},
-                }
-        metadata = {"slip_free": self.slip_free, "budget": rows, "calibrated": calibrated}
-        return replace(settings, metadata=metadata | {"confidence": self.confidence})
-
-    def _decisions_h(self, settings: AlarmSettings) -> float:
-        """Decisions of an hour."""
-        return 3600 * self.streams.sample_rate_hz / settings.decision_samples
 
     def _budget_rows(
         self,
@@ -838,32 +899,6 @@ class CalibratedAlarm:
                 row["hours"] += times.duration_s / 3600
                 row["slips"] += len(times.onsets_s)
         return amounts
-
-
-@dataclass
-class _Scores:
-    """Of the recordings of a budget's scene, each a row of decisions; ``amount`` of it there is."""
-
-    budget: Budget
-    statistic: list[NDArray[Any]] = field(default_factory=list)
-    onset_score: list[NDArray[Any]] = field(default_factory=list)
-    is_quiet: list[NDArray[np.bool_]] = field(default_factory=list)
-    amount: float = 0
-
-    def raised(self, settings: AlarmSettings) -> list[NDArray[np.bool_]]:
-        """Where bins alone would raise an alarm."""
-        return [own >= settings.threshold for own in self.statistic]
-
-    def alarms(self, settings: AlarmSettings, times: Mapping[str, int]) -> list[int]:
-        """False alarms of each recording."""
-        raised, onset = self.raised(settings), settings.onset
-        if onset is not None:
-            raised = [
-                of_bins | (own >= onset.threshold)
-                for of_bins, own in zip(raised, self.onset_score, strict=True)
-            ]
-        pairs = zip(raised, self.is_quiet, strict=True)
-        return [false_alarms(is_high, is_quiet, **times) for is_high, is_quiet in pairs]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tactslip_torch.data.splits import PAPER_SCENE
+from tactslip_torch.data.recording import PAPER_SCENE
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
-from tactslip_torch.data.splits import Split, have_same_bins
+from tactslip_torch.data.splits import ROLES, Split, everything, have_same_bins
 from tactslip_torch.features.cache import (
     FeatureCache,
     default_cache_folder,
@@ -65,6 +65,8 @@ class Experiment:
         num_workers: processes that make features; ``None``: one a processor.
         with_baselines: whether baselines are fitted and evaluated.
         export: writes the ONNX files of a detector into a folder; ``None``: nothing does.
+        train_on_all: whether a last detector, the one to use, is trained on all recordings of the
+            folds; those of folds then show what to expect of it, in place of a nested validation.
     """
 
     maker: FeatureMaker
@@ -77,6 +79,7 @@ class Experiment:
     num_workers: int | None = None
     with_baselines: bool = True
     export: Callable[[SlipDetector, Path], dict[str, Any]] | None = None
+    train_on_all: bool = False
 
 
 def run_experiment(experiment: Experiment, folder: Path) -> dict[str, Any]:
@@ -89,14 +92,23 @@ def run_experiment(experiment: Experiment, folder: Path) -> dict[str, Any]:
     Returns:
         Plain values, as ``metrics.json`` has them; ``features`` are rows of the selected features.
     """
-    folds = experiment.folds
+    folds, on_all = experiment.folds, dict[str, Any]()
     results: dict[str, dict[str, Any]] = {}
     with feature_cache(experiment.cache) as experiment.maker.cache:
         data = SlipDataModule(experiment.maker, folds, experiment.num_workers)
+        of_folds = replace(experiment, export=None) if experiment.train_on_all else experiment
         for data.fold in folds:
-            place = folder if len(folds) == 1 else folder / data.fold.name
-            results[data.fold.name] = _run_fold(experiment, data, place)
-    seconds = {"features": data.seconds, **_added([of.pop("timing_s") for of in results.values()])}
+            place = (
+                folder if of_folds is experiment and len(folds) == 1 else folder / data.fold.name
+            )
+            results[data.fold.name] = _run_fold(of_folds, data, place)
+        if experiment.train_on_all:
+            recordings = sorted({r for fold in folds for r in fold.having(*ROLES)})
+            (data.fold,) = everything(recordings, role="train")
+            on_all = _run_fold(replace(experiment, with_baselines=False), data, folder)
+            on_all["num_recordings"] = len(recordings)
+    every = [*results.values(), *filter(None, [on_all])]
+    seconds = {"features": data.seconds, **_added([of.pop("timing_s") for of in every])}
     first, *others = results.values()
     shared = set(first["selected"]).intersection(*(of["selected"] for of in others))
     features = [row for row in first["features"] if row["name"] in shared]
@@ -108,6 +120,10 @@ def run_experiment(experiment: Experiment, folder: Path) -> dict[str, Any]:
         events = dict(zip(results, recording_events, strict=True))
         metrics = merged_results(results, events, by_fold=have_same_bins(folds))
         metrics |= {"selected": [row["name"] for row in features], "folds": results}
+    if on_all:  # what was measured is of the folds, all else of the detector to use
+        measured = {"splits", "baselines", "events", "recording_events"}
+        features = on_all["features"]
+        metrics |= {key: value for key, value in on_all.items() if key not in measured}
     return metrics | {
         "timing_s": seconds,
         "features": features,
@@ -122,6 +138,7 @@ def _run_fold(experiment: Experiment, data: SlipDataModule, folder: Path) -> dic
         maker.channel_filter,
         experiment.recipe,
         with_baselines=experiment.with_baselines,
+        is_nested=not experiment.train_on_all,
     )
     trainer.fit(learner, datamodule=data)
     detector, started = learner.detector, time.perf_counter()

@@ -13,6 +13,7 @@ from tactslip_torch.data.splits import ROLES
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.events import LatencyParts, RecordingEvents
+from tactslip_torch.runtime import from_first_process, gathered
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.baselines import Baselines
 from tactslip_torch.training.datamodule import RecordingFeatures, TrainingBins
@@ -23,7 +24,7 @@ from tactslip_torch.training.evaluation import (
     event_numbers,
     events_by_rule,
 )
-from tactslip_torch.training.recipe import General, Recipe, from_first_process, gathered
+from tactslip_torch.training.recipe import General, Recipe
 
 
 class SlipLearner(L.LightningModule):
@@ -35,6 +36,7 @@ class SlipLearner(L.LightningModule):
         recipe: how the machine is made.
         detector: a finished one, to be evaluated only.
         with_baselines: fit baselines on the sample of training bins, to be evaluated beside.
+        is_nested: whether a nested validation also evaluates the recipe's choice itself.
 
     Attributes:
         detector: the result, after the training step.
@@ -55,6 +57,7 @@ class SlipLearner(L.LightningModule):
         detector: SlipDetector | None = None,
         *,
         with_baselines: bool = True,
+        is_nested: bool = True,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -65,6 +68,7 @@ class SlipLearner(L.LightningModule):
             self.recipe.allowed(pool)  # refused before any work
         self.detector = detector
         self.with_baselines = with_baselines
+        self.is_nested = is_nested
         self.baselines: Baselines | None = None
         self.metadata: dict[str, Any] = {}
         self.metrics: dict[str, Any] = {}
@@ -82,7 +86,7 @@ class SlipLearner(L.LightningModule):
     def training_step(self, batch: TrainingBins, batch_idx: int) -> None:
         """Fit to the training bins of this process and of those beside it."""
         started = time.perf_counter()
-        fit = self.recipe.fit(batch, self.pool, show=True)
+        fit = self.recipe.fit(batch, self.pool, is_nested=self.is_nested, show=True)
         fitted = time.perf_counter()
         self.seconds["fit"] = fitted - started
         self.log("penalty", fit.penalty, batch_size=1)

@@ -11,20 +11,24 @@ import itertools
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
-import torch.distributed
 from torch import Tensor
 
-from tactslip_torch.data.splits import PAPER_SCENE
+from tactslip_torch.data.recording import PAPER_SCENE
 from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
-from tactslip_torch.features.groups import checked_attributes, matching
 from tactslip_torch.features.pool import FeaturePool, is_rounding
-from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
+from tactslip_torch.features.selection import (
+    ClassMoments,
+    checked_attributes,
+    matching,
+    rank_features,
+    t_scores,
+)
 from tactslip_torch.features.sensing import (
     Sensing,
     SpanFeatures,
@@ -37,7 +41,14 @@ from tactslip_torch.model.kernels import PAPER_KERNEL, Head, Polynomial
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
-from tactslip_torch.runtime import bar, check_choice, check_number
+from tactslip_torch.runtime import (
+    add_over_processes,
+    bar,
+    check_choice,
+    check_number,
+    from_first_process,
+    gathered,
+)
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.bins import BinSample, RecordingBins, SampledBins, bin_keys
 from tactslip_torch.training.choice import (
@@ -51,11 +62,12 @@ from tactslip_torch.training.choice import (
 )
 
 log = logging.getLogger(__name__)
-Value = TypeVar("Value")
 
 FREE_CONSTANT = 1.0e6
 """``c`` of degree 1, where it weighs the constant alone: so large, the penalty does not reach it.
 A penalised constant moves the threshold of a machine with few bins or a strong penalty."""
+POOLING = ("mean", "std", "min", "max")
+"""Statistics over channels of the default."""
 MOST_DUAL_BINS = 2500
 """Up to so many training bins a machine of degree 2 on all features is a candidate: it does not
 fold, so its cost grows with the bins."""
@@ -247,9 +259,8 @@ class _Recipe(ABC):
                 sums.update(some.name, *part)
         if sums is None:
             kept = dict(itertools.chain(*(own.items() for own in gathered(kept))))
-        elif _num_processes() > 1:
-            for total in (sums.sums, sums.count):
-                torch.distributed.all_reduce(total)
+        else:
+            add_over_processes(sums.sums, sums.count)
 
         def solve() -> Head:
             if sums is not None:
@@ -271,22 +282,26 @@ class _Recipe(ABC):
     def _weighted(self, plan: _Plan, bins: RecordingBins) -> tuple[Tensor, Tensor, Tensor]:
         """Scaled bins ``[N, K]``, classes and weights ``[N]`` that the machine is fitted to."""
 
-    def _sensing(
+    def _planned(
         self,
         pool: FeaturePool,
-        selection: FeatureSelection,
         sample: SampledBins,
+        selection: FeatureSelection,
+        weight: Tensor,
         alive_fraction: float,
-    ) -> Sensing:
-        """Spans of channels that work, of the training bins of a selection."""
+        **chosen: Any,
+    ) -> _Plan:
+        """A plan of what was chosen, and of what a selection learns of the sample besides."""
         channels = pool.hand.names
         used = sorted({channels.index(pool.names[i].channel) for i in selection.selected})
         num_counted = len(counted_channels(pool.hand, used, selection.pooling is not None))
-        return Sensing.fit(
+        sensing = Sensing.fit(
             SpanFeatures(pool.hand, pool.names, pool.bin_samples)(sample.features),
             self.min_alive or least_alive(num_counted, alive_fraction),
             most_stuck_samples(pool.sample_rate_hz, sample.longest_run),
         )
+        imputation = _class_mean(selection(sample.features), sample.is_slip, weight)
+        return _Plan(selection, imputation=imputation, sensing=sensing, sample=sample, **chosen)
 
 
 @dataclass(frozen=True)
@@ -302,7 +317,8 @@ class General(_Recipe):
         sample_bins: bins of each group and class that choices are made by.
         feature_filter: only features that match are used, such as ``{"kind": "SG", "descriptor":
             "mean"}``: of each attribute a value, or one of several.
-        descriptors: those that may be used; ``None``: all.
+        descriptors: those that may be used; by default none that jumps with the last digit or needs
+            sorting; ``None``: all.
         min_alive: channels that must be alive for a valid decision, of the fast ones in use (of all
             in use, where nothing is pooled). ``None``: as many as the second copies have at least;
             half where nothing is pooled.
@@ -327,7 +343,21 @@ class General(_Recipe):
     use: str | Sequence[str] = ("channel", "pooled", "both")
     num_features: int | Sequence[int | None] | None = (None, 120)
     degree: int | Sequence[int] = (1, 2)
-    pooling: str | Sequence[str] | None = ("mean", "std", "min", "max")
+    descriptors: Sequence[str] | None = (
+        "mean",
+        "range",
+        "mean_deviation",
+        "std",
+        "skewness",
+        "kurtosis",
+        "energy",
+        "peak_factor",
+        "correlation",
+        "spectral_centroid",
+        "spectral_spread",
+        "band_energy_ratio",
+    )
+    pooling: str | Sequence[str] | None = POOLING
     tolerance: float = 0.005
     scene_weights: Mapping[str, float] = field(default_factory=dict)
     drop_channels: float = 0.5
@@ -391,14 +421,15 @@ class General(_Recipe):
         selection = candidates.select(choice.structure)
         is_pooled = selection.pooling is not None and self.drop_channels > 0
         fraction = 1 - self.drop_channels if is_pooled else 0.5
-        return _Plan(
-            selection=selection,
+        return self._planned(
+            pool,
+            sample,
+            selection,
+            weight,
+            fraction,
             kernel=choice.structure.kernel,
             penalty=choice.penalty,
-            imputation=_class_mean(selection(sample.features), sample.is_slip, weight),
-            sensing=self._sensing(pool, selection, sample, fraction),
             num_bins=num_bins,
-            sample=sample,
             weights=weights,
             validation=choice.rows,
             nested=choice.nested,
@@ -524,16 +555,17 @@ class Paper(_Recipe):
         best = places[rank_features(t_scores(statistics.moments)[places], size)].tolist()
         scaler = FeatureScaler(statistics.minimum[best].double(), statistics.maximum[best].double())
         selection = FeatureSelection(tuple(best), scaler)
-        z = selection(sample.features)
-        penalty, rows = self._penalty(TrainingBins(z, sample.is_slip, weight), sample, show)
-        return _Plan(
-            selection=selection,
+        trained = TrainingBins(selection(sample.features), sample.is_slip, weight)
+        penalty, rows = self._penalty(trained, sample, show)
+        return self._planned(
+            pool,
+            sample,
+            selection,
+            weight,
+            0.5,
             kernel=self.kernel,
             penalty=penalty,
-            imputation=_class_mean(z, sample.is_slip, weight),
-            sensing=self._sensing(pool, selection, sample, 0.5),
             num_bins=2 * min(counts),
-            sample=sample,
             weights={PAPER_SCENE: fractions},
             validation=rows,
         )
@@ -549,7 +581,8 @@ class Paper(_Recipe):
             middle = penalties[len(penalties) // 2]
             log.warning("C=%g is taken unvalidated: one group", middle)
             return middle, []
-        rows, machine = [], HeldOut(bins, sample.group, self.kernel)
+        rows, scored = list[dict[str, Any]](), list[Tensor]()
+        machine = HeldOut(bins, sample.group, self.kernel)
         for penalty in bar(penalties, "choose C on held-out groups", show=show):
             scores = machine.at(penalty).scores
             by_group = {
@@ -563,6 +596,7 @@ class Paper(_Recipe):
                     "no validation group has bins of both classes; add recordings, or give one "
                     "value of recipe.penalties"
                 )
+            scored.append(scores)
             rows.append(
                 {
                     "num_features": bins.features.shape[1],
@@ -570,11 +604,11 @@ class Paper(_Recipe):
                     "penalty": penalty,
                     "mean": sum(known) / len(known),
                     "balanced_accuracy": by_group,
-                    "calibration": platt_or_none(scores, bins.is_slip, bins.weights),
                 }
             )
-        best = max(rows, key=lambda row: float(row["mean"]))
-        best["chosen"] = True
+        best, scores = max(zip(rows, scored, strict=True), key=lambda of: float(of[0]["mean"]))
+        calibration = platt_or_none(scores, bins.is_slip, bins.weights)
+        best |= {"chosen": True, "calibration": calibration}
         return best["penalty"], rows
 
 
@@ -656,42 +690,9 @@ def _numbers(name: str, value: Any) -> list[float]:
     return [float(each) for each in _several(value)]
 
 
-# Processes of a distributed fit ------------------------------------------------------------------
-
-
-def _num_processes() -> int:
-    ready = torch.distributed.is_available() and torch.distributed.is_initialized()
-    return torch.distributed.get_world_size() if ready else 1
-
-
-def gathered(own: Value) -> list[Value]:
-    """The value of every process, in the order of their ranks."""
-    values: list[Any] = [own] * _num_processes()
-    if len(values) > 1:
-        torch.distributed.all_gather_object(values, own)
-    return values
-
-
 def _merged(own: Any) -> Any:
     """What every process holds, put together in the order of their ranks."""
     values = gathered(own)
     for other in values[1:]:
         values[0].merge(other)
     return values[0]
-
-
-def from_first_process(make: Callable[[], Value]) -> Value:
-    """What the first process makes, in every process; its error as well, so that none waits."""
-    if _num_processes() == 1:
-        return make()
-    box: list[Any] = [None, None]
-    if torch.distributed.get_rank() == 0:
-        try:
-            box[0] = make()
-        except Exception as error:
-            box[1] = error
-    torch.distributed.broadcast_object_list(box)
-    if box[1] is not None:
-        raise box[1]
-    made: Value = box[0]
-    return made

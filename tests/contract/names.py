@@ -90,11 +90,6 @@ FIT_FACTS = ("selected", "penalty", "kernel", "solve", "validation", "num_bins")
 ALARM_INFO = "alarm"  # in the detector's info
 TRAINING_RECORDINGS = "train_recordings"  # in the detector's info
 
-# Graphs: inputs and outputs
-BIN_INPUT = "samples"
-BIN_OUTPUTS = ("score", "probability", "valid", "in_range", "channels_lost")
-STREAM_INPUTS = ("samples", "tail", "state", "threshold")
-STREAM_HANDED_ON = {"tail": "next_tail", "state": "next_state"}
 STREAM_OUTPUTS = {
     "score": "score",
     "probability": "probability",
@@ -119,6 +114,3 @@ HOST_OPTIONS |= {"rate": "--rate"}
 # Recordings in files ---------------------------------------------------------------------------
 
 from tactslip_torch.data.formats import FORMATS, Reading, named_format, open_file  # noqa: E402
-
-INSTALL_FORMATS = 'pip install "tactslip-torch[formats]"'
-"""What brings the library of a format that is not installed."""

@@ -91,9 +91,14 @@ def train(command: Runner, folder: Path, overrides: Sequence[str], **words: obje
     """Run the training in a folder, and read what it left."""
     given = [*overrides, *settings(**words)]
     command.well(folder, "train", *given, *settings(folder="run"))
+    return trained_in(folder, given)
+
+
+def trained_in(folder: Path, overrides: list[str]) -> Trained:
+    """What such a run left in its folder."""
     run = folder / "run"
     metrics = json.loads((run / METRICS).read_text())
-    return Trained(SlipDetector.load(run / DETECTOR), run, metrics, given)
+    return Trained(SlipDetector.load(run / DETECTOR), run, metrics, overrides)
 
 
 def _become(folder: Path, arguments: Sequence[str]) -> None:

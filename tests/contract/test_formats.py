@@ -3,7 +3,6 @@
 import importlib.util
 import json
 import shutil
-from dataclasses import replace
 from itertools import pairwise
 
 import h5py
@@ -15,7 +14,6 @@ import scipy.io
 import torch
 from foreign_files import LVM, made_73, made_hdf5, stored
 from mcap.reader import make_reader
-from mcap.records import Statistics
 from message_bags import (
     START_NS,
     STEP_NS,
@@ -38,7 +36,7 @@ from tactslip_torch import HandLayout, Recording
 from tactslip_torch.data.clock import even_clock
 from tactslip_torch.data.formats import endings, find_format, format_of, pieces
 
-from .names import FORMATS, INSTALL_FORMATS, Reading, named_format, open_file
+from .names import FORMATS, Reading, named_format, open_file
 
 ENDINGS = ("npz", "csv", "txt", "h5", "mat", "mcap", "parquet")
 ALIKE = ("npy", "tsv", "dat", "lvm", "hdf5", "he5")
@@ -151,15 +149,6 @@ def test_what_goes_in_comes_out(tmp_path, ending, dtype):
             assert bits(part) == bits(samples[:, 1500:1600].contiguous())
 
 
-def test_a_table_that_says_nothing_of_releases_is_read_as_before(tmp_path):
-    form, path = named_format("csv"), tmp_path / "a.csv"
-    wanted, hand = recording(released_s=()), hand_of("ab")
-    form.save(path, wanted, hand, KEY)
-    path.write_text(path.read_text("utf-8").replace('"released_s": [], ', "", 1), "utf-8")
-    assert "released_s" not in path.read_text("utf-8")
-    assert_truth(form.load(path), wanted, hand)
-
-
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_equal_recordings_are_equal_bytes_whenever_written(tmp_path, ending, monkeypatch):
     form = named_format(ending)
@@ -233,28 +222,6 @@ def test_ours_saved_again_by_others_are_ours(tmp_path):
         archived = format_of(tmp_path / name).load(tmp_path / name)
         assert torch.equal(archived.recording.samples, wanted.samples)
         assert_truth(archived, wanted, hand)
-
-
-@pytest.mark.parametrize("ending", ["npz", "csv", "h5", "mcap", "parquet"])
-def test_a_damaged_sample_of_ours_is_noticed(tmp_path, ending):
-    """MAT files of version 5 keep no check sums; all others must notice, or text be no number."""
-    form, path = named_format(ending), tmp_path / f"a.{ending}"
-    form.save(path, recording(), hand_of("ab"), KEY)
-    whole, values = path.read_bytes(), recording().samples.numpy()
-    plain = {
-        "csv": repr(float(values[0, 700])).encode(),
-        "mcap": values[:, 700].tobytes(),
-    }.get(ending, values[0, 700:703].tobytes())
-    turned = bytearray(whole)
-    turned[turned.index(plain) + 2] ^= 0x40
-    for content in (bytes(turned), *(whole[: len(whole) * part // 100] for part in (19, 57, 95))):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match=f"a.{ending}"):
-            form.load(path)
-    path.write_bytes(turned)
-    with pytest.raises(ValueError, match=f"a.{ending}"), open_file(path) as opened:
-        opened.samples.read(0, 1234)
-    assert form.is_native(path)
 
 
 # Which files there are -------------------------------------------------------------------------
@@ -540,15 +507,6 @@ def test_files_of_all_formats_are_read_as_meant_or_refused_in_a_line(tmp_path, n
         return
     samples, names, *_ = read(tmp_path / name)
     assert (names, samples[:, -1].tolist()) == tuple(wanted)
-
-
-def test_a_message_lost_from_an_mcap_file_is_noticed(tmp_path, monkeypatch):
-    counted = Statistics.write
-    monkeypatch.setattr(
-        Statistics, "write", lambda self, out: counted(replace(self, message_count=8), out)
-    )
-    path = write_mcap(tmp_path / "a.mcap", [wrenches(7)[0]])
-    assert "holds 7 messages, where its metadata say 8" in refused(path)
 
 
 # Arrays: NumPy, HDF5, MAT, Parquet -------------------------------------------------------------
@@ -906,4 +864,4 @@ def test_an_absent_library_is_one_line_with_its_remedy(tmp_path, monkeypatch, na
     monkeypatch.setattr("importlib.util.find_spec", hidden)
     with pytest.raises(ValueError, match=f"needs {library}, which is not installed") as caught:
         named_format(name[2:]).save(tmp_path / name, recording(), hand_of("ab"), KEY)
-    assert INSTALL_FORMATS in str(caught.value)
+    assert f"pip install {library}" in str(caught.value)

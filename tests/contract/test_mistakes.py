@@ -37,7 +37,11 @@ MISTAKES = {  # beside those of tests/test_command_line.py, which a page lists
         files(channels=[CHANNELS[0] | {"name": "Z1"}, *CHANNELS[1:]]),
         "Z1 SG1 csv",
     ),
-    "evaluate another hand": ("evaluate", settings(model="{model}", cycles=2), "4 24 SG1"),
+    "evaluate another hand": (
+        "evaluate",
+        ["data=simulated", *settings(model="{model}", cycles=2)],
+        "4 24 SG1",
+    ),
     "detect without an alarm": ("detect", settings(model="{bare}", input="{root}"), "alarm onset"),
     "export in a precision": (
         "export",

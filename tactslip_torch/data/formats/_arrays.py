@@ -578,7 +578,7 @@ def read_mat(path: Path, how: Reading, stack: ExitStack) -> Opened:
 
     Of foreign ones: the only matrix, or all vectors of one length as channels by name, also in
     structs (``trial.volts``); times by name; the rate by a number, names of channels by characters
-    or cells, that are called so.
+    or, up to version 7, cells, that are called so.
 
     Raises:
         Refused: if h5py is absent where it is needed, or a file of version 5 claims more than is
@@ -645,9 +645,8 @@ def _hdf5_variables(file: Any, how: Reading) -> dict[str, Any]:
             continue
         if "MATLAB_empty" in thing.attrs:
             found[name] = "is empty"
-        elif kind in ("char", "cell"):
-            words = _characters(thing) if kind == "char" else _cells(file, thing)
-            found[name] = f"is a {kind} array" if words is None else words
+        elif kind == "char":
+            found[name] = _characters(thing) or "is a char array"
         elif kind == "logical":
             is_label = how.label is not None and how.label.name in (name, name.split(".")[-1])
             found[name] = thing if is_label else "holds true or false"
@@ -667,17 +666,3 @@ def _characters(thing: Any) -> tuple[str, ...] | None:
         return None
     rows = np.ascontiguousarray(thing[()].T).astype("<u2")
     return tuple(row.tobytes().decode("utf-16-le", "replace").rstrip(" \0") for row in rows)
-
-
-def _cells(file: Any, thing: Any) -> tuple[str, ...] | None:
-    """The words of cells that hold one each."""
-    if thing.dtype.kind != "O" or thing.ndim != 2 or not 0 < thing.size <= MOST_MEMBERS:
-        return None
-    words: list[str] = []
-    for reference in thing[()].reshape(-1):
-        cell = file[reference]
-        if _attribute(cell, "MATLAB_class") != ("char",):
-            return None
-        is_empty = "MATLAB_empty" in cell.attrs
-        words += ("",) if is_empty else (_characters(cell) or ())[:1]
-    return tuple(words)

@@ -100,22 +100,20 @@ def check_plausible(what: str, claimed: int, stored: int, most: int | None = Non
         )
 
 
-def needs(module: str, what: str, extra: str = "formats") -> ModuleType:
+def needs(module: str, what: str) -> ModuleType:
     """A library that is there only if an extra was installed.
 
     Args:
         module: to import.
         what: it is for, such as ``"reading .h5"``.
-        extra: that brings it.
 
     Raises:
         Refused: in one line, if it is absent.
     """
     name = module.partition(".")[0]
     if importlib.util.find_spec(name) is None:
-        raise Refused(
-            f'{what} needs {name}, which is not installed; pip install "tactslip-torch[{extra}]"'
-        )
+        wanted = {"serial": "pyserial"}.get(name, name)
+        raise Refused(f"{what} needs {wanted}, which is not installed; pip install {wanted}")
     return importlib.import_module(module)
 
 
