@@ -5,6 +5,7 @@ Of tensors: whether their values may be looked at, and operations that are quick
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import glob
 import hashlib
@@ -21,7 +22,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import lru_cache
 from numbers import Integral, Real
 from pathlib import Path
@@ -130,6 +131,12 @@ def _renew_lock() -> None:
 
 
 os.register_at_fork(after_in_child=_renew_lock)
+
+
+def trim_memory() -> None:
+    """Hand freed memory back to the system, which glibc keeps for each thread apart."""
+    with suppress(OSError, AttributeError, TypeError):  # other C libraries have no such call
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def is_traced() -> bool:
