@@ -12,6 +12,7 @@ from importlib import import_module
 
 COMMANDS = {
     "demo": "find the slip in a sample recording, draw it, export; nothing is needed",
+    "setup": "look at your recordings, write how they are read: hand.yaml, and a picture",
     "train": "fit a detector, evaluate, save and export it",
     "evaluate": "evaluate a saved detector on recordings",
     "detect": "find slips in recordings",
@@ -23,7 +24,7 @@ COMMANDS = {
     "pareto": "the most accurate detector within a deadline",
     "hosts": "copy a program that runs an exported detector: python, c, node or web",
 }
-OF_THEIR_OWN = ("demo", "hosts")
+OF_THEIR_OWN = ("demo", "setup", "hosts")
 """Commands without a configuration."""
 
 

@@ -225,7 +225,7 @@ def test_a_template_lists_every_recording_with_what_names_tell(tmp_path, capsys)
     assert "lists 3 recordings, 2 of them with what" in out
     with pytest.raises(ValueError, match=r"manifest\.csv is there already; move it away"):
         run("label_template", tmp_path)
-    text = path.read_text().replace("x.csv,,,,,,,,", "x.csv,iron,,,1.5; 2,,,0-1,")
+    text = path.read_text().replace("x.csv,,,,,,,,,", "x.csv,iron,,,,1.5; 2,,,0-1,")
     path.write_text(text.replace(",,,,,,\n", ",,,,,,slip\n"))  # filled in it is a manifest
     filled = FileRecordings(tmp_path)
     assert [str(r) for r in filled.ids] == ["iron/0", "oil paper-slip/7", "wood/1"]
@@ -239,6 +239,7 @@ PATTERNS = [
     ("{label}/{material}_*", "slip/iron_x.h5", "label=slip, material=iron"),
     ("*_{material}.v1", "run7_oil paper.v1.csv", "material=oil paper"),
     ("{material:cup|big cup}{trial}*", "big cup12b.csv", "material=big cup, trial=12"),
+    ("{session}/{material}_{trial}", "day 2/oil_7.csv", "session=day 2, material=oil, trial=7"),
 ]
 
 

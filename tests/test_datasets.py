@@ -610,6 +610,13 @@ def test_paths_say_what_recordings_are(folder):
     assert (other.onsets_s, other.slip_s) == ((), ((0.5, 1.5),))
 
 
+def test_a_trial_of_each_session_is_a_recording_of_its_own(folder):
+    pattern = "{session}/{material:pen}{trial}"
+    found = named_recordings(folder, pattern=pattern, reading=NAMED["reading"])
+    expected = [(0, "n"), (7, "n"), (0, "t")]
+    assert set(found.ids) == {RecordingId("pen", trial, session=day) for trial, day in expected}
+
+
 UNSAID = [
     ({"root": "../linked"}, r"n/pen9.csv: is a link out of the folder"),
     ({"pattern": "{scene}"}, r"data.pattern must name \{material\}, got"),

@@ -215,10 +215,10 @@ def write_manifest(folder: Path, written: Sequence[Written]) -> None:
 
 # Manifests to fill in ---------------------------------------------------------------------------
 
-_FIELDS = ("material", "trial", "scene", "label")
+_FIELDS = ("material", "trial", "scene", "session", "label")
 """What a pattern may name."""
 _TEMPLATE_COLUMNS = (
-    *("file", "material", "trial", "scene"),
+    *("file", "material", "trial", "scene", "session"),
     *("onsets_s", "sliding_s", "slip_s", "non_slip_s", "label"),
 )
 _BETWEEN = r"[-_. ]"
@@ -228,13 +228,13 @@ def guessed(file: str, pattern: str) -> dict[str, str]:
     """What a pattern tells of a file by its name, and by its folders if the pattern has strokes.
 
     As many folders are looked at as the pattern has strokes. Capitals do not matter. A trial is a
-    whole number. A material, scene or label is any text, or one of those listed:
+    whole number. A material, scene, session or label is any text, or one of those listed:
     ``{scene:taps|held}``. A ``*`` stands for any text, and the ending is no part of a name. Blanks,
-    dots, strokes and underlines around a material or scene are no part of it.
+    dots, strokes and underlines around a material, scene or session are no part of it.
 
     Raises:
         ValueError: if the pattern names nothing, one twice, or something else than material,
-            trial, scene and label; or if it can read the name in two ways.
+            trial, scene, session and label; or if it can read the name in two ways.
 
     Example:
         >>> guessed("oil paper-slip_07.csv", "{material}{trial}")
@@ -281,7 +281,7 @@ def _field(name: str, words: Sequence[str] | None) -> str:
     inner = free if words is None else "|".join(map(re.escape, words))
     if name == "trial":
         return rf"(?<!\d)(?P<trial>{inner})(?!\d)"
-    between = f"{_BETWEEN}*" if name in ("material", "scene") else ""
+    between = f"{_BETWEEN}*" if name in ("material", "scene", "session") else ""
     return f"{between}(?P<{name}>(?!{_BETWEEN})(?:{inner})(?<!{_BETWEEN})){between}"
 
 

@@ -52,7 +52,8 @@ def named_recordings(
     Args:
         root: the folder.
         pattern: of a file's name, or of the end of its path, as ``folder.guessed`` reads it; it
-            names ``{material}``, and may name ``{trial}``, ``{scene}`` and ``{label}``.
+            names ``{material}``, and may name ``{trial}``, ``{scene}``, ``{session}`` and
+            ``{label}``.
         labels: ``slip`` or ``non-slip`` for each text of ``{label}``, or of ``{scene}`` if
             the pattern has no label; ``None``: the text is one of the two, or nothing is known.
         rename: materials that names spell otherwise, in capitals or not.
@@ -144,7 +145,7 @@ def _listed(
     renamed = {old.lower(): new for old, new in rename.items()}
     entries: list[Entry] = []
     problems: list[Problem] = []
-    counts: Counter[tuple[str, str]] = Counter()
+    counts: Counter[tuple[str, str, str]] = Counter()
     for path in sorted(recording_files(root, in_folders=True)):
         file = path.relative_to(root).as_posix()
         found = guessed(file, pattern)
@@ -152,8 +153,9 @@ def _listed(
             continue
         material = renamed.get(found["material"].lower(), found["material"])
         scene = found.get("scene", RecordingId.scene)
-        trial = found.get("trial", str(counts[material, scene]))
-        counts[material, scene] += 1
+        session = found.get("session", "")
+        trial = found.get("trial", str(counts[material, scene, session]))
+        counts[material, scene, session] += 1
         word = found.get("label", scene)
         label = label_of(word if labels is None else labels.get(word, ""))
         if not path.resolve().is_relative_to(root.resolve()):
@@ -165,7 +167,8 @@ def _listed(
             problems.append(Problem(file, f"{word!r} is none of data.labels: {known}"))
         else:
             truth = Timeline(label=label) if label else None
-            entries.append(Entry(file, file, RecordingId(material, int(trial), scene), truth))
+            recording = RecordingId(material, int(trial), scene, session)
+            entries.append(Entry(file, file, recording, truth))
     if not entries and not problems:
         raise ValueError(f"no file in {root} has a path that matches data.pattern={pattern!r}")
     return Listing(tuple(entries), tuple(problems))

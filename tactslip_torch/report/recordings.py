@@ -338,3 +338,77 @@ def _legend(rows: Sequence[Recording], channels: Channels) -> list[Any]:
     if any(row.non_slip_s for row in rows):
         handles.append(Patch(label="non-slip", **_NON_SLIP))
     return handles
+
+
+# How a recording is read ------------------------------------------------------------------------
+_MOST_PANELS, _MOST_NAMED = 8, 7
+_APART = 5.0  # channels whose levels differ by so many times their span are drawn without them
+
+
+@style.styled
+def reading_figure(recording: Recording, channels: Channels, path: str | Path, title: str) -> None:
+    """Write a recording with a panel for each kind of channel, its labels and what is missing.
+
+    Of more kinds than eight the first eight are drawn.
+
+    Args:
+        recording: one of the hand's.
+        channels: of the hand.
+        path: the PNG to write, replaced as a whole if it exists.
+        title: of the figure.
+    """
+    kinds: dict[str, list[int]] = {}
+    for place, channel in enumerate(channels):
+        kinds.setdefault(channel["kind"], []).append(place)
+    shown = list(kinds.items())[:_MOST_PANELS]
+    if len(kinds) > len(shown):
+        title += f"\nthe first {len(shown)} of {len(kinds)} kinds"
+    figure = style.new_figure(11.0, 1.2 + max(1.5, 3.2 - 0.4 * len(shown)) * len(shown), title)
+    panels = figure.subplots(len(shown), 1, squeeze=False, sharex=True)[:, 0]
+    view = (0.0, recording.duration_s)
+    is_missing = ~np.isfinite(recording.samples.cpu().numpy()).all(axis=0)
+    for axes, (kind, places) in zip(panels, shown, strict=True):
+        times, values = _points(recording, places, view)
+        adapting = "fast" if style.is_fast(channels[places[0]]) else "slow"
+        middles = np.array([median(line) for line in values])
+        widths = np.array([span(line, 0.01) for line in values])
+        note = ""
+        if np.ptp(middles) > _APART * max(np.median(widths), 1e-300):
+            values, note = values - middles[:, None], ", each about its median"
+        colours = style.shades(len(places))
+        for line, place, colour in zip(values, places, colours, strict=True):
+            name = channels[place]["name"]
+            axes.plot(times, line, color=colour, linewidth=0.7, alpha=0.85, label=name)
+        if len(places) <= _MOST_NAMED:
+            axes.legend(**style.UPPER_LEFT_OUTSIDE, fontsize=_NAMES)
+        many = f"{len(places)} channel{'s' * (len(places) > 1)}"
+        axes.set_title(f"{kind}: {many}, {adapting}{note}")
+        axes.set_ylabel(recording.units)
+        _mark(axes, recording, view)
+        _mark_missing(axes, is_missing, recording.sample_rate_hz)
+    panels[-1].set_xlabel("time, s")
+    handles: list[Any] = []
+    if recording.onsets_s:
+        handles.append(Line2D([], [], label="onset of slip", **_ONSET))
+    if _slips(recording):
+        handles.append(Patch(label="slip", **_SLIP))
+    if recording.non_slip_s:
+        handles.append(Patch(label="non-slip", **_NON_SLIP))
+    if is_missing.any():
+        handles.append(Patch(color=style.INK, label=f"missing: {is_missing.sum()} samples"))
+    if handles:
+        style.legend_below(figure, handles, 4)
+    style.save(figure, path, dpi=120)
+
+
+def _mark_missing(axes: Axes, is_missing: NDArray[np.bool_], sample_rate_hz: float) -> None:
+    """A bar at the foot of a panel where samples are missing, wide enough to be seen."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_missing, [False]])))
+    least = len(is_missing) / 400
+    spans = [
+        (start / sample_rate_hz, max(stop - start, least) / sample_rate_hz)
+        for start, stop in zip(edges[::2], edges[1::2], strict=True)
+    ]
+    axes.broken_barh(
+        spans, (0, 0.05), transform=axes.get_xaxis_transform(), color=style.INK, linewidth=0
+    )

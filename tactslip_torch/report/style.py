@@ -14,7 +14,8 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-from matplotlib import rc_context
+import numpy as np
+from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -27,13 +28,19 @@ ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 PALETTE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 INK, GREY, LIGHT = "#222222", "#666666", "#DDDDDD"
 ALARM = "#C6361B"
+_EMPTY: set[object] = {None, "-"}
 _KIND_COLOURS = {"SG": ORANGE, "PVDF": BLUE}
 
 UPPER_LEFT_OUTSIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 
 
 # Tables ------------------------------------------------------------------------------------------
-def table(rows: Sequence[Mapping[str, object]], num_left: int = 1, merged: int = 0) -> str:
+def table(
+    rows: Sequence[Mapping[str, object]],
+    num_left: int = 1,
+    merged: int = 0,
+    kept: int | None = None,
+) -> str:
     """Columns padded to their widest cell: ``num_left`` flush left, the others flush right.
 
     Args:
@@ -42,6 +49,8 @@ def table(rows: Sequence[Mapping[str, object]], num_left: int = 1, merged: int =
         num_left: number of columns that hold words.
         merged: number of leading columns in which a cell that repeats the one above is left
             blank, as long as those to its left repeat as well.
+        kept: number of leading columns that are always there; behind them those are left out in
+            which no row has a value. ``None``: all are there.
 
     Example:
         >>> print(table([{"stage": "solve", "s": "9.50"}, {"stage": "total", "s": None}]))
@@ -49,6 +58,9 @@ def table(rows: Sequence[Mapping[str, object]], num_left: int = 1, merged: int =
         solve  9.50
         total     -
     """
+    if kept is not None and rows:
+        titles = [t for i, t in enumerate(rows[0]) if i < kept or {row[t] for row in rows} - _EMPTY]
+        rows = [{title: row[title] for title in titles} for row in rows]
     texts = cells(rows)
     shown = [list(row) for row in texts]
     for above, row, own in zip(texts[1:], texts[2:], shown[2:], strict=False):
@@ -197,6 +209,13 @@ def legend_below(figure: Figure, handles: Sequence[Any], ncols: int) -> None:
 def colours_of(names: Iterable[str]) -> dict[str, str]:
     """A colour for each name, in the order of ``PALETTE``."""
     return dict(zip(dict.fromkeys(names), cycle(PALETTE)))
+
+
+def shades(num: int) -> list[Any]:
+    """So many colours: those of ``PALETTE`` or, of more, a range from dark blue to yellow."""
+    if num <= len(PALETTE):
+        return list(PALETTE[:num])
+    return list(colormaps["viridis"](np.linspace(0, 0.92, num)))
 
 
 def kind_colours(kinds: Iterable[str]) -> dict[str, str]:

@@ -1,0 +1,978 @@
+"""What a folder of recordings is: its channels, rate, labels and groups, each with the reason.
+
+``look`` reads some of the files, ``propose`` decides. What neither tells is a ``Question``; a
+person's answers go in as ``Answers``. Nothing is written here.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import detrend
+
+from tactslip_torch.data.clock import even_clock, nominal_rate
+from tactslip_torch.data.file_names import name_pattern, word_choices
+from tactslip_torch.data.folder import guessed, recording_files
+from tactslip_torch.data.formats import Opened, Reading, find_format, open_file
+from tactslip_torch.data.formats._inference import (
+    NUMBER,
+    SECONDS,
+    TimeUnit,
+    cells_of,
+    is_time,
+    no_channels,
+    text_layout,
+    time_unit_in,
+    without_comment,
+)
+from tactslip_torch.data.formats._text import _opened_text
+from tactslip_torch.data.manifest import MANIFEST, Entry, label_of, read_manifest
+from tactslip_torch.signals.wavelet import highest_level
+
+_Numbers = NDArray[np.float64]
+_MOST_FILES = 40  # that are read
+_MOST_BYTES = 200e6  # of files that are read, beside the first three
+_HEAD = 2**16  # characters that show the layout of a text
+_SAME_RATE = 0.01  # rates of files that differ by less are one
+_EDGE_HZ, _SLOWEST_HZ = 5.0, 50.0
+_CLEARLY = 0.75  # of the variance on one side: channels of one name that disagree are two kinds
+_BIN_S, _LEAST_BIN, _MOST_BIN = 0.05, 32, 1024
+_FRAMES_S: Mapping[str, float] = {"slow": 0.0255, "fast": 0.0055}
+_LEAST_FRAME = 5
+_MOST_STATES = 12  # different numbers of a column of labels; more are a speed or the like
+_FOLDS, _FEWEST_GROUPS = 10, 3
+_SLIP_NAMES = re.compile(r"slip|slid", re.IGNORECASE)
+_LABEL_NAMES = re.compile(
+    r"label|state|class|target|annotation|truth|event|contact|grasp|phase", re.IGNORECASE
+)
+_SPEED_UNITS = {"mm_s": "mm/s", "cm_s": "cm/s", "um_s": "um/s", "m_s": "m/s"}
+_UNIT_IN_NAME = re.compile(r"[(\[]\s*([^()\[\]]+?)\s*[)\]]\s*$")
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What a person says of a set; ``None`` where it is to be found.
+
+    Args:
+        rate_hz: samples a second.
+        units: of the samples.
+        time: the column of times.
+        time_unit: of them.
+        pattern: of the names of files, as ``folder.guessed`` reads it.
+        column: that has a label for each sample.
+        over: slip is where that column is above it.
+        words: of names, folders or the column, and whether each is slip; where words of one side
+            alone are given, all others are the other.
+    """
+
+    rate_hz: float | None = None
+    units: str | None = None
+    time: str | None = None
+    time_unit: TimeUnit | None = None
+    pattern: str | None = None
+    column: str | None = None
+    over: float | None = None
+    words: Mapping[str, bool] = field(default_factory=dict)
+
+
+class Question(NamedTuple):
+    """What a set does not tell.
+
+    Args:
+        name: the field of ``Answers`` that answers it.
+        text: what is asked, with what is known.
+        flag: of the command ``setup`` that answers it.
+        default: what is likely, if anything is.
+    """
+
+    name: str
+    text: str
+    flag: str
+    default: str = ""
+
+
+class Finding(NamedTuple):
+    """What was found, and why it is taken to be so."""
+
+    what: str
+    value: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """How a set is read, labelled and split.
+
+    Args:
+        settings: sections ``data``, ``labels``, ``features`` and ``split`` of a configuration.
+        reasons: of settings, by their keys, such as ``"labels.bin_ms"``.
+        findings: for people, in order.
+        questions: that are open; the first must be answered before more can be found.
+        manifest: rows of a manifest that is to be written, where a table of intervals was found.
+        example: a recording that shows what is labelled.
+    """
+
+    settings: Mapping[str, Mapping[str, Any]]
+    reasons: Mapping[str, str]
+    findings: tuple[Finding, ...]
+    questions: tuple[Question, ...] = ()
+    manifest: tuple[Mapping[str, str], ...] = ()
+    example: str = ""
+
+
+# Looking ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A file that was read.
+
+    Args:
+        file: relative to the folder.
+        names: of its columns but the times, by what ``Reading.channels`` takes.
+        samples: of the columns of numbers, by name, ``[T]`` each.
+        words: cells of the columns that hold words, by name.
+        times_s: of the samples, if the file has any.
+        time: the column of them.
+        time_unit: of them.
+        rate_hz: that the file states.
+        delimiter: of a text.
+        is_native: whether this package wrote it.
+    """
+
+    file: str
+    names: tuple[str | int, ...]
+    samples: Mapping[str | int, _Numbers]
+    words: Mapping[str | int, Sequence[str]] = field(default_factory=dict)
+    times_s: _Numbers | None = None
+    time: str | int | None = None
+    time_unit: TimeUnit | None = None
+    rate_hz: float | None = None
+    delimiter: str | None = None
+    is_native: bool = False
+
+    @property
+    def own_rate_hz(self) -> float | None:
+        """As the file states it, or by the median step of its times."""
+        if self.times_s is None or len(self.times_s) < 2:
+            return self.rate_hz
+        step_s = float(np.median(np.diff(self.times_s)))
+        return 1 / step_s if step_s > 0 else None
+
+
+@dataclass(frozen=True)
+class Look:
+    """The files of a folder, and what some of them hold.
+
+    Args:
+        folder: the set.
+        files: all of them, relative to it.
+        tables: those that were read.
+        intervals: a table of when slip is, if there is one, with its rows.
+        problems: why files could not be read, each a line.
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    tables: tuple[_Table, ...]
+    intervals: tuple[str, tuple[Mapping[str, str], ...]] | None = None
+    problems: tuple[str, ...] = ()
+
+
+def look(folder: Path, answers: Answers | None = None) -> Look:
+    """Read some of the recordings of a folder and of its folders, evenly chosen, at most 40.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        ValueError: if it holds no recording, or none that can be read.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder at {folder}")
+    paths = sorted(recording_files(folder, in_folders=True))
+    intervals = _intervals(folder, paths)
+    if intervals is not None:
+        paths = [path for path in paths if path.relative_to(folder).as_posix() != intervals[0]]
+    tables: list[_Table] = []
+    problems: list[str] = []
+    num_bytes = 0
+    places = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _MOST_FILES)).astype(int))
+    for place in places:
+        path = paths[place]
+        num_bytes += path.stat().st_size if path.is_file() else 0
+        if len(tables) >= _FEWEST_GROUPS and num_bytes > _MOST_BYTES:
+            break
+        try:
+            tables.append(_table_of(folder, path, answers or Answers()))
+        except (ValueError, OSError) as error:
+            problems.append(str(error).replace(f"{folder}/", ""))
+    if not tables:
+        raise ValueError(problems[0])
+    common = Counter(table.names for table in tables).most_common(1)[0][0]
+    alike = tuple(table for table in tables if table.names == common)
+    problems += [f"{t.file} has other columns" for t in tables if t.names != common]
+    files = tuple(path.relative_to(folder).as_posix() for path in paths)
+    return Look(folder, files, alike, intervals, tuple(problems))
+
+
+def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
+    """What a file holds; of a text all columns, of others what is taken for channels or labels."""
+    words: dict[str | int, Sequence[str]] = {}
+    delimiter = None
+    how = Reading(time=answers.time or "auto", time_unit=answers.time_unit)
+    form = find_format(path)
+    is_text = form is not None and form.name == "text"
+    if is_text and form is not None and not form.is_native(path):
+        names, cells, delimiter = _cells(path)
+        words = {
+            name: column
+            for name, column in zip(names, cells, strict=True)
+            if any(cell and not NUMBER.fullmatch(cell.replace(",", ".")) for cell in set(column))
+        }
+        numbers = [name for name in names if name not in words]
+        how = replace(how, channels=numbers)
+        if names[0] == 0:  # without names
+            how = replace(how, time=answers.time)
+    with open_file(path, how) as opened:
+        if opened.archived is None and not is_text and opened.left_out and opened.names:
+            labels = [n for n in opened.left_out if _SLIP_NAMES.search(n) or _LABEL_NAMES.search(n)]
+            with open_file(path, replace(how, channels=(*opened.names, *labels))) as wider:
+                return _read(folder, path, wider, words, delimiter)
+        return _read(folder, path, opened, words, delimiter)
+
+
+def _read(
+    folder: Path,
+    path: Path,
+    opened: Opened,
+    words: Mapping[str | int, Sequence[str]],
+    delimiter: str | None,
+) -> _Table:
+    file = path.relative_to(folder).as_posix()
+    own = opened.archived
+    values = opened.samples.read(0, opened.samples.num_samples).double().numpy()
+    if own is not None:
+        names: Sequence[str | int] = own.hand.names
+    else:
+        names = opened.names or range(len(values))
+    samples = dict(zip(names, values, strict=True))
+    time: str | int | None = None
+    time = next((name for name in names if isinstance(name, str) and is_time(name)), None)
+    times = opened.times()
+    rate_hz = own.recording.sample_rate_hz if own else opened.sample_rate_hz
+    unit = opened.time_unit
+    if time is not None:
+        samples.pop(time)
+    elif times is None and rate_hz is None and own is None:
+        time, unit = _times_by_values(samples)
+        if time is not None and unit is not None:
+            times = samples.pop(time) * SECONDS[unit]
+    kept = (*samples, *words)
+    return _Table(
+        file, kept, samples, words, times, time, unit, rate_hz, delimiter, own is not None
+    )
+
+
+def _cells(path: Path) -> tuple[list[str | int], list[list[str]], str]:
+    """Names, columns of cells and the delimiter of a text table."""
+    with _opened_text(path) as text:
+        head = text.read(_HEAD)
+        layout = text_layout(head.rpartition("\n")[0] if len(head) == _HEAD else head)
+        text.seek(0)
+        lines = text.read().split("\n")[layout.first_line - 1 :]
+    lines = [without_comment(line) for line in lines if line.strip()]
+    if layout.delimiter == " ":
+        rows = [line.split() for line in lines]
+    else:
+        rows = list(csv.reader(lines, delimiter=layout.delimiter, skipinitialspace=True))
+    rows = [row[: layout.num_columns] for row in rows if len(row) >= layout.num_columns]
+    columns = [list(map(str.strip, column)) for column in zip(*rows, strict=True)]
+    return list(layout.names or range(layout.num_columns)), columns, layout.delimiter
+
+
+def _times_by_values(
+    samples: Mapping[str | int, _Numbers],
+) -> tuple[str | int | None, TimeUnit | None]:
+    """The first column that rises at nearly even steps, and the unit its name or size tells."""
+    for name, values in samples.items():
+        steps = np.diff(values)
+        if len(steps) < 8 or not (steps > 0).all() or (steps == 1).all():
+            continue
+        if np.quantile(steps, 0.9) > 3 * np.median(steps):
+            continue
+        ending = re.split(r"[\W_]+", str(name).strip("()[] "))[-1]
+        unit = time_unit_in(f"t_{ending}")
+        return name, unit or ("s" if np.median(steps) < 1 else "ms")
+    return None, None
+
+
+# Tables of intervals ------------------------------------------------------------------------------
+
+_STARTS = re.compile(r"(start|begin|from|onset)(_?(s|ms|sec|seconds|time))*", re.IGNORECASE)
+_ENDS = re.compile(r"(end|stop|to|until)(_?(s|ms|sec|seconds|time))*", re.IGNORECASE)
+_MOST_ROWS_BYTES = 2**20
+
+
+def _intervals(
+    folder: Path, paths: Sequence[Path]
+) -> tuple[str, tuple[Mapping[str, str], ...]] | None:
+    """A table in the folder that names recordings, with starts and ends, and its rows."""
+    known = {name: path for path in paths for name in (path.stem, path.name)}
+    known |= {path.relative_to(folder).as_posix(): path for path in paths}
+    for path in sorted(folder.glob("*.csv")):
+        if path.stat().st_size > _MOST_ROWS_BYTES or path.name == MANIFEST:
+            continue
+        text = path.read_text("utf-8-sig", "replace")
+        lines = [line for line in text.splitlines() if line.strip()]
+        if len(lines) < 2:
+            continue
+        delimiter = max(";,\t", key=lines[0].count)
+        names, *rows = (cells_of(line, delimiter) for line in lines)
+        rows = [row for row in rows if len(row) == len(names)]
+        starts = [n for n, name in enumerate(names) if _STARTS.fullmatch(name)]
+        ends = [n for n, name in enumerate(names) if _ENDS.fullmatch(name)]
+        named = [n for n in range(len(names)) if rows and all(row[n] in known for row in rows)]
+        if not (starts and ends and named):
+            continue
+        labels = [
+            n
+            for n in range(len(names))
+            if n not in (starts[0], ends[0], named[0]) and all(label_of(row[n]) for row in rows)
+        ]
+        scale = 1e-3 if "ms" in re.split(r"[\W_]+", names[starts[0]].lower()) else 1.0
+        table = []
+        for row in rows:
+            start, end = (float(row[n].replace(",", ".")) * scale for n in (starts[0], ends[0]))
+            label = label_of(row[labels[0]]) if labels else "slip"
+            file = known[row[named[0]]].relative_to(folder).as_posix()
+            span = {"start": f"{start:.10g}", "end": f"{end:.10g}"}
+            table.append({"file": file, **span, "label": label or ""})
+        return path.name, tuple(table)
+    return None
+
+
+def _manifest_rows(
+    rows: Sequence[Mapping[str, str]], fields: Mapping[str, Mapping[str, str]]
+) -> tuple[Mapping[str, str], ...]:
+    """Rows of a manifest: of each file its intervals; what lies between slips is non-slip.
+
+    If intervals of non-slip are given as well, what lies between is not labelled. Files without
+    an interval have no label.
+    """
+    spans_of: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
+    for row in rows:
+        spans_of[row["file"], row["label"]].append((float(row["start"]), float(row["end"])))
+    has_both = {row["label"] for row in rows} == {"slip", "non-slip"}
+    found = []
+    for file, known in fields.items():
+        slips, rest = sorted(spans_of[file, "slip"]), sorted(spans_of[file, "non-slip"])
+        if slips and not has_both:
+            edges = [0.0, *(edge for span in slips for edge in span), math.inf]
+            pairs = zip(edges[::2], edges[1::2], strict=True)
+            rest = [(start, end) for start, end in pairs if start < end]
+        spans = {"slip_s": slips, "non_slip_s": rest}
+        texts = {name: "; ".join(map(_span_text, each)) for name, each in spans.items()}
+        columns = {name: known.get(name, "") for name in ("material", "trial", "scene", "session")}
+        found.append({"file": file, **columns, **texts})
+    return tuple(found)
+
+
+def _span_text(span: tuple[float, float]) -> str:
+    start, end = span
+    return f"{start:.10g}-{'end' if end == math.inf else format(end, '.10g')}"
+
+
+# Proposing ----------------------------------------------------------------------------------------
+
+
+class _Draft:
+    """What is known so far; findings come in the order in which people read them."""
+
+    def __init__(self) -> None:
+        self.settings: dict[str, dict[str, Any]] = {
+            name: {} for name in ("data", "labels", "features", "split")
+        }
+        self.reasons: dict[str, str] = {}
+        self.findings: list[Finding] = []
+        self.questions: list[Question] = []
+
+    def set(self, key: str, value: Any, reason: str) -> None:
+        """A setting, such as ``labels.bin_ms`` or ``data.reading.time``."""
+        section, *inner, last = key.split(".")
+        place = self.settings[section]
+        for name in inner:
+            place = place.setdefault(name, {})
+        place[last] = value
+        self.reasons[key] = reason
+
+    def tell(self, what: str, value: str, reason: str) -> None:
+        self.findings.append(Finding(what, value, reason))
+
+
+def propose(found: Look, answers: Answers | None = None) -> Proposal:
+    """How a set is read, labelled and split, and what a person must say of it.
+
+    Args:
+        found: the set.
+        answers: what a person has said so far.
+    """
+    given, draft = answers or Answers(), _Draft()
+    first = found.tables[0]
+    endings = Counter(Path(file).suffix for file in found.files)
+    reason = f"{len(found.tables)} of them were read"
+    if found.problems:
+        reason += f"; not like the others: {'; '.join(found.problems[:3])}"
+    draft.tell("recordings", f"{len(found.files)} ({', '.join(endings)})", reason)
+    rate_hz = _propose_rate(found, given, draft)
+    label = _label_column(found, given)
+    channels = _channels(found, label, draft)
+    if not channels:
+        raise ValueError(
+            f"{found.folder}: no column of {first.file} can be a channel; it has "
+            f"{', '.join(map(str, first.names))}"
+        )
+    _propose_gaps(found, channels, draft)
+    kinds = _propose_kinds(found, channels, rate_hz, draft)
+    _propose_units(channels, given, draft)
+    if rate_hz:
+        _propose_bins(kinds, rate_hz, draft)
+    classes, manifest = _propose_labels_and_groups(found, label, given, draft)
+    return Proposal(
+        draft.settings,
+        draft.reasons,
+        tuple(draft.findings),
+        tuple(draft.questions),
+        manifest,
+        max(classes, key=lambda file: len(classes[file]), default=first.file),
+    )
+
+
+# Rate and times -----------------------------------------------------------------------------------
+
+
+def _propose_rate(found: Look, given: Answers, draft: _Draft) -> float:
+    """The rate as recordings will be read; 0 if it must be asked."""
+    table, reading = found.tables[0], "data.reading"
+    if all(one.is_native for one in found.tables):
+        rate_hz = float(table.rate_hz or 0.0)
+        draft.tell("rate", f"{rate_hz:g} Hz", "the files say it")
+        return rate_hz
+    rates, gaps, wrong = [], 0, ""
+    for one in found.tables:
+        if one.times_s is None:
+            rates += [one.rate_hz] if one.rate_hz else []
+            continue
+        try:
+            clock = even_clock(one.times_s, None, one.file)
+            rates.append(clock.sample_rate_hz)
+            gaps += sum(gap.missing for gap in clock.gaps)
+        except ValueError as error:
+            wrong = wrong or str(error)
+    if table.delimiter not in (None, ","):
+        draft.set(f"{reading}.delimiter", table.delimiter, "between the columns of the files")
+    has_times = table.times_s is not None and not wrong
+    if has_times and table.time is not None:
+        name = table.time
+        draft.set(f"{reading}.time", name, "the column of times, by its name")
+        if table.time_unit is not None:
+            draft.set(f"{reading}.time_unit", table.time_unit, "of the times")
+            draft.tell("time", f"column {name} in {table.time_unit}", "by its name")
+    elif table.times_s is None and not table.rate_hz:
+        draft.set(f"{reading}.time", None, "the files have no times")
+    if not has_times:
+        rate_hz = given.rate_hz or (rates[0] if rates and not wrong else 0.0)
+        if not rate_hz:
+            own = [one.own_rate_hz for one in found.tables if one.own_rate_hz]
+            default = f"{nominal_rate(float(np.median(own)), 0.01):g}" if own else ""
+            why = f"the times are uneven ({wrong})" if wrong else "the files have no times"
+            text = f"How many samples a second does each channel have? ({why})"
+            draft.questions.append(Question("rate_hz", text, "--rate HZ", default))
+            return 0.0
+        if wrong:
+            draft.set(f"{reading}.time", None, "the times are uneven; samples are taken as even")
+        reason = "stated" if given.rate_hz else "the files say it"
+        draft.set(f"{reading}.sample_rate_hz", rate_hz, reason)
+        draft.tell("rate", f"{rate_hz:g} Hz", reason)
+        return rate_hz
+    common = float(np.median(rates))
+    off = max(abs(rate / common - 1) for rate in rates)
+    if off > _SAME_RATE:
+        each = sorted({nominal_rate(rate, _SAME_RATE) for rate in rates})
+        rate_hz = given.rate_hz or each[-1]
+        shown = ", ".join(f"{rate:g}" for rate in each)
+        which = "the one stated" if given.rate_hz else "the highest"
+        reason = f"the files have {shown} Hz: all are resampled to {which}"
+        draft.set(f"{reading}.resample_hz", rate_hz, reason)
+    else:
+        rate_hz = given.rate_hz or nominal_rate(common, max(off, 1e-4))
+        reason = "by the times"
+        draft.set(f"{reading}.sample_rate_hz", rate_hz, reason)
+    missing = f"; {gaps} rows are missing in the files that were read" if gaps else ""
+    draft.tell("rate", f"{rate_hz:g} Hz", reason + missing)
+    return rate_hz
+
+
+def _propose_gaps(found: Look, channels: Sequence[str | int], draft: _Draft) -> None:
+    """What is done where samples are missing."""
+    if found.tables[0].is_native:
+        return
+    num = sum(int((~np.isfinite(t.samples[name])).sum()) for t in found.tables for name in channels)
+    what = "bins that would need missing samples are left out"
+    draft.set("data.reading.gaps", "missing", what)
+    if num:
+        draft.tell("empty cells", f"{num}", f"in the files that were read; {what}")
+
+
+# Columns ------------------------------------------------------------------------------------------
+
+
+class _Label(NamedTuple):
+    """The column of labels: its different values, words or numbers, and why it is one."""
+
+    name: str | int
+    words: tuple[str, ...]
+    numbers: tuple[float, ...]
+    reason: str
+
+
+def _label_column(found: Look, given: Answers) -> _Label | None:
+    """The column that says of each sample whether it is slip, if one does."""
+    names = found.tables[0].names
+    if given.column is not None:
+        wanted: str | int = int(given.column) if given.column.isdecimal() else given.column
+        if wanted not in names:
+            raise ValueError(
+                f"{found.tables[0].file} has no column {given.column!r}; it has "
+                f"{', '.join(map(str, names))}"
+            )
+        return _label_values(found, wanted, "stated")
+    candidates = []
+    for name in names:
+        label = _label_values(found, name, "by its name")
+        points = 2 * bool(_SLIP_NAMES.search(str(name))) + bool(_LABEL_NAMES.search(str(name)))
+        num = len(label.words) or len(label.numbers)
+        is_told = all(map(label_of, label.words)) if label.words else num == 2
+        if num < 2:
+            continue
+        if not points and is_told:
+            what = "words of slip and non-slip" if label.words else "two values"
+            points, label = 1, label._replace(reason=f"it holds {what}")
+        if points and (num <= _MOST_STATES or _SLIP_NAMES.search(str(name))):
+            candidates.append((points + is_told / 2, label))
+    return max(candidates, key=lambda one: one[0])[1] if candidates else None
+
+
+def _label_values(found: Look, name: str | int, reason: str) -> _Label:
+    words: set[str] = set()
+    numbers: set[float] = set()
+    for table in found.tables:
+        if name in table.words:
+            words.update(filter(None, table.words[name]))
+        elif name in table.samples:
+            values = table.samples[name]
+            numbers.update(np.unique(values[np.isfinite(values)]).tolist())
+    if words:
+        numbers = set()
+    return _Label(name, tuple(sorted(words)), tuple(sorted(numbers)), reason)
+
+
+def _channels(found: Look, label: _Label | None, draft: _Draft) -> list[str | int]:
+    """The columns that are channels; those that are not are told, each with its reason."""
+    table = found.tables[0]
+    if table.is_native:
+        return list(table.samples)
+    names = list(map(str, table.names))
+    beside = {table.names[place] for place in no_channels(names)}
+    left: dict[str | int, str] = dict.fromkeys(table.words, "holds words")
+    channels: list[str | int] = []
+    for name in table.samples:
+        columns = [one.samples[name] for one in found.tables if name in one.samples]
+        values = [column[np.isfinite(column)] for column in columns]
+        if label is not None and name == label.name:
+            left[name] = "has the labels"
+        elif name in beside:
+            left[name] = "by its name"
+        elif all(len(column) > 2 and (np.diff(column) == 1).all() for column in columns):
+            left[name] = "counts the rows"
+        elif len({value for column in values for value in np.unique(column)[:2]}) < 2:
+            left[name] = "never changes"
+        else:
+            channels.append(name)
+    if {*left} - beside:
+        draft.set("data.reading.channels", channels, "the columns of channels; others hold none")
+    if label is not None:
+        left.pop(label.name, None)
+    for name, reason in left.items():
+        draft.tell("no channel", f"column {name}", reason)
+    return channels
+
+
+def _stems(names: Sequence[str]) -> list[str] | None:
+    """The kind of each name, where each has two channels or more; ``None`` if names show none."""
+    for ending in (r"[\W_]*(\d.*|[xyzXYZ])?$", r"[\W_][^\W_]+$"):
+        stems = [re.sub(ending, "", name) for name in names]
+        counts = Counter(stems)
+        if all(stems) and min(counts.values()) > 1:
+            return [re.sub(r"\W+", "_", stem) for stem in stems]
+    return None
+
+
+def _fast_part(values: _Numbers, rate_hz: float) -> float:
+    """How much of the variance lies above 5 Hz, a straight line taken off; NaN if there is none."""
+    is_there = np.isfinite(values)
+    if not rate_hz or is_there.sum() < _LEAST_BIN:
+        return math.nan
+    ticks = np.arange(len(values))
+    even = detrend(np.interp(ticks, ticks[is_there], values[is_there]))
+    power = np.abs(np.fft.rfft(even * np.hanning(len(even)))) ** 2
+    is_above = np.fft.rfftfreq(len(even), 1 / rate_hz) > _EDGE_HZ
+    return float(power[is_above].sum() / power.sum()) if power.sum() > 0 else math.nan
+
+
+def _propose_kinds(
+    found: Look, channels: Sequence[str | int], rate_hz: float, draft: _Draft
+) -> dict[str, str]:
+    """Rows of channels; how each kind adapts."""
+    if found.tables[0].is_native:
+        draft.tell("channels", f"{len(channels)}", "the files say what they are")
+        return {}
+    names = [f"ch{name + 1}" if isinstance(name, int) else name for name in channels]
+    parts = [
+        float(np.nanmedian(each)) if np.isfinite(each).any() else 0.0
+        for each in (
+            np.array([_fast_part(t.samples[name], t.own_rate_hz or rate_hz) for t in found.tables])
+            for name in channels
+        )
+    ]
+    is_known = rate_hz >= _SLOWEST_HZ
+    stems = _stems(names)
+    kinds = stems or ["fast" if part > 0.5 and is_known else "slow" for part in parts]
+    for kind in set(kinds) if stems and is_known else ():
+        own = [part for part, other in zip(parts, kinds, strict=True) if other == kind]
+        if min(own) < 1 - _CLEARLY and max(own) > _CLEARLY:
+            kinds = [
+                f"{k}_{'fast' if p > 0.5 else 'slow'}" if k == kind else k
+                for k, p in zip(kinds, parts, strict=True)
+            ]
+    adapting = {}
+    for kind in dict.fromkeys(kinds):
+        own = [part for part, other in zip(parts, kinds, strict=True) if other == kind]
+        part = float(np.median(own))
+        adapting[kind] = "fast" if is_known and part > 0.5 else "slow"
+        reason = f"{100 * part:.0f} % of the variance is above {_EDGE_HZ:g} Hz"
+        if not is_known:
+            reason = f"below {_SLOWEST_HZ:g} Hz all channels are slow"
+        shown = [name for name, other in zip(names, kinds, strict=True) if other == kind]
+        listed = ", ".join(shown if len(shown) < 7 else [*shown[:3], "...", shown[-1]])
+        value = f"{kind}: {len(own)} {adapting[kind]} channel{'s' * (len(own) > 1)} ({listed})"
+        draft.tell("kind", value, reason)
+        draft.reasons[f"kind.{kind}"] = f"{adapting[kind]}: {reason}"
+    rows = [
+        {"name": name, "kind": kind, "adapting": adapting[kind]}
+        for name, kind in zip(names, kinds, strict=True)
+    ]
+    reason = "kinds by the names" if stems else "kinds by the spectrum; names do not tell any"
+    draft.set("data.channels", rows, f"{reason}. Fast: more than half of the variance above 5 Hz")
+    if isinstance(channels[0], int):
+        draft.set(
+            "data.reading.channels", list(channels), "columns have no names; by number from 0"
+        )
+    return adapting
+
+
+def _propose_units(channels: Sequence[str | int], given: Answers, draft: _Draft) -> None:
+    """The unit of samples, as names say it in brackets, or as it is stated, or volts."""
+    told = [found[1] if (found := _UNIT_IN_NAME.search(str(name))) else "" for name in channels]
+    units, reason = given.units, "stated"
+    if units is None and len(set(told)) == 1 and told[0]:
+        units, reason = told[0], "by the names of channels"
+    if units is None:
+        units, reason = "V", "assumed; it names the axis of figures, --units states another"
+    draft.set("data.units", units, reason)
+    draft.tell("units", units, reason)
+
+
+# Bins ---------------------------------------------------------------------------------------------
+
+
+def bin_samples(rate_hz: float) -> int:
+    """The length of a bin: 50 ms or more, an even number of samples from 32 to 1024.
+
+    Of lengths up to a quarter longer the first is taken that is a whole number of microseconds.
+
+    Example:
+        >>> bin_samples(1000.0), bin_samples(100.0), bin_samples(24.0)
+        (50, 32, 36)
+    """
+    least = max(2 * round(_BIN_S * rate_hz / 2), _LEAST_BIN)
+    least = min(least, _MOST_BIN)
+    lengths = range(least, min(least + least // 4, _MOST_BIN) + 1, 2)
+    return next((n for n in lengths if (1e6 * n / rate_hz).is_integer()), least)
+
+
+def filter_frame(adapting: str, rate_hz: float) -> int | None:
+    """The filter's frame in samples: 25.5 ms of slow channels, 5.5 ms of fast ones, odd.
+
+    ``None``, no filter, where that is fewer than 5 samples.
+
+    Example:
+        >>> [filter_frame(a, rate) for rate in (2000.0, 1000.0, 100.0) for a in ("slow", "fast")]
+        [51, 11, 25, 5, None, None]
+    """
+    num = 2 * round((_FRAMES_S[adapting] * rate_hz - 1) / 2) + 1
+    return num if num >= _LEAST_FRAME else None
+
+
+def _propose_bins(kinds: Mapping[str, str], rate_hz: float, draft: _Draft) -> None:
+    """Length and distance of bins, and the filters of kinds."""
+    num = bin_samples(rate_hz)
+    bin_ms, hop_ms = 1000 * num / rate_hz, 500 * num / rate_hz
+    reason = f"{num} samples" + (", the fewest that are described well" if num < 40 else "")
+    draft.set("labels.bin_ms", bin_ms, f"{reason} at {rate_hz:g} Hz")
+    draft.set("labels.hop_ms", hop_ms, "half a bin: a decision every so many ms")
+    draft.set("labels.assign", "majority", "a bin is slip if most of its samples are")
+    draft.tell("bins", f"{bin_ms:.4g} ms, a hop of {hop_ms:.4g} ms", reason)
+    frames = {kind: filter_frame(adapting, rate_hz) for kind, adapting in kinds.items()}
+    if frames:
+        rule = "filter of each kind in samples: 25.5 ms if slow, 5.5 ms if fast; null: not filtered"
+        draft.set("features.frames", frames, rule)
+        texts = [f"{kind} {num or 'none'}" for kind, num in frames.items()]
+        draft.tell("filters", ", ".join(texts), "25.5 ms of slow, 5.5 ms of fast channels")
+    level = min(highest_level(num), 4)
+    draft.set("features.level", None, f"wavelet levels: as many as {num} samples allow, {level}")
+
+
+# Labels and groups --------------------------------------------------------------------------------
+
+
+def _propose_labels_and_groups(
+    found: Look, label: _Label | None, given: Answers, draft: _Draft
+) -> tuple[Mapping[str, set[bool]], tuple[Mapping[str, str], ...]]:
+    """What says where slip is, what is an object, and what is left out in evaluation.
+
+    Returns:
+        Of files whether they hold slip, none, or both, and the rows of a manifest, where a table
+        of intervals is to become one.
+    """
+    has_manifest = (found.folder / MANIFEST).is_file()
+    fields: Mapping[str, Mapping[str, str]]
+    by_name: dict[str, bool] = {}
+    classes: dict[str, set[bool]] = {}
+    is_told = has_manifest or found.intervals is not None or found.tables[0].is_native
+    if label is not None:
+        classes = _propose_label_column(found, label, given, draft)
+    elif found.intervals is not None and not has_manifest:
+        name = found.intervals[0]
+        draft.tell(
+            "labels", f"intervals of {name}", f"it names recordings; {MANIFEST} is made of it"
+        )
+        for row in found.intervals[1]:
+            classes.setdefault(row["file"], {False}).add(row["label"] == "slip")
+    elif not is_told:
+        by_name = _words_of_names(found.files, given, draft)
+        if not by_name:
+            return classes, ()
+    if has_manifest:
+        listing = read_manifest(found.folder / MANIFEST, found.folder)
+        fields = {
+            entry.file: {"material": entry.recording.material, "session": entry.recording.session}
+            for entry in listing.entries
+        }
+        classes |= {entry.file: _states_of(entry) for entry in listing.entries if entry.truth}
+        draft.tell("labels and objects", MANIFEST, "it lists the recordings")
+    else:
+        fields = _propose_pattern(found, by_name, given, draft)
+        if by_name:
+            lower = {word.lower(): slips for word, slips in by_name.items()}
+            classes = {file: {lower[each["label"].lower()]} for file, each in fields.items()}
+    if not fields:
+        return classes, ()
+    _propose_split(fields, classes, draft)
+    if found.intervals is not None and not has_manifest and label is None:
+        del draft.settings["data"]["pattern"]
+        return classes, _manifest_rows(found.intervals[1], fields)
+    return classes, ()
+
+
+def _states_of(entry: Entry) -> set[bool]:
+    """Whether a manifest says slip, non-slip or both of a recording."""
+    truth = entry.truth
+    if truth is None:
+        return set()
+    slips = truth.onsets_s or truth.sliding_s or truth.slip_s or truth.label == "slip"
+    rests = truth.onsets_s or truth.non_slip_s or truth.label == "non-slip"
+    return {state for state, is_there in ((True, slips), (False, rests)) if is_there}
+
+
+def _propose_label_column(
+    found: Look, label: _Label, given: Answers, draft: _Draft
+) -> dict[str, set[bool]]:
+    """Slip by a column; which of the files that were read hold slip and non-slip."""
+    draft.set(
+        "labels.column", label.name, f"says of each sample whether it is slip; {label.reason}"
+    )
+    classes: dict[str, set[bool]] = {}
+    if label.words:
+        known = {word: _is_slip(word, given.words) for word in label.words}
+        if unknown := [word for word, slips in known.items() if slips is None]:
+            text = (
+                f"Which words of column {label.name} mean slip, with commas between? It holds "
+                f"{', '.join(label.words)}"
+            )
+            draft.questions.append(Question("slip", text, f"--label {unknown[0]}=slip"))
+        slips = [word for word, is_slip in known.items() if is_slip]
+        if given.words and not unknown:
+            draft.set("labels.slip", slips, "words of that column that mean slip; others do not")
+        value = f"column {label.name}: {', '.join(slips) or '?'} is slip"
+        draft.tell("labels", value, label.reason)
+        for table in found.tables:
+            words = set(filter(None, table.words.get(label.name, ())))
+            classes[table.file] = {bool(known.get(word)) for word in words}
+        return classes
+    numbers = label.numbers
+    over = given.over
+    if over is None and len(numbers) == 2:
+        over = sum(numbers) / 2
+    if over is None:
+        is_few = len(numbers) <= _MOST_STATES
+        values = (
+            ", ".join(f"{number:g}" for number in numbers)
+            if is_few
+            else (f"numbers from {numbers[0]:g} to {numbers[-1]:g}")
+        )
+        default = f"{(numbers[0] + numbers[1]) / 2:g}" if is_few else ""
+        text = f"Above which value of column {label.name} is it slip? It holds {values}"
+        draft.questions.append(Question("over", text, "--over NUMBER", default))
+        over = float(default or "nan")
+    draft.set("labels.over", over, "slip is where that column is above it")
+    lower = str(label.name).lower()
+    unit = next((unit for end, unit in _SPEED_UNITS.items() if lower.endswith(end)), None)
+    if unit is not None and len(numbers) > _MOST_STATES:
+        draft.set("labels.unit", unit, "of that column, a speed")
+    draft.tell("labels", f"column {label.name} above {over:g} is slip", label.reason)
+    for table in found.tables:
+        values_of = table.samples[label.name]
+        states = np.unique(np.abs(values_of[np.isfinite(values_of)]) > over)
+        classes[table.file] = set(map(bool, states))
+    return classes
+
+
+def _is_slip(word: str, words: Mapping[str, bool]) -> bool | None:
+    """Whether a word means slip: as stated, all others the other side; else as people spell it."""
+    stated = {one.lower(): slips for one, slips in words.items()}
+    if word.lower() in stated:
+        return stated[word.lower()]
+    if stated and len(set(stated.values())) == 1:
+        return not next(iter(stated.values()))
+    label = label_of(word)
+    return None if label is None else label == "slip"
+
+
+def _words_of_names(files: Sequence[str], given: Answers, draft: _Draft) -> dict[str, bool]:
+    """The words of names or folders that are labels; asks where there is none that is known."""
+    choices = word_choices(files)
+    if given.pattern is not None and "{label" in given.pattern:
+        read = [guessed(file, given.pattern).get("label") for file in files]
+        choices = [tuple(sorted({word for word in read if word}))]
+    for words in choices:
+        stated = {one.lower() for one in given.words}
+        if stated and not stated <= {word.lower() for word in words}:
+            continue
+        known = {word: _is_slip(word, given.words) for word in words}
+        both = {slips for slips in known.values() if slips is not None}
+        if both == {True, False} and None not in known.values():
+            labels = {word: "slip" if slips else "non-slip" for word, slips in known.items()}
+            reason = "stated; the others are the other" if stated else "by the words in names"
+            draft.set("data.labels", labels, "what the words in names and folders mean")
+            rest = ", ".join(word for word, slips in known.items() if not slips)
+            draft.tell("labels", f"by names: {rest} is non-slip", reason)
+            return {word: bool(slips) for word, slips in known.items()}
+    if given.words:
+        raise ValueError(
+            f"no part of all names holds the words {', '.join(given.words)}; names tell apart "
+            f"{' or '.join('|'.join(words) for words in choices) or 'nothing'}"
+        )
+    listed = "; or ".join(", ".join(words[:12]) for words in choices)
+    text = (
+        "Nothing tells which recordings slip. Which word in the names of files or folders, or "
+        "which words with commas between, mean that nothing slips?"
+        + (f" They have {listed}" if listed else "")
+    )
+    draft.questions.append(Question("non_slip", text, "--non-slip WORD, or --column NAME"))
+    return {}
+
+
+def _propose_pattern(
+    found: Look, by_name: Mapping[str, bool], given: Answers, draft: _Draft
+) -> Mapping[str, Mapping[str, str]]:
+    """How names are read; what they tell of each file."""
+    fields: dict[str, Mapping[str, str]]
+    if given.pattern is not None:
+        draft.set("data.pattern", given.pattern, "how names are read; stated")
+        read = {file: guessed(file, given.pattern) for file in found.files}
+        fields = {file: each for file, each in read.items() if each}
+        if not fields:
+            raise ValueError(f"no file has a name that matches --pattern {given.pattern!r}")
+        reason = "stated"
+    else:
+        pattern = name_pattern(found.files, tuple(by_name))
+        if pattern.is_simple and by_name:
+            text = (
+                "How are the names made, such as {label}/{material}_{trial}? The first is "
+                f"{found.files[0]}"
+            )
+            draft.questions.append(Question("pattern", text, "--pattern PATTERN"))
+            return {}
+        draft.set("data.pattern", pattern.pattern, "how the names of files and folders are read")
+        fields = dict(zip(found.files, pattern.fields, strict=True))
+        reason = (
+            "no part of the names repeats" if pattern.is_simple else "each name has one reading"
+        )
+    shown = draft.settings["data"]["pattern"]
+    draft.tell("names", shown, reason)
+    counts = Counter(each["material"] for each in fields.values())
+    if len(counts) < len(fields):
+        listed = ", ".join(f"{name} ({num})" for name, num in list(counts.items())[:8])
+        more = f" and {len(counts) - 8} more" if len(counts) > 8 else ""
+        draft.tell("objects", f"{len(counts)}: {listed}{more}", "by the names, with their files")
+        for name in (name for name, num in counts.items() if num == 1):
+            others = [other for other, num in counts.items() if num > 1]
+            if near := get_close_matches(name, others, 1):
+                renaming = f"data.rename: {{{name}: {near[0]}}}"
+                draft.tell("look", f"object {name} has one file", f"if misspelt, add {renaming}")
+    return fields
+
+
+def _propose_split(
+    fields: Mapping[str, Mapping[str, str]], classes: Mapping[str, set[bool]], draft: _Draft
+) -> None:
+    """What is left out, one after the other, to estimate how good a detector is on new ones."""
+    by = "recording"
+    for name in ("material", "session"):
+        groups: dict[str, set[bool]] = defaultdict(set)
+        for file, known in classes.items():
+            if (value := fields.get(file, {}).get(name)) is not None:
+                groups[value] |= known
+        num = sum(states == {True, False} for states in groups.values())
+        is_grouped = len(groups) < len(fields)
+        if num >= _FEWEST_GROUPS and is_grouped:
+            by = name
+            break
+    words = {"material": "object", "session": "session", "recording": "recording"}
+    reason = {
+        "material": f"{num} objects have slip and non-slip",
+        "session": f"{num} sessions have slip and non-slip",
+        "recording": f"fewer than {_FEWEST_GROUPS} objects or sessions have slip and non-slip",
+    }[by]
+    draft.set("split.by", by, f"what is left out for the estimate; {reason}")
+    draft.set("split.folds", _FOLDS, "groups are joined to at most so many, each left out once")
+    draft.tell("estimate", f"one {words[by]} after the other is left out", reason)

@@ -1,0 +1,306 @@
+"""Setup: what is proposed for recordings of a hand that nobody knows, and what is asked."""
+
+import re
+import zlib
+from itertools import pairwise
+
+import numpy as np
+import own_gripper
+import pytest
+import yaml
+
+from tactslip_torch.commands import setup
+from tactslip_torch.data.file_names import name_pattern
+from tactslip_torch.data.proposal import Answers, bin_samples, filter_frame, look, propose
+
+# Names ---------------------------------------------------------------------------------------
+
+
+def names(form, **values):
+    """Names of files, one of each combination of the values."""
+    rows = [{}]
+    for key, each in values.items():
+        rows = [{**row, key: value} for row in rows for value in each]
+    return [form.format(**row) for row in rows]
+
+
+OBJECTS = ("cup", "big_box", "tea_can")
+NAMES = [
+    (names("{a}_{n}.csv", a=OBJECTS, n=range(3)), (), "{material}_{trial}"),
+    (names("{a}{n}.csv", a=("cup", "box"), n=range(3)), (), "{material}{trial}"),
+    (
+        names("{a}_{s}_3_{n}.csv", a=OBJECTS, s="CD", n=(7, 8)),
+        (),
+        "{material}_{scene:C|D}_3_{trial}",
+    ),
+    (
+        names("{a}_{s}_{m}_{n}.csv", a=OBJECTS, s="CD", m=(3, 8), n=(1, 2)),  # n repeats
+        (),
+        "{material}_{scene:C|D}_*",
+    ),
+    (
+        names("csvs/{w}/{a}{n}.csv", w="tn", a=("cup", "box"), n=range(3)),  # n repeats
+        ("t", "n"),
+        "{label}/{material:box|cup}*",
+    ),
+    (
+        names("{d}/{a}_{n}.csv", d=("2026-11-10", "2026-11-12"), a=OBJECTS, n=range(3)),
+        (),
+        "{session}/{material}_{trial}",
+    ),
+    (
+        names("{a}_session{s}_{n}.csv", a=OBJECTS, s=(1, 2), n=range(3)),
+        (),
+        "{material}_session{session}_{trial}",
+    ),
+    (
+        names("{a}_{w}_{n}.csv", a=OBJECTS, w=("slip", "no_slip"), n=(1, 2)),
+        ("slip", "no_slip"),
+        "{material:big_box|cup|tea_can}_{label:no_slip|slip}_*",
+    ),
+    (names("obj{a}_trial{n}.csv", a=range(4), n=range(3)), (), "obj{material}_trial{trial}"),
+    (names("rec{n}.csv", n=range(9)), (), "{material}"),
+]
+
+
+@pytest.mark.parametrize(("files", "words", "pattern"), NAMES)
+def test_a_pattern_for_names_is_found(files, words, pattern):
+    found = name_pattern(files, words)
+    assert found.pattern == pattern
+    assert len(found.fields) == len(files)
+    for file, fields in zip(files, found.fields, strict=True):
+        assert fields["material"] in file
+        assert fields.get("label", "") in file.split("/")[-2:][0]
+    assert found.is_simple == (pattern == "{material}")
+
+
+# Bins and filters ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 24.0, 92.31, 100.0, 640.0, 1000.0, 1024.0, 2000.0, 5e4])
+def test_bins_and_frames_fit_the_rate(rate_hz):
+    num = bin_samples(rate_hz)
+    assert num % 2 == 0  # so that half of it is a hop
+    assert num == pytest.approx(np.clip(0.05 * rate_hz, 32, 1024), rel=0.25)
+    for adapting, seconds in (("slow", 0.0255), ("fast", 0.0055)):
+        frame = filter_frame(adapting, rate_hz)
+        if frame is None:
+            assert seconds * rate_hz < 5
+        else:
+            assert frame % 2 == 1
+            assert abs(frame - seconds * rate_hz) <= 1
+
+
+# Proposals -----------------------------------------------------------------------------------
+
+
+def write(path, columns, step=0.01, **others):
+    """A table of 400 rows: columns of noise and those that are given; no times for step 0."""
+    rng = np.random.default_rng(zlib.crc32(path.name.encode()))
+    table = {"time": np.arange(400) * step} if step else {}
+    table |= {name: rng.standard_normal(400) for name in columns} | others
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [
+        ",".join(table),
+        *(",".join(map(str, row)) for row in zip(*table.values(), strict=True)),
+    ]
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture(scope="module")
+def gripper(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("gripper")
+    own_gripper.write_recordings(folder, trials=2, seconds=2.0)
+    return folder
+
+
+def test_a_grippers_recordings_need_no_answer(gripper):
+    proposal = propose(look(gripper))
+    assert proposal.questions == ()
+    data = proposal.settings["data"]
+    assert data["pattern"] == "{material}_{trial}"
+    assert data["reading"] == {
+        "delimiter": ";",
+        "time": "t_ms",
+        "time_unit": "ms",
+        "sample_rate_hz": 1000.0,
+        "channels": list(own_gripper.CHANNELS),
+        "gaps": "missing",
+    }
+    kinds = {(row["kind"], row["adapting"]) for row in data["channels"]}
+    assert kinds == {("force", "slow"), ("acc", "fast")}
+    assert [row["name"] for row in data["channels"]] == list(own_gripper.CHANNELS)
+    labels = {"column": "state", "bin_ms": 50.0, "hop_ms": 25.0, "assign": "majority"}
+    assert proposal.settings["labels"] == labels
+    assert proposal.settings["features"] == {"frames": {"force": 25, "acc": 5}, "level": None}
+    assert proposal.settings["split"]["by"] == "material"
+
+
+@pytest.fixture
+def touches(tmp_path):
+    """Folders of classes, without times."""
+    for word in "nst":
+        for name in ("pen", "cup", "hd"):
+            for number in range(2):
+                write(tmp_path / word / f"{name}{number}.csv", ["e1", "e2"], step=0)
+    return tmp_path
+
+
+def test_folders_of_classes_ask_for_the_rate_and_the_word_of_non_slip(touches):
+    found, answers = look(touches), Answers()
+    asked = [question.name for question in propose(found, answers).questions]
+    assert asked == ["rate_hz", "non_slip"]
+    done = propose(found, Answers(rate_hz=100.0, words={"t": False}))
+    assert done.questions == ()
+    data = done.settings["data"]
+    assert data["labels"] == {"n": "slip", "s": "slip", "t": "non-slip"}
+    assert data["pattern"] == "{label}/{material:cup|hd|pen}*"
+    assert data["reading"]["time"] is None
+    assert data["reading"]["sample_rate_hz"] == 100.0
+    assert done.settings["labels"]["bin_ms"] == 320.0
+    assert done.settings["split"]["by"] == "material"
+    with pytest.raises(ValueError, match=r"no part of all names holds the words x; .*n\|s\|t"):
+        propose(found, Answers(rate_hz=100.0, words={"x": False}))
+
+
+def test_files_of_several_rates_and_a_column_of_several_values(tmp_path):
+    for name in ("cup", "box", "can"):
+        for number, step in enumerate((0.1, 0.025)):
+            states = np.repeat([0.0, 0.25, 1.0, np.nan], 100).tolist()
+            cells = ["" if np.isnan(one) else one for one in states]
+            write(tmp_path / f"{name}_{number}.csv", ["lx", "ly"], step=step, slip_over=cells)
+    (question,) = propose(look(tmp_path)).questions
+    assert (question.name, question.default) == ("over", "0.125")
+    done = propose(look(tmp_path), Answers(over=0.9))
+    assert done.questions == ()
+    reading = done.settings["data"]["reading"]
+    assert reading["resample_hz"] == 40.0
+    assert "sample_rate_hz" not in reading
+    assert done.settings["labels"]["column"] == "slip_over"
+    assert done.settings["labels"]["over"] == 0.9
+    assert {row["adapting"] for row in done.settings["data"]["channels"]} == {"slow"}  # < 50 Hz
+
+
+def test_uneven_times_ask_for_the_rate_and_are_left_out(tmp_path):
+    rng = np.random.default_rng(0)
+    for name in ("cup_1", "cup_2"):
+        times = np.cumsum(0.01 * rng.exponential(1, 400) + 0.005)
+        write(tmp_path / f"{name}.csv", ["a", "b"], time=times, slip=[0] * 200 + [1] * 200)
+    question, *_ = propose(look(tmp_path)).questions
+    assert question.name == "rate_hz"
+    assert float(question.default) > 0
+    reading = propose(look(tmp_path), Answers(rate_hz=80.0)).settings["data"]["reading"]
+    assert (reading["time"], reading["sample_rate_hz"]) == (None, 80.0)
+
+
+def test_a_table_of_intervals_becomes_a_manifest(tmp_path):
+    for name in ("cup_1", "cup_2", "box_1", "box_2"):
+        write(tmp_path / f"{name}.csv", ["a", "b"])
+    (tmp_path / "slips.csv").write_text(
+        "recording;start_ms;end_ms\ncup_1;1000;2500,5\ncup_1;3000;3500\nbox_2.csv;0;500\n"
+    )
+    proposal = propose(look(tmp_path))
+    assert proposal.questions == ()
+    assert "pattern" not in proposal.settings["data"]
+    rows = {row["file"]: row for row in proposal.manifest}
+    assert set(rows) == {"cup_1.csv", "cup_2.csv", "box_1.csv", "box_2.csv"}
+    assert rows["cup_1.csv"]["slip_s"] == "1-2.5005; 3-3.5"
+    assert rows["cup_1.csv"]["non_slip_s"] == "0-1; 2.5005-3; 3.5-end"
+    assert rows["box_2.csv"]["non_slip_s"] == "0.5-end"
+    assert rows["cup_2.csv"]["slip_s"] == rows["cup_2.csv"]["non_slip_s"] == ""  # nobody says
+    assert (rows["box_2.csv"]["material"], rows["box_2.csv"]["trial"]) == ("box", "2")
+    (tmp_path / "manifest.csv").write_text("file,material,slip_s\ncup_1.csv,cup,0-1\n")
+    assert propose(look(tmp_path)).manifest == ()  # one that is there is kept
+
+
+def test_columns_that_are_no_channels_are_told_with_the_reason(tmp_path):
+    words = np.repeat(["no slip", "slip"], 200).tolist()
+    counts = range(400)
+    for name in ("cup_1", "cup_2"):
+        more = {"nr": counts, "temperature": [20.5] * 400, "state": words, "note": ["x"] * 400}
+        write(tmp_path / f"{name}.csv", ["p (kPa)", "q (kPa)"], seq=counts, **more)
+    proposal = propose(look(tmp_path))
+    channels = [row["name"] for row in proposal.settings["data"]["channels"]]
+    assert channels == ["p (kPa)", "q (kPa)"]
+    assert proposal.settings["data"]["units"] == "kPa"
+    told = {f.value: f.reason for f in proposal.findings if f.what == "no channel"}
+    assert told == {
+        "column nr": "counts the rows",
+        "column seq": "by its name",
+        "column temperature": "never changes",
+        "column note": "holds words",
+    }
+    assert proposal.settings["labels"]["column"] == "state"
+
+
+KINDS = [
+    (["force_1", "force_2", "acc_x", "acc_y"], ["force", "force", "acc", "acc"]),
+    (["t1_x", "t1_y", "t2_x", "t2_y"], ["t"] * 4),
+    (["Fx", "Fy", "Ax", "Ay"], ["F", "F", "A", "A"]),
+    (["left_a", "left_b", "right_a", "right_b"], ["left", "left", "right", "right"]),
+    (["alpha", "beta"], ["fast", "fast"]),  # white noise at 100 Hz
+]
+
+
+@pytest.mark.parametrize(("channels", "kinds"), KINDS)
+def test_kinds_are_the_stems_of_names_or_fast_and_slow(tmp_path, channels, kinds):
+    for name in ("cup_1", "cup_2"):
+        write(tmp_path / f"{name}.csv", channels, slip=[0] * 200 + [1] * 200)
+    rows = propose(look(tmp_path)).settings["data"]["channels"]
+    assert [row["kind"] for row in rows] == kinds
+    assert {row["adapting"] for row in rows} == {"fast"}
+
+
+def test_channels_of_one_name_that_disagree_are_two_kinds(tmp_path):
+    for name in ("cup_1", "cup_2"):
+        drift = np.sin(np.arange(400) / 100)
+        write(tmp_path / f"{name}.csv", ["ch1"], ch2=drift, slip=[0] * 200 + [1] * 200)
+    rows = propose(look(tmp_path)).settings["data"]["channels"]
+    found = {row["name"]: (row["kind"], row["adapting"]) for row in rows}
+    assert found == {"ch1": ("ch_fast", "fast"), "ch2": ("ch_slow", "slow")}
+
+
+# The command ---------------------------------------------------------------------------------
+
+
+def test_hand_yaml_says_what_was_proposed_and_why(typed, gripper, drawn):
+    status, out, err = typed(setup, gripper, "--yes")
+    assert status == 0, err
+    assert f"next: tactslip train {gripper}" in out
+    text = (gripper / "hand.yaml").read_text()
+    settings = propose(look(gripper)).settings
+    assert yaml.safe_load(text) == settings
+    lines = text.splitlines()
+    for before, line in pairwise(lines):  # a reason on each line of a value, or above it
+        if re.match(r"\s+\w+: \S", line):
+            assert "#" in line or before.strip().startswith("#"), line
+    (figure,) = drawn
+    assert "6 channels at 1000 Hz" in figure.get_suptitle()
+    assert [axes.get_title(loc="left") for axes in figure.axes] == [
+        "force: 3 channels, slow",
+        "acc: 3 channels, fast",
+    ]
+    legend = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert "missing" in " ".join(legend)
+    status, _, err = typed(setup, gripper, "--yes")
+    assert status == 2
+    assert "hand.yaml is there already; --force replaces it" in err
+    assert typed(setup, gripper, "--yes", "--force")[0] == 0
+
+
+def test_what_cannot_be_guessed_names_its_flag(typed, touches, monkeypatch):
+    status, _, err = typed(setup, touches, "--yes")
+    assert status == 2
+    assert len(err.strip().splitlines()) == 1
+    assert "--rate HZ" in err
+    status, _, err = typed(setup, touches, "--yes", "--rate", "100")
+    assert status == 2
+    assert "--non-slip WORD" in err
+    assert not (touches / "hand.yaml").exists()
+    given = iter(["100", "t"])
+    monkeypatch.setattr("builtins.input", lambda text: next(given))
+    status, _, err = typed(setup, touches)
+    assert status == 0, err
+    assert yaml.safe_load((touches / "hand.yaml").read_text())["data"]["labels"]["n"] == "slip"
+    with pytest.raises(StopIteration):  # two questions and no more
+        next(given)
