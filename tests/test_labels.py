@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from tactslip_torch.data.labels import (
     NO_POSITION,
     LabelRule,
-    clear_of,
+    bins_of,
     label_bins,
 )
+from tactslip_torch.data.recording import Timeline
 
 RATE = 2000.0
 ONSETS = (2.0, 9.0, 13.5)  # as in the paper, with slides of 100 mm at 20, 40, 60 mm/s
@@ -164,13 +165,16 @@ def test_windows_have_the_label_of_most_samples_or_of_the_last(assign, layout, h
 
 
 def test_bins_that_need_missing_samples_are_left_out():
-    bins = lay(None, (), (), 3.0, non_slip_s=((0.0, 3.0),))
+    def laid(*missing_s, reach=(0, 0)):
+        times = Timeline(non_slip_s=((0.0, 3.0),), duration_s=3.0, missing_s=missing_s)
+        bins = bins_of(LabelRule(), times, RATE, *reach)
+        assert len(bins.starts) == len(bins.is_slip) == len(bins.stroke) == len(bins.position)
+        return set(bins.starts.tolist())
+
     gap = (1.0, 1.0 + 1 / RATE)
-    for before, after, expected in ((0, 0, [2000]), (25, 11, [1900, 2000])):
-        kept = clear_of(bins, [gap], before, after, RATE)
-        assert sorted(set(bins.starts.tolist()) - set(kept.starts.tolist())) == expected
-        assert len(kept.starts) == len(kept.is_slip) == len(kept.stroke) == len(kept.position)
-    assert 1900 in clear_of(bins, [(1.0 + 11 / RATE, 1.1)], 25, 11, RATE).starts.tolist()
+    assert laid() - laid(gap) == {2000}
+    assert laid() - laid(gap, reach=(25, 11)) == {1900, 2000}
+    assert 1900 in laid((1.0 + 11 / RATE, 1.1), reach=(25, 11))
 
 
 # Errors --------------------------------------------------------------------------------------

@@ -43,10 +43,8 @@ from tactslip_torch.data.recording import (
     RecordingId,
     Stretch,
     Timeline,
-    joined,
     on_time,
     scaled,
-    with_slides,
 )
 from tactslip_torch.hand import KNOWN_KINDS, Adapting, Channel, HandLayout
 from tactslip_torch.runtime import check_number, in_processes, setting, settings_in
@@ -645,10 +643,10 @@ class FileRecordings:
             known = head.own.recording
             own = Timeline(**{name: getattr(known, name) for name in (*MOMENTS, *STRETCHES)})
             if told is None or told == Timeline(missing_s=told.missing_s):
-                told = own if told is None else joined(own, told)
+                told = own if told is None else own.joined(told)
         elif head.labels is not None and self.label_column is not None:
             rate_hz = head.clock.sample_rate_hz / self._given.reading.samples_per_row
-            given = with_slides(told or Timeline(), len(head.labels) / rate_hz, self._slide_s)
+            given = (told or Timeline()).with_slides(len(head.labels) / rate_hz, self._slide_s)
             found = self.label_column.timeline(head.labels, rate_hz, given, self._skip_s)
             return head._replace(truth=found, labels=None, is_labelled=True)
         return head._replace(truth=told or Timeline())

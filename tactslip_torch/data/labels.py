@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactslip_torch.data.recording import Label, Stretch, Timeline, joined
+from tactslip_torch.data.recording import Label, Stretch, Timeline
 from tactslip_torch.runtime import check_choice, check_number
 
 Layout = Literal["whole_slide", "half_second"]
@@ -213,7 +213,7 @@ class LabelColumn:
             end = len(state) if end_s == math.inf else round(end_s * sample_rate_hz)
             state[round(start_s * sample_rate_hz) : end] = _TOLD
         found = _timeline_of(state, sample_rate_hz, speed, self.over_mm_s)
-        return joined(replace(told, label=None), found)
+        return replace(told, label=None).joined(found)
 
     @property
     def over_mm_s(self) -> float:
@@ -534,10 +534,10 @@ def bins_of(
         times.slip_s,
         times.unlabelled_s,
     )
-    return clear_of(bins, times.missing_s, before, after, sample_rate_hz)
+    return _clear_of(bins, times.missing_s, before, after, sample_rate_hz)
 
 
-def clear_of(
+def _clear_of(
     bins: LabelledBins,
     missing_s: Sequence[Stretch],
     before: int,

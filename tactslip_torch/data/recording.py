@@ -87,43 +87,41 @@ class Timeline:
     duration_s: float = 0.0
     unlabelled_s: tuple[Stretch, ...] = ()
 
+    def with_slides(self, duration_s: float, slide_s: float) -> Timeline:
+        """The same, in which every onset has its slide.
 
-def with_slides(truth: Timeline, duration_s: float, slide_s: float) -> Timeline:
-    """A timeline in which every onset has its slide.
+        One of which only the onset is known lasts ``slide_s``, or ends before that with the next onset,
+        stretch without slip, or the recording.
+        """
+        if self.sliding_s:
+            return self
+        onsets = self.onsets_s
+        stops = [*onsets, duration_s, *(start for start, _ in self.non_slip_s)]
+        ends = [min([onset + slide_s, *(s for s in stops if s > onset)]) for onset in onsets]
+        return replace(self, sliding_s=tuple(zip(onsets, ends, strict=True)))
 
-    One of which only the onset is known lasts ``slide_s``, or ends before that with the next onset,
-    stretch without slip, or the recording.
-    """
-    if truth.sliding_s:
-        return truth
-    onsets = truth.onsets_s
-    stops = [*onsets, duration_s, *(start for start, _ in truth.non_slip_s)]
-    ends = [min([onset + slide_s, *(s for s in stops if s > onset)]) for onset in onsets]
-    return replace(truth, sliding_s=tuple(zip(onsets, ends, strict=True)))
-
-
-def joined(told: Timeline, found: Timeline) -> Timeline:
-    """What two timelines say of different parts of a recording; every onset has its slide."""
-    strokes = sorted(
-        (onset, annotated, speed, slide)
-        for times in (told, found)
-        for onset, annotated, speed, slide in zip(
-            times.onsets_s,
-            times.annotated_onsets_s or times.onsets_s,
-            times.speeds_mm_s or (0.0,) * len(times.onsets_s),
-            times.sliding_s,
-            strict=True,
+    def joined(self, other: Timeline) -> Timeline:
+        """What both say, of different parts of a recording; every onset must have its slide."""
+        strokes = sorted(
+            (onset, annotated, speed, slide)
+            for times in (self, other)
+            for onset, annotated, speed, slide in zip(
+                times.onsets_s,
+                times.annotated_onsets_s or times.onsets_s,
+                times.speeds_mm_s or (0.0,) * len(times.onsets_s),
+                times.sliding_s,
+                strict=True,
+            )
         )
-    )
-    onsets, annotated, speeds, slides = zip(*strokes, strict=True) if strokes else ((),) * 4
-    spans: dict[str, Any] = {
-        name: tuple(sorted((*getattr(told, name), *getattr(found, name))))
-        for name in ("slip_s", "non_slip_s", "missing_s", "unlabelled_s")
-    }
-    is_known = told.released_s and not found.onsets_s
-    released = told.released_s if is_known else ()
-    both = replace(told, onsets_s=onsets, annotated_onsets_s=annotated, speeds_mm_s=speeds)
-    return replace(both, sliding_s=slides, released_s=released, **spans)
+        onsets, annotated, speeds, slides = zip(*strokes, strict=True) if strokes else ((),) * 4
+        spans: dict[str, Any] = {
+            name: tuple(sorted((*getattr(self, name), *getattr(other, name))))
+            for name in ("slip_s", "non_slip_s", "missing_s", "unlabelled_s")
+        }
+        is_known = self.released_s and not other.onsets_s
+        released = self.released_s if is_known else ()
+        both = replace(self, onsets_s=onsets, annotated_onsets_s=annotated, speeds_mm_s=speeds)
+        return replace(both, sliding_s=slides, released_s=released, **spans)
 
 
 def on_time(
@@ -141,7 +139,7 @@ def on_time(
         truth: as it was annotated.
         duration_s: of the recording.
         skip_s: at the start that a label of all of it does not stand for.
-        slide_s: how long a slide lasts of which only the onset is known, as ``with_slides`` has it.
+        slide_s: how long a slide lasts of which only the onset is known, as ``Timeline.with_slides`` has it.
         slack_s: by which a stretch may leave the recording; it is cut then.
         missing_s: further stretches without samples, of the file.
     """
@@ -161,7 +159,7 @@ def on_time(
         )
     if problems:
         return Timeline(duration_s=duration_s), problems
-    truth = with_slides(truth, duration_s, slide_s)
+    truth = truth.with_slides(duration_s, slide_s)
     onsets = truth.onsets_s
     cut: dict[str, Any] = {
         name: tuple((start, min(end, duration_s)) for start, end in getattr(truth, name))
