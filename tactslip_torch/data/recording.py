@@ -90,8 +90,8 @@ class Timeline:
     def with_slides(self, duration_s: float, slide_s: float) -> Timeline:
         """The same, in which every onset has its slide.
 
-        One of which only the onset is known lasts ``slide_s``, or ends before that with the next onset,
-        stretch without slip, or the recording.
+        One of which only the onset is known lasts ``slide_s``, or ends before that with the next
+        onset, stretch without slip, or the recording.
         """
         if self.sliding_s:
             return self
@@ -139,7 +139,7 @@ def on_time(
         truth: as it was annotated.
         duration_s: of the recording.
         skip_s: at the start that a label of all of it does not stand for.
-        slide_s: how long a slide lasts of which only the onset is known, as ``Timeline.with_slides`` has it.
+        slide_s: how long a slide lasts of which only the onset is known (``Timeline.with_slides``).
         slack_s: by which a stretch may leave the recording; it is cut then.
         missing_s: further stretches without samples, of the file.
     """
