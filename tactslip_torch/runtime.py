@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextvars import ContextVar
 from functools import lru_cache
 from numbers import Integral, Real
 from pathlib import Path
@@ -248,6 +249,30 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+_SECTION: ContextVar[str] = ContextVar("section", default="")
+
+
+@contextmanager
+def settings_in(section: str) -> Iterator[None]:
+    """Until it is left, ``setting`` names settings as those of a section, such as ``"data"``."""
+    token = _SECTION.set(f"{section}." if section else "")
+    try:
+        yield
+    finally:
+        _SECTION.reset(token)
+
+
+def setting(name: str) -> str:
+    """A setting as the user of the running command writes it, for messages.
+
+    Example:
+        >>> with settings_in("data"):
+        ...     setting("reading.time")
+        'data.reading.time'
+    """
+    return _SECTION.get() + name
 
 
 def check_number(name: str, value: Any, *, least: float | None = None, whole: bool = False) -> None:
