@@ -161,7 +161,7 @@ def _labelled(
     if not found:
         remedy = "label them, or say slip_free=true"
         if trained:
-            remedy = "record others, or say use_trained=true, with which no rate is promised"
+            remedy = "record others, or say use_trained=true, with which the stated rate is too low"
         raise ValueError(f"no recording is left to calibrate on: {remedy}")
     return found
 
