@@ -297,9 +297,18 @@ def test_a_mistake_is_one_line_and_nothing_is_written(command, general, tmp_path
 
 
 def test_recordings_of_the_training_are_left_out(command, general, recordings, tmp_path):
-    ran = command(tmp_path, "calibrate", *told(general.file, recordings, "data.materials=[A]"))
-    is_left = "use_trained=true" in ran.err or "left out, as the detector was trained" in ran.out
-    assert is_left
+    known = set(general.detector.info[names.TRAINING_RECORDINGS].values())
+    printed = command.well(tmp_path, "calibrate", *told(general.file, recordings))
+    report = json.loads((tmp_path / "run" / "calibration.json").read_text())
+    assert f"{len(known)} recordings are left out" in printed
+    used = set(report["recordings"].values())
+    assert used
+    assert not known & used
+    everything = told(general.file, recordings, "use_trained=true")
+    command.well(tmp_path, "calibrate", *everything)
+    report = json.loads((tmp_path / "run" / "calibration.json").read_text())
+    assert report["trained_on"]
+    assert known <= set(report["recordings"].values())
 
 
 def test_a_user_may_say_that_nothing_slips(command, general, tmp_path):
