@@ -105,7 +105,11 @@ def test_lost_samples_and_what_has_no_label_are_no_hours_without_slip():
     assert made.hours == pytest.approx(0.5, abs=0.001)
 
 
-@pytest.mark.parametrize(("rule", "offset"), [(KOfN(2, 3), 5.0), (Cusum(0.5, 0.5), 2.0)], ids=str)
+@pytest.mark.parametrize(
+    ("rule", "offset"),
+    [(KOfN(2, 3), 5.0), (Cusum(0.5, 0.5), 2.0), (Cusum(0.5, 0.5, 0.1), 2.0)],  # one set before
+    ids=str,
+)
 def test_every_rule_keeps_the_rate_on_what_it_was_set_on(rule, offset):
     settings = AlarmSettings(
         500, Platt(1.0, offset), rule, 0.0, None, rearm_s=1.0, refractory_s=1.0
