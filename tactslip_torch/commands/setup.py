@@ -81,6 +81,8 @@ def _answered(answers: Answers, question: Question, answer: str) -> Answers:
         return replace(answers, words={**answers.words, **words})
     if question.name == "pattern":
         return replace(answers, pattern=answer)
+    if question.name == "column":
+        return replace(answers, column=answer)
     number = _number(answer, question.flag)
     return (
         replace(answers, rate_hz=number)
@@ -122,12 +124,12 @@ def _lines(settings: Mapping[str, Any], place: str, reasons: Mapping[str, str]) 
             found += [f"{indent}{name}:", *_lines(value, key, reasons)]
         elif key == "data.channels":
             found.append(f"{indent}{name}:   # {reason}")
-            last = ""
+            told: set[str] = set()
             for row in value:
                 kind = row["kind"]
-                why = f"   # {reasons[f'kind.{kind}']}" if kind != last else ""
+                why = "" if kind in told else f"   # {reasons[f'kind.{kind}']}"
                 found.append(f"{indent}  - {_flow(row)}{why}")
-                last = kind
+                told.add(kind)
         else:
             line = f"{indent}{name}: {_flow(value)}"
             if len(line) + len(reason) + 5 <= _WIDTH:
