@@ -14,7 +14,6 @@ from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.features.pool import is_rounding
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.training.experiment import feature_maker
-from tactslip_torch.training.recipe import Paper
 
 any_hand = pytest.mark.parametrize("name", HANDS)
 
@@ -106,14 +105,3 @@ REFUSED = [
 def test_features_that_a_hand_cannot_have_are_refused_in_one_line(bin_ms, changes, message):
     with pytest.raises(ValueError, match=message):
         parts_of(bin_ms, **changes)
-
-
-@pytest.mark.parametrize(
-    ("name", "num"), [("one slow", 13), ("five slow", 65), ("one fast", 240), ("40 at 1 kHz", 3730)]
-)
-def test_more_features_than_a_small_hand_has_are_refused(name, num):
-    assert len(HANDS[name].pool().names) == num
-    pool = HANDS[name].pool()
-    Paper(num_features=num).allowed(pool)
-    with pytest.raises(ValueError, match=f"={num + 1} exceeds the pool's {num}; give at most"):
-        Paper(num_features=num + 1).allowed(pool)

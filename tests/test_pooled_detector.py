@@ -7,40 +7,16 @@ import copy
 
 import pytest
 import torch
-from hydra.utils import instantiate
-from test_commands import TINY, composed, run_train
+from test_commands import TINY, run_train
 
-from tactslip_torch import SlipDetector
-from tactslip_torch.onset.decisions import score_stream
+from tactslip_torch import SlipDetector, sample_recording
 
-HOP = 50
-MOST_MOVED = 1e-4  # of the scores' standard deviation
 DEAD = ("SG2", "SG9", "PVDF1", "PVDF7")
 
 
 @pytest.fixture(scope="module")
 def detector():
     return SlipDetector.pretrained("paper24-sim")
-
-
-@pytest.fixture(scope="module")
-def recording():
-    """A test recording in float64, with digits that float32 does not hold."""
-    source = instantiate(composed("+exp=quick").data, _convert_="all")
-    samples = source.load(source.ids[1]).samples.double()
-    generator = torch.Generator().manual_seed(0)
-    digits = torch.rand(samples.shape, generator=generator, dtype=torch.float64) - 0.5
-    return samples + digits * torch.finfo(torch.float32).eps * samples.abs()
-
-
-@pytest.fixture(scope="module")
-def whole(detector, recording):
-    return score_stream(detector, recording, HOP)
-
-
-def noise_like(samples, size=1e-9):
-    generator = torch.Generator().manual_seed(1)
-    return size * torch.randn(samples.shape, generator=generator, dtype=torch.float64)
 
 
 def test_a_damaged_pooling_is_refused(detector, tmp_path):
@@ -52,20 +28,11 @@ def test_a_damaged_pooling_is_refused(detector, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-# Must hold: last digits, and channels that get stuck ---------------------------------------------
-
-
-def test_a_nanovolt_of_noise_moves_no_score(detector, recording, whole):
-    found = score_stream(detector, recording + noise_like(recording), HOP)
-    sd = float(whole.score.std())
-    assert float((found.score - whole.score).abs().max()) < MOST_MOVED * sd
-    assert torch.equal(found.score >= 0, whole.score >= 0)
-
-
 # Dead channels -----------------------------------------------------------------------------------
 
 
-def test_dead_channels_are_left_out_of_their_pools(detector, recording):
+def test_dead_channels_are_left_out_of_their_pools(detector):
+    recording = sample_recording().samples.double()
     bins = recording.unfold(-1, 400, 400).transpose(0, 1)[:, :, : detector.pool.bin_samples]
     judged = detector.predict(bins, masked_channels=list(DEAD))
     mask = torch.tensor([name in DEAD for name in detector.pool.hand.names])

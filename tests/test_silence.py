@@ -305,15 +305,3 @@ def test_windows_with_missing_samples_are_predicted_and_not_fitted():
     assert np.isfinite(classifier.decision_function(missing)).all()
     with pytest.raises(ValueError, match="X holds NaN: window 0, channel 0, sample 0"):
         classifier.fit(missing, y)
-
-
-def test_min_alive_can_be_set(detector, volts):
-    own = SlipDetector.pretrained()
-    half = volts[:200].T.clone()[None]
-    half[:, 14:19] = torch.nan
-    raw = half[..., : own.context_before + 100 + own.context_after]
-    assert own.predict_raw(raw).is_valid.all()
-    own.sensing = replace(own.sensing, min_alive=6)
-    assert not own.predict_raw(raw).is_valid.any()
-    with pytest.raises(ValueError, match="min_alive is 11, of 10 channels that count"):
-        own.sensing = replace(own.sensing, min_alive=11)

@@ -20,6 +20,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from tactslip_torch.report import style
+from tactslip_torch.report.results import few_events
 from tactslip_torch.runtime import write_json
 
 Array = NDArray[np.float64]
@@ -28,7 +29,7 @@ Segments = Sequence[tuple[float, float]]
 
 REST, SLIP = style.BLUE, style.ORANGE
 COLUMNS = (
-    *("file", "alarm_s", "onset_s", "end_s", "score", "probability", "statistic", "is_valid"),
+    *("file", "alarm_s", "onset_s", "end_s", "score", "probability", "statistic"),
     *("in_range", "channels_lost", "raised_by"),
     *("outcome", "true_onset_s", "delay_s", "simulated"),
 )
@@ -281,8 +282,8 @@ def onsets_title(entry: Mapping[str, Any], *, of_simulated: bool) -> str:
         entry: of ``onsets.json``.
         of_simulated: whether the detector was trained on simulated data.
     """
-    title = [f"{'SIMULATED recording' if entry['simulated'] else 'Recording'} {entry['file']}"]
-    title += [f"material {entry['material']}"] if entry["material"] else []
+    of = f" of {entry['material']}" if entry["material"] else ""
+    title = [f"{'SIMULATED recording' if entry['simulated'] else 'Recording'} {entry['file']}{of}"]
     count = len(entry["alarms"])
     title += [f"{count} alarm{'s' * (count != 1)}"]
     if truth := entry["truth"]:
@@ -309,7 +310,8 @@ def onsets_table(content: Mapping[str, Any]) -> str:
         cells |= {"true onset s": _seconds(row["true_onset_s"])}
         cells |= {"delay s": _seconds(row["delay_s"]), "outcome": row["outcome"]}
         shown.append(cells)
-    lines = [style.table(shown, merged=1) if rows else "no alarm, and no slip missed"]
+    nothing = "no alarm, and no slip missed"
+    lines = [style.table(shown, merged=1, kept=1) if rows else nothing]
     if len(rows) > _MOST_ROWS:
         lines.append(f"and {len(rows) - _MOST_ROWS} more, see onsets.csv")
     return style.marked(content["simulated"], *lines)
@@ -347,6 +349,7 @@ def onsets_summary(content: Mapping[str, Any], seconds: float) -> str:
             f"false alarms: {events['num_false_alarms']} in {60 * events['quiet_hours']:.2f} "
             "minutes without slip"
         )
+        lines += [few] if (few := few_events(events)) else []
     return "\n".join(lines)
 
 

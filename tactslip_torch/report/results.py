@@ -23,6 +23,9 @@ from tactslip_torch.runtime import write_json
 
 PAPER_LINE = f"paper: {published.PAPER}; real hand, random split over bins"
 _PAPER_SCENE_LINE = "of several scenes: materials and speeds are of the paper's scene alone"
+_UNNAMED_SCENE = "unnamed"  # of recordings that are not the paper's, whose scene nothing says
+_SCENE_LINE = f"of several scenes: objects and speeds are of the scene {_UNNAMED_SCENE} alone"
+_NO_SPEED = {"0": "no slide", "nan": "speed not known"}
 BASELINES = {
     "best_pooled_number": "best pooled number",
     "logistic_regression": "logistic regression, same features",
@@ -30,6 +33,19 @@ BASELINES = {
     "random_forest_simple": "random forest on mean, std, rms",
 }
 """What baselines (``tactslip_torch.training.learner``) are called in tables."""
+_OF_SIMPLE = (
+    "try recipe.use=[channel], longer bins (labels.bin_ms) and recordings of more objects; where "
+    "it stays ahead, a classifier on mean, std and rms is the better one for this hand"
+)
+_ADVICE = {
+    "best_pooled_number": "try fewer features (recipe.num_features=[10,30]) and more recordings",
+    "logistic_regression": "try recipe.degree=[1], which is linear as well, and more recordings",
+    "logistic_regression_simple": _OF_SIMPLE,
+    "random_forest_simple": _OF_SIMPLE,
+}
+"""What to do where a baseline is ahead."""
+FEWEST_SLIPS, FEWEST_HOURS = 30, 1
+"""Slips and hours without slip below which a rate says little."""
 _SCORES = {
     "accuracy": "accuracy %",
     "balanced_accuracy": "balanced %",
@@ -73,7 +89,8 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
 
 def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> None:
     """Print the tables of a run."""
-    texts = [splits_table(metrics), *_trained_on_lines(metrics), materials_table(metrics)]
+    texts = [splits_table(metrics), *_comparison_lines(metrics), *_trained_on_lines(metrics)]
+    texts.append(materials_table(metrics))
     for key, tables in (
         ("events", (events_table,)),
         ("alarm", (alarm_table, _scenes_table, reliability_table)),
@@ -123,24 +140,82 @@ def splits_table(metrics: _Metrics) -> str:
     return style.marked(metrics["simulated"], style.table(rows), *source)
 
 
-def materials_table(metrics: _Metrics) -> str:
-    """The same scores within each split for each material, stroke speed and, of several, scene.
+def _comparison_lines(metrics: _Metrics) -> list[str]:
+    """A line for each held-out split: which baseline is ahead of the detector, or that none is.
 
-    Where there are several scenes, a line above says that materials and speeds are of the paper's
-    alone (``bin_metrics``).
+    One is ahead where the whole interval of its difference is above 0. Then the line says what to
+    do; else it names the best baseline.
+
+    Args:
+        metrics: the content of ``metrics.json``.
+    """
+    lines = []
+    for role, found in metrics.get("comparison", {}).items():
+        known = found["baselines"]
+        differences = {name: own["difference"] for name, own in known.items()}
+        sure = {name: own for name, own in differences.items() if own["low"] is not None}
+        ahead = [name for name, own in sure.items() if own["low"] > 0]
+        best = max(ahead or known, key=lambda name: float(differences[name]["value"]))
+        named, score = BASELINES[best], style.percent(known[best]["balanced_accuracy"], 1)
+        own_score, between = style.percent(found["detector"], 1), "too few for an interval"
+        if best in sure:
+            what = _group_word(metrics, found["drawn"])
+            low, high = (f"{100 * sure[best][end]:.1f}" for end in ("low", "high"))
+            drawn = f"95 % interval over {found['num_drawn']} {what}s"
+            between = f"difference {low} to {high} points, {drawn}"
+        if ahead:
+            lines.append(
+                f"{named} is ahead of the detector on {role} recordings: {score} against "
+                f"{own_score} % balanced ({between}); {_ADVICE[best]}"
+            )
+            continue
+        is_behind = len(sure) == len(known) and all(own["high"] < 0 for own in sure.values())
+        begin = "the detector is ahead of every baseline" if is_behind else "no baseline is ahead"
+        lines.append(
+            f"{begin} on {role} recordings: the detector has {own_score} % balanced, {named}, the "
+            f"best of them, {score} ({between})"
+        )
+    return ["\n".join(lines)] if lines else []
+
+
+def _group_word(metrics: _Metrics, group: str) -> str:
+    """What a group of recordings is called: a material of the paper's hand, else an object."""
+    return "object" if group == "material" and not _is_papers_hand(metrics) else group
+
+
+def _is_papers_hand(metrics: _Metrics) -> bool:
+    return bool(metrics.get("is_papers_hand", True))
+
+
+def _scene_name(metrics: _Metrics, scene: str) -> str:
+    """A scene as it is shown; the paper's is the default where nothing names one."""
+    is_default = scene == published.PAPER_SCENE and not _is_papers_hand(metrics)
+    return _UNNAMED_SCENE if is_default else scene
+
+
+def materials_table(metrics: _Metrics) -> str:
+    """The same scores within each split for each material, speed and, of several, scene.
+
+    Speeds are shown where some are known. Of another hand than the paper's, recordings that were
+    trained on are left out. Of several scenes a line above says where materials and speeds are of
+    the paper's alone (``bin_metrics``).
 
     Args:
         metrics: the content of ``metrics.json``.
     """
     rows: list[_Row] = []
-    head = []
-    for name, split in metrics["splits"].items():
+    head, splits = [], dict(metrics["splits"])
+    if len(splits) > 1 and not _is_papers_hand(metrics):
+        splits.pop("train", None)
+    for name, split in splits.items():
         groups = dict(split.get("per_material", {}))
-        for speed, scores in split.get("per_speed", {}).items():
-            groups["no stroke" if speed == "0" else f"{speed} mm/s"] = scores
+        speeds = split.get("per_speed", {})
+        for speed, scores in speeds.items() if set(speeds) - {"0", "nan"} else ():
+            groups[_NO_SPEED.get(speed, f"{speed} mm/s")] = scores
         if len(scenes := split.get("per_scene", {})) > 1:
-            head = [_PAPER_SCENE_LINE]
-            groups |= {f"scene {scene}": scores for scene, scores in scenes.items()}
+            if published.PAPER_SCENE in scenes:
+                head = [_PAPER_SCENE_LINE if _is_papers_hand(metrics) else _SCENE_LINE]
+            groups |= {f"scene {_scene_name(metrics, s)}": of for s, of in scenes.items()}
         rows += [{"split": name, "group": group} | _score_cells(of) for group, of in groups.items()]
     return style.marked(metrics["simulated"], *head, style.table(rows, num_left=2, merged=1))
 
@@ -152,17 +227,27 @@ def _trained_on_lines(metrics: _Metrics) -> list[str]:
     """
     if number := metrics.get("num_recordings"):
         folds = len(metrics.get("folds") or [metrics])
+        held_out = " and ".join(role for role in metrics["splits"] if role != "train")
         return [
-            f"test and unseen: {folds} folds, each of a detector trained without these recordings\n"
+            f"{held_out}: {folds} folds, each of a detector trained without these recordings\n"
             f"detector.pt: trained on all {number} recordings; no number above was measured on it, "
-            "test and unseen say what to expect of it"
+            f"{held_out} shows what to expect of it"
         ]
     lines = []
     for name, fold in (metrics.get("folds") or {"": metrics}).items():
-        if known := fold.get("trained_on"):
+        if known := _trained_on(metrics, fold.get("trained_on", {})):
             listed = "; ".join(f"{what} {', '.join(names)}" for what, names in known.items())
             lines.append(f"{name} trained on {listed}".strip())
     return ["\n".join(lines)] if lines else []
+
+
+def _trained_on(metrics: _Metrics, known: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str]]:
+    """What was trained on, in the user's words; without a session or scene that is the only one."""
+    if _is_papers_hand(metrics):
+        return dict(known)
+    found = {"objects" if what == "materials" else what: names for what, names in known.items()}
+    found["scenes"] = [_scene_name(metrics, scene) for scene in found.get("scenes", ())]
+    return {what: names for what, names in found.items() if what == "objects" or len(names) > 1}
 
 
 def _timing_table(timing_s: Mapping[str, float]) -> str:
@@ -265,13 +350,14 @@ def _selected_table(selected: Sequence[Mapping[str, str]]) -> str:
 
     The paper's counts stand beside where it prints them; for descriptors it gives only an order,
     so their column holds a rank such as ``#1``, and ``0`` for the two it never selects. Features
-    of another hand than the paper's stand alone.
+    of another hand than the paper's stand alone, without what all of them have in common.
 
     Args:
         selected: one mapping per feature with ``channel``, ``component``, ``domain``,
             ``descriptor``, ``kind`` and ``finger``.
     """
     is_papers = _is_of_papers_hand(selected)
+    number = "ours" if is_papers else "features"
     gauges, films = published.SELECTED_BY_FINGER.values()
     by_finger = {finger: gauges[finger] + films[finger] for finger in films}
     ranks = {name: f"#{rank}" for rank, name in enumerate(published.DESCRIPTORS_RANKED, 1)}
@@ -287,10 +373,12 @@ def _selected_table(selected: Sequence[Mapping[str, str]]) -> str:
     for key, of_paper in beside.items():
         shown = of_paper if is_papers else {}
         counted = Counter(each[key] for each in selected)
+        if len(counted) < 2 and not is_papers:
+            continue
         for value in dict.fromkeys([*dict(counted.most_common()), *shown]):
-            row = {"selected by": key, "": value, "ours": counted[value]}
+            row = {"selected by": key, "": value, number: counted[value]}
             rows.append(row | ({"paper": shown.get(value)} if is_papers else {}))
-    rows.append({"selected by": "all", "": "", "ours": len(selected)})
+    rows.append({"selected by": "all", "": "", number: len(selected)})
     if not is_papers:
         return style.table(rows, num_left=2, merged=1)
     rows[-1]["paper"] = published.NUM_SELECTED
@@ -515,7 +603,8 @@ def confound_table(metrics: _Metrics) -> str:
     rows: list[_Row] = []
     recalls = ("non_slip_recall", "slip_recall", "balanced_accuracy")
     for row in _scene_rows(metrics):
-        cells: _Row = {"evaluated on": row["role"], "scene": row["scene"]}
+        scene = _scene_name(metrics, row["scene"])
+        cells: _Row = {"evaluated on": row["role"], "scene": scene}
         cells |= {"detector": row["detector"], "trained on it": row["is_trained"]}
         cells |= {"bins": row["scores"]["num_bins"]}
         rows.append(cells | _percents(row["scores"], {key: _SCORES[key] for key in recalls}))
@@ -538,12 +627,16 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
     roles, scenes = (list(dict.fromkeys(row[key] for row in rows)) for key in ("role", "scene"))
     colours = style.colours_of(row["detector"] for row in rows)
     height = 1.7 + len(roles) * (0.8 + 0.28 * len(scenes))
+    is_papers = _is_papers_hand(metrics)
+    names = {published.PAPER_SCENE: "paper's protocol" if is_papers else _UNNAMED_SCENE}
     title = "Does it detect slip, or the motion of the arm?"
+    title = title if is_papers else "Scores of each kind of scene"
     figure = style.new_figure(10.5, height, title, simulated=metrics["simulated"])
     panels = figure.subplots(len(roles), 2, sharex="col", sharey=True, squeeze=False)
     dot: dict[str, Any] = {"marker": "o", "ls": "", "ms": 7.5, "mew": 1.8}
     sides = {"non_slip_recall": "nothing but slip", "slip_recall": "no slip in this scene"}
     named = {"test": "test cycles of seen materials", "unseen": "unseen materials"}
+    named = named if is_papers else {}
     for role, pair in zip(roles, panels, strict=True):
         for axes, (key, nothing) in zip(pair, sides.items(), strict=True):
             for lane, scene in enumerate(scenes):
@@ -560,9 +653,7 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
                 if not own:
                     look: dict[str, Any] = {"color": style.GREY, "ha": "center", "va": "center"}
                     axes.text(0.5, lane, nothing, transform=axes.get_yaxis_transform(), **look)
-            style.lanes(
-                axes, [{"paper": "paper's protocol"}.get(s, style.words(s)) for s in scenes]
-            )
+            style.lanes(axes, [names.get(scene, style.words(scene)) for scene in scenes])
         pair[0].set_title(named.get(role, role))
     left, right = panels[-1]
     left.set_xlim(left=0)
@@ -572,7 +663,7 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
     handles = [Line2D([], [], color=colours[name], label=name, **dot) for name in colours]
     if any(row["is_trained"] is False for row in rows):
         labels = {
-            style.GREY: "trained on other cycles of that scene",
+            style.GREY: "trained on other recordings of that scene",
             "white": "scene not trained on",
         }
         for fill, label in labels.items():
@@ -694,8 +785,9 @@ def events_table(metrics: _Metrics) -> str:
 
     ``delay`` is the median from the exact onset to the alarm, look-ahead within, ``mm slid`` the
     way slid meanwhile at most; ``slip-free`` is how long an alarm would have been false. Rates are
-    by the hour where that is at least an hour, else by the minute. Where compute was measured, the
-    parts of the mean delay follow in a second table.
+    by the hour where that is at least an hour, else by the minute. Columns in which nothing is
+    known are left out, and a line says where slips or hours are too few. Where compute was
+    measured, the parts of the mean delay follow in a second table.
 
     Args:
         metrics: the content of ``metrics.json``, with ``events``.
@@ -714,13 +806,39 @@ def events_table(metrics: _Metrics) -> str:
                 ms = latency.get(name)
                 delay[title] = None if ms is None else f"{ms:.1f}"
             delays.append(delay)
-    lines = [style.table(rows, num_left=2, merged=1)]
     found = [numbers for by_rule in metrics["events"].values() for numbers in by_rule.values()]
+    is_any = any(numbers["num_onsets"] or numbers["quiet_hours"] for numbers in found)
+    lines = [style.table(rows, num_left=2, merged=1, kept=2)] if is_any else []
+    if is_any and not any(numbers["num_onsets"] for numbers in found):
+        lines.append("no slip has a known onset: false alarms alone can be counted")
+    lines += [
+        f"{role}: {few}"
+        for role, by_rule in metrics["events"].items()
+        for few in [few_events(*list(by_rule.values())[:1])]
+        if few and role != "train"
+    ]
     if reasons := dict.fromkeys(of["reason"] for of in found if of.get("reason")):
         lines.append(f"no events: {'; '.join(reasons)}")
     if any(row["compute beside"] for row in delays):
         lines += ["", style.table(delays, num_left=2, merged=1)]
     return style.marked(metrics["simulated"], *lines)
+
+
+def few_events(numbers: Mapping[str, Any]) -> str:
+    """That slips or hours are too few for a rate; empty where they are enough or there are none.
+
+    Args:
+        numbers: of ``pooled_metrics``.
+    """
+    slips, hours = numbers["num_onsets"], numbers["quiet_hours"]
+    counts, wanted = [f"{hours:.1f} h without slip"], [f"{FEWEST_HOURS} h"]
+    if slips:
+        counts.insert(0, f"{slips} slip{'s' * (slips != 1)}")
+        wanted.insert(0, str(FEWEST_SLIPS))
+    if not (slips or hours) or (hours >= FEWEST_HOURS and (not slips or slips >= FEWEST_SLIPS)):
+        return ""
+    are = "are" if slips else "is"
+    return f"{' and '.join(counts)}: too few for a rate; {' and '.join(wanted)} {are} wanted"
 
 
 def _drawn_events(metrics: _Metrics) -> dict[str, dict[str, Mapping[str, Any]]]:
@@ -857,7 +975,7 @@ def _target_line(metrics: _Metrics) -> str:
     )
 
 
-def budget_rows(metrics: _Metrics) -> list[_Row]:
+def _budget_rows(metrics: _Metrics) -> list[_Row]:
     """False alarms of each scene and method beside the budget, on recordings that set nothing.
 
     Args:
@@ -878,9 +996,9 @@ def budget_rows(metrics: _Metrics) -> list[_Row]:
 
 
 def alarm_table(metrics: _Metrics) -> str:
-    """``_target_line``, ``_rate_rows`` and ``budget_rows`` for the terminal."""
+    """``_target_line``, ``_rate_rows`` and ``_budget_rows`` for the terminal."""
     rows = style.table(_rate_rows(metrics), num_left=2, merged=1)
-    budget = style.table(budget_rows(metrics), num_left=3)
+    budget = style.table(_budget_rows(metrics), num_left=3)
     return style.marked(metrics["simulated"], _target_line(metrics), rows, budget)
 
 

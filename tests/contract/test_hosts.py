@@ -49,9 +49,11 @@ def build(places):
     return run
 
 
-@pytest.fixture(
-    scope="module", params=["python", "c", pytest.param("node", marks=pytest.mark.slow)]
-)
+SLOW_START = [pytest.param(name, marks=pytest.mark.slow) for name in ("python", "node")]
+"""Hosts that take long to start, for what each must be started for anew."""
+
+
+@pytest.fixture(scope="module", params=["python", "c", SLOW_START[1]])
 def host(request, places):
     """The words of each host's command; built or installed before."""
     if request.param == "c":
@@ -256,6 +258,7 @@ def assert_refused(ran, words, status):
     assert not missing, line
 
 
+@pytest.mark.parametrize("host", ["c", *SLOW_START], indirect=True)
 @pytest.mark.parametrize("wrong", WRONG_FILES)
 def test_a_wrong_file_is_one_line_and_a_failing_exit(host, wrong, stream, recording, tmp_path):
     which, change, words = WRONG_FILES[wrong]
@@ -264,6 +267,7 @@ def test_a_wrong_file_is_one_line_and_a_failing_exit(host, wrong, stream, record
     assert_refused(run_host(host, model, own), words, 1)
 
 
+@pytest.mark.parametrize("host", ["c", *SLOW_START], indirect=True)
 @pytest.mark.parametrize("options", WRONG_OPTIONS)
 def test_a_wrong_option_is_one_line_and_a_failing_exit(host, options, stream, recording):
     status = 1 if options == "--rate 1000" else 2
