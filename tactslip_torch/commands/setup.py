@@ -190,7 +190,7 @@ def _source(folder: Path, proposal: Proposal) -> FileRecordings:
     """
     from tactslip_torch.data.file_recordings import FileRecordings
     from tactslip_torch.data.folder import guessed
-    from tactslip_torch.data.labels import label_of
+    from tactslip_torch.data.labels import LabelRule, label_of
     from tactslip_torch.data.manifest import MANIFEST, Entry, Listing, read_manifest
     from tactslip_torch.data.recording import RecordingId, Timeline
 
@@ -203,7 +203,8 @@ def _source(folder: Path, proposal: Proposal) -> FileRecordings:
         label = label_of(words.get(guessed(file, pattern).get("label", ""), ""))
         truth = Timeline(label=label) if label else None
         entries = (Entry(file, file, RecordingId(file, 0), truth),)
-    return FileRecordings(folder, manifest=Listing(entries), **data)
+    rule = LabelRule(**proposal.settings["labels"])
+    return FileRecordings(folder, manifest=Listing(entries), label_rule=rule, **data)
 
 
 def main() -> None:

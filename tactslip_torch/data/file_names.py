@@ -92,7 +92,7 @@ def name_pattern(files: Sequence[str], label_words: Sequence[str] = ()) -> NameP
             is the label.
 
     Example:
-        >>> objects = ("soup_can", "tea_can")
+        >>> objects = ("soup_can", "cup")
         >>> files = [f"{name}_{side}_{n}.csv" for name in objects for side in "AB" for n in "12"]
         >>> name_pattern(files).pattern
         '{material}_{scene:A|B}_{trial}'

@@ -31,6 +31,7 @@ from tactslip_torch.data.formats._inference import (
     cells_of,
     is_time,
     no_channels,
+    seconds_and_nanoseconds,
     text_layout,
     time_unit_in,
     without_comment,
@@ -241,10 +242,13 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
         words = {
             name: column
             for name, column in zip(names, cells, strict=True)
-            if not is_time(str(name))
-            and any(cell and not NUMBER.fullmatch(cell.replace(",", ".")) for cell in set(column))
+            if any(cell and not NUMBER.fullmatch(cell.replace(",", ".")) for cell in set(column))
         }
-        numbers = [name for name in names if name not in words and not is_time(str(name))]
+        texts = list(map(str, names))
+        of_time = {names[place] for place in seconds_and_nanoseconds(texts) or ()}
+        of_time |= {name for name in words if is_time(str(name))}  # dates
+        numbers = [name for name in names if name not in {*words, *of_time}]
+        words = {name: column for name, column in words.items() if name not in of_time}
         how = replace(how, channels=numbers)
         if names[0] == 0:  # without names
             how = replace(how, time=answers.time)
