@@ -7,16 +7,19 @@ and check sums are looked at here; whether parts fit together, where they are pu
 from __future__ import annotations
 
 import json
+import math
 import os
+import stat
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.runtime import regular_file, whole_file
+from tactslip_torch.runtime import whole_file
 
 DETECTOR = "tactslip_torch detector 5"
 SUMS = "tactslip_torch sums 3"
@@ -99,7 +102,7 @@ def read_json(path: str | os.PathLike[str], form: str, most_bytes: int = 2**24) 
         FileNotFoundError: if there is no such file.
         ValueError: if it is no JSON, longer than that, or of another format.
     """
-    text = regular_file(path, most_bytes).read_bytes()
+    text = _regular_file(path, most_bytes).read_bytes()
     with reading(path):
         content: dict[str, Any] = json.loads(text)
         if content["format"] != form:
@@ -130,7 +133,7 @@ def reading(path: str | os.PathLike[str]) -> Iterator[None]:
 
 def _load(path: str | os.PathLike[str], most_bytes: int) -> dict[str, Any]:
     """A dictionary with a format, of an archive whose check sums fit."""
-    file = regular_file(path, most_bytes)
+    file = _regular_file(path, most_bytes)
     try:
         with zipfile.ZipFile(file) as archive:
             if sum(member.file_size for member in archive.infolist()) > most_bytes:
@@ -145,3 +148,29 @@ def _load(path: str | os.PathLike[str], most_bytes: int) -> dict[str, Any]:
             f"{os.fspath(path)} is damaged or no file of this package; make it again"
         ) from error
     return content
+
+
+def _regular_file(path: str | os.PathLike[str], most_bytes: float = math.inf) -> Path:
+    """The path of a file that can be read from start to end: no folder, device or pipe.
+
+    Opening a pipe would wait for whoever writes to it.
+
+    Args:
+        path: of the file.
+        most_bytes: that it may be long.
+
+    Raises:
+        FileNotFoundError: if there is nothing.
+        ValueError: if it is no file, or longer than that.
+    """
+    path = Path(path)
+    try:
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise FileNotFoundError(f"no file at {path}") from None
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or pipe"
+        raise ValueError(f"{path} is {kind}, expected a file; copy it to a file first")
+    if status.st_size > most_bytes:
+        raise ValueError(f"{path} has {status.st_size} bytes, at most {most_bytes:.0f} can be read")
+    return path

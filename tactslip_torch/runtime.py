@@ -5,6 +5,7 @@ Of tensors: whether their values may be looked at, and operations that are quick
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import glob
 import hashlib
@@ -16,13 +17,13 @@ import multiprocessing
 import os
 import secrets
 import shutil
-import stat
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextvars import ContextVar
 from functools import lru_cache
 from numbers import Integral, Real
 from pathlib import Path
@@ -131,6 +132,12 @@ def _renew_lock() -> None:
 
 
 os.register_at_fork(after_in_child=_renew_lock)
+
+
+def trim_memory() -> None:
+    """Hand freed memory back to the system, which glibc keeps for each thread apart."""
+    with suppress(OSError, AttributeError, TypeError):  # other C libraries have no such call
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def is_traced() -> bool:
@@ -242,6 +249,30 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+_SECTION: ContextVar[str] = ContextVar("section", default="")
+
+
+@contextmanager
+def settings_in(section: str) -> Iterator[None]:
+    """Until it is left, ``setting`` names settings as those of a section, such as ``"data"``."""
+    token = _SECTION.set(f"{section}." if section else "")
+    try:
+        yield
+    finally:
+        _SECTION.reset(token)
+
+
+def setting(name: str) -> str:
+    """A setting as the user of the running command writes it, for messages.
+
+    Example:
+        >>> with settings_in("data"):
+        ...     setting("reading.time")
+        'data.reading.time'
+    """
+    return _SECTION.get() + name
 
 
 def check_number(name: str, value: Any, *, least: float | None = None, whole: bool = False) -> None:
@@ -372,32 +403,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def regular_file(path: str | os.PathLike[str], most_bytes: float = math.inf) -> Path:
-    """The path of a file that can be read from start to end: no folder, device or pipe.
-
-    Opening a pipe would wait for whoever writes to it.
-
-    Args:
-        path: of the file.
-        most_bytes: that it may be long.
-
-    Raises:
-        FileNotFoundError: if there is nothing.
-        ValueError: if it is no file, or longer than that.
-    """
-    path = Path(path)
-    try:
-        status = path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        raise FileNotFoundError(f"no file at {path}") from None
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or pipe"
-        raise ValueError(f"{path} is {kind}, expected a file; copy it to a file first")
-    if status.st_size > most_bytes:
-        raise ValueError(f"{path} has {status.st_size} bytes, at most {most_bytes:.0f} can be read")
-    return path
 
 
 class SeenBatches(dict[str, str]):

@@ -12,6 +12,7 @@ from small_detector import HAND
 from small_set import SmallSet
 from test_learner import learn, unseen_c
 
+from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.training.baselines import (
@@ -21,6 +22,7 @@ from tactslip_torch.training.baselines import (
     best_threshold,
 )
 from tactslip_torch.training.bins import BinSample, RecordingBins
+from tactslip_torch.training.evaluation import Outcomes, compared
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",
@@ -127,4 +129,57 @@ def test_a_learner_evaluates_them_on_the_same_bins():
         for role, scores in found["splits"].items():
             assert scores["num_bins"] == metrics["splits"][role]["num_bins"]
         assert found["splits"]["train"]["balanced_accuracy"] > 0.75
+    for role in ("test", "unseen"):
+        beside = metrics["comparison"][role]
+        assert beside["detector"] == metrics["splits"][role]["balanced_accuracy"]
+        assert {n: of["balanced_accuracy"] for n, of in beside["baselines"].items()} == {
+            n: of["splits"][role]["balanced_accuracy"] for n, of in metrics["baselines"].items()
+        }
     json.dumps(metrics["baselines"])
+
+
+# Beside the detector -----------------------------------------------------------------------------
+
+
+def outcomes_of_objects(wrong, num_objects=8, trials=5):
+    """Confusions of recordings of 20 bins; ``wrong``: how many of a class, by method and object."""
+    ids = [RecordingId(f"object {i}", trial) for i in range(num_objects) for trial in range(trials)]
+    confusions = {
+        name: torch.tensor(
+            [[[10 - of(r), of(r)], [of(r), 10 - of(r)]] for r in range(num_objects)]
+        ).repeat_interleave(trials, 0)
+        for name, of in wrong.items()
+    }
+    return Outcomes(tuple(ids), confusions)
+
+
+def test_a_baseline_that_is_better_on_one_object_alone_is_not_ahead_where_objects_are_left_out():
+    wrong = {"detector": lambda r: 6 * (r == 0), "one": lambda r: 0}
+    outcomes = outcomes_of_objects(wrong)
+    by_object, by_recording = (compared([outcomes], role) for role in ("unseen", "test"))
+    assert (by_object["drawn"], by_object["num_drawn"]) == ("material", 8)
+    assert (by_recording["drawn"], by_recording["num_drawn"]) == ("recording", 40)
+    number = by_object["baselines"]["one"]["difference"]
+    assert number["value"] == pytest.approx(0.6 / 8)
+    assert number["low"] == 0 < number["high"]
+    assert by_recording["baselines"]["one"]["difference"]["low"] > 0
+    assert compared([outcomes_of_objects(wrong, num_objects=4)], "unseen")["drawn"] == "recording"
+
+
+def test_the_difference_from_the_detector_is_paired_and_of_all_folds():
+    """Where both fail in the same recordings the interval is narrow, however these differ."""
+    wrong = {"detector": lambda r: r, "same": lambda r: r, "better": lambda r: max(r - 1, 0)}
+    outcomes = outcomes_of_objects(wrong)
+    cut = 15
+    folds = [
+        Outcomes(outcomes.recordings[part], {n: c[part] for n, c in outcomes.confusions.items()})
+        for part in (slice(cut), slice(cut, None))
+    ]
+    found = compared(folds, "unseen")
+    assert found == compared([outcomes], "unseen")
+    assert found["detector"] == pytest.approx(1 - 0.35)
+    assert found["baselines"]["same"]["difference"] == {"value": 0, "low": 0, "high": 0}
+    better = found["baselines"]["better"]["difference"]
+    assert 0.05 < better["low"] <= better["value"] <= better["high"] <= 0.1 + 1e-12
+    slip_alone = {n: c * torch.tensor([[0], [1]]) for n, c in outcomes.confusions.items()}
+    assert compared([Outcomes(outcomes.recordings, slip_alone)], "test") == {}

@@ -82,6 +82,9 @@ def test_a_run_on_several_scenes_leaves_table_figure_and_scores_by_fold(ran):
     for name, found in metrics["baselines"].items():
         own = {f"{f}/{role}": folds[f]["baselines"][name]["splits"][role] for f, role in places}
         assert found["splits"] == own
+    for fold, role in places:
+        if role != "train":
+            assert metrics["comparison"][f"{fold}/{role}"] == folds[fold]["comparison"][role]
     assert returned["protocol/test/accuracy"] != returned["with_scenes/test/accuracy"]
 
 

@@ -55,7 +55,6 @@ def test_check_lists_every_problem_and_warning(tmp_path, capsys):
     expected = broken(tmp_path)
     flat = samples(0)
     flat[1] = 2.5
-    flat[2, 40:50] = torch.nan
     table(tmp_path / "0.csv", flat)
     assert run("check", tmp_path) == len(expected)
     lines = capsys.readouterr().out.splitlines()
@@ -64,23 +63,24 @@ def test_check_lists_every_problem_and_warning(tmp_path, capsys):
         assert what in line
     assert lines[len(expected) :] == [
         "warning: manifest.csv:2: 0.csv: b never changes, it is 2.5 throughout",
-        "warning: manifest.csv:2: 0.csv: c is not finite in 10 samples, first at 0.2000 s; leave "
-        "the stretch out as missing_s, or repair it",
         "channels: a, b, c",
-        "3 recordings of 2 materials, 9.0 s, 3 channels at 200 Hz in V: 6 problems, 2 warnings",
+        "3 recordings of 2 materials, 9.0 s, 3 channels at 200 Hz in V: 6 problems, 1 warning",
     ]
 
 
-@pytest.mark.parametrize(("lost", "num"), [((40, 50), 0), ((330, 340), 1), ((70, 80), 1)])
-def test_samples_that_train_refuses_are_a_problem(tmp_path, capsys, lost, num):
-    """The onset is at sample 300, non-slip is the second before, and a filter reads 25 more."""
+@pytest.mark.parametrize("gaps", ["refuse", "missing"])
+def test_check_and_train_say_the_same_of_samples_that_are_not_finite(tmp_path, capsys, gaps):
     content = samples(0)
-    content[2, slice(*lost)] = torch.nan
+    content[2, 330:340] = torch.nan
     table(tmp_path / "a.csv", content)
     manifest(tmp_path, "a.csv,wood,0,1.5,1.5-2.5,")
-    assert run("check", tmp_path) == num
-    line = f"{'problem' if num else 'warning'}: manifest.csv:2: a.csv: c is not finite in 10"
-    assert line in capsys.readouterr().out
+    assert run("check", tmp_path, f"data.reading.gaps={gaps}") == (gaps == "refuse")
+    line = capsys.readouterr().out.splitlines()[0]
+    assert "manifest.csv:2: a.csv: c is not finite in 10 samples, first at 1.6500 s" in line
+    if gaps == "refuse":
+        with pytest.raises(ValueError, match=r"data\.reading\.gaps=missing") as said:
+            FileRecordings(tmp_path)  # as train makes it
+        assert line.removeprefix("problem: ") in str(said.value)
 
 
 def test_a_file_that_is_damaged_in_its_samples_is_a_problem(root, capsys, monkeypatch):

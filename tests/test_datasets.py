@@ -153,7 +153,7 @@ def test_rows_of_channels_find_their_columns_by_name_or_by_place(tables):
     refused(r"has the channels a, b, c, not the 2 of data\.channels", tables, channels=ROWS[:2])
     half = [*rows_named("c"), *ROWS[1:]]  # as many, but who knows which is which
     refused(r"has no channel PVDF1, PVDF2 of .*; it has a, b, c", tables, channels=half)
-    said = r"0\.csv: has the channels a, b, c, not the 3 .* as reading\.channels"
+    said = r"0\.csv: has the channels a, b, c, not the 3 .* as data\.reading\.channels"
     refused(said, tables, channels=ROWS)
     said = r"has the channels a, b, not the 3 of data\.channels"
     refused(said, tables, channels=ROWS, reading={"channels": ["a", "b"]})
@@ -250,13 +250,14 @@ def gappy(root, lost=((100, 104), (300, 360)), num_samples=600):
 
 def test_gaps_are_refused_missing_or_bridged(tmp_path):
     content, kept = gappy(tmp_path)
-    refused(r"64 samples are missing in 2 gaps, first 4 at 0\.5", tmp_path)
+    said = r"64 samples are missing in 2 gaps, first 4 at 0\.5.* set data\.reading\.gaps=missing"
+    refused(said, tmp_path)
     source = FileRecordings(tmp_path, reading={"gaps": "missing"})
     times = source.timeline(source.ids[0])
     assert (times.duration_s, times.missing_s) == (3.0, ((0.5, 0.52), (1.5, 1.8)))
     assert torch.equal(first(source)[:, kept], content[:, kept])
     assert first(source)[:, ~kept].isnan().all()
-    assert "gaps.csv: lacks 64 samples in 2 gaps, first at 0.5 s" in str(source.warnings[0])
+    assert "gaps.csv: 64 samples are missing in 2 gaps, first 4 at" in str(source.warnings[0])
     bridged = FileRecordings(tmp_path, reading={"gaps": "bridge", "bridge_ms": 25.0})
     assert bridged.timeline(source.ids[0]).missing_s == ((1.5, 1.8),)
     read = first(bridged)
@@ -287,8 +288,8 @@ def test_the_mean_of_a_stretch_is_taken_off_without_what_is_missing_there(tables
     content[1, 100:] = torch.nan
     table(tables / "0.csv", content)
     manifest(tables, "0.csv,wood,0,,,slip")
-    with pytest.raises(ValueError, match=r"0\.csv has nothing finite in its column 2 .* 0\.5 to 1"):
-        first(FileRecordings(tables, reading={"tare_s": [0.5, 1.0]}))
+    how = {"gaps": "missing", "tare_s": [0.5, 1.0]}
+    refused(r"0\.csv: nothing is there to tare on from 0\.5 to 1 s", tables, reading=how)
 
 
 def test_files_of_several_rates_are_brought_to_one(tmp_path):
@@ -324,48 +325,59 @@ def test_truth_follows_the_clock_of_the_file(tmp_path):
         assert times.duration_s == 1995 / 200.0
 
 
-# Slip by its speed, and rows of several samples -----------------------------------------------
-
-SPEED = torch.cat([torch.zeros(300), torch.linspace(0, -0.02, 101), torch.zeros(199)]).double()
+# Samples that are not finite ------------------------------------------------------------------
 
 
-def with_speed(path):
-    """Three channels at 200 Hz, and a speed in m/s that passes 5 mm/s at 1.625 s."""
-    content = samples(1)
-    if path.suffix == ".csv":
-        table(path, torch.cat([content, SPEED[None]]), names=("t", *"abc", "speed"))
-    else:
-        times = np.arange(600) / RATE_HZ
-        columns = dict(zip("abc", content.numpy(), strict=True))
-        np.savez(path, t=times, speed=SPEED.numpy(), **columns)
+def broken_cells(root):
+    """A table with two short runs of empty cells in b, and a long one in c."""
+    content = samples(5)
+    content[1, 100:103] = torch.nan
+    content[1, 0:2] = torch.nan  # nothing to bridge from
+    content[2, 300:340] = torch.inf
+    table(root / "a.csv", content)
+    manifest(root, "a.csv,wood,0,,,non-slip")
     return content
 
 
-@pytest.mark.parametrize("name", ["a.npz", "a.csv"])
-def test_a_speed_above_a_threshold_is_slip(tmp_path, name):
-    content = with_speed(tmp_path / name)
-    manifest(tmp_path, f"{name},wood", columns="file,material")
-    reading = {"speed": "speed", "speed_unit": "m/s"}
-    source = FileRecordings(tmp_path, reading=reading, speed_over=5.0)
-    assert torch.allclose(first(source).double(), content)  # the speed is no channel
-    times = source.timeline(source.ids[0])
-    # 25 steps of 0.2 mm/s behind 1.5 s
-    edges = [*times.onsets_s, *times.sliding_s[0], *np.ravel(times.non_slip_s)]
-    expected = [1.625, 1.625, 2.00375, 0, 1.625, 2.00375, 3]
-    assert edges == pytest.approx(expected, abs=5e-5)
-    assert times.speeds_mm_s in ((12.0,), (13.0,))
-    manifest(tmp_path, f"{name},wood,0,0.5,,")  # who says more is believed
-    source = FileRecordings(tmp_path, reading=reading, speed_over=5.0)
-    assert source.timeline(source.ids[0]).onsets_s == (0.5,)
+def test_samples_that_are_not_finite_are_like_a_gap(tmp_path):
+    content = broken_cells(tmp_path)
+    said = r"a\.csv: b \(and 1 more channels\) is not finite in 5 samples, first at 0\.0000 s; set "
+    refused(said + r"data\.reading\.gaps=missing to leave out", tmp_path)
+    source = FileRecordings(tmp_path, reading={"gaps": "missing"})
+    lost = ((0.0, 0.01), (0.5, 0.515), (1.5, 1.7))
+    assert source.timeline(source.ids[0]).missing_s == lost
+    assert "b (and 1 more channels) is not finite in 5" in str(source.warnings[0])
+    bridged = FileRecordings(tmp_path, reading={"gaps": "bridge", "bridge_ms": 15.0})
+    assert bridged.timeline(source.ids[0]).missing_s == (lost[0], lost[2])
+    read = first(bridged)
+    line = torch.from_numpy(np.linspace(content[1, 99].item(), content[1, 103].item(), 5))
+    assert torch.allclose(read[1, 99:104], line, atol=1e-12, rtol=0)
+    assert torch.equal(read[0], content[0])
+    assert torch.equal(read[1, 2:100], content[1, 2:100])
 
 
-def test_a_speed_that_is_not_there_is_one_line(tmp_path):
-    with_speed(tmp_path / "a.csv")
-    manifest(tmp_path, "a.csv,wood", columns="file,material")
-    refused(r"labels\.speed_over=5 needs .*: data\.reading\.speed", tmp_path, speed_over=5.0)
-    assert FileRecordings(tmp_path).hand.names == ("a", "b", "c")
-    refused(r"no column 'v' that reading\.speed names", tmp_path, reading={"speed": "v"})
-    refused(r"reading\.speed_unit must be one of mm/s", tmp_path, reading={"speed_unit": "km/h"})
+def test_what_a_manifest_leaves_out_need_not_be_there(tmp_path):
+    broken_cells(tmp_path)
+    columns = "file,material,label,missing_s"
+    manifest(tmp_path, "a.csv,wood,slip,0-0.01; 0.5-0.515; 1.4-1.7", columns=columns)
+    assert len(FileRecordings(tmp_path).timeline(RecordingId("wood", 0)).missing_s) == 4
+    manifest(tmp_path, "a.csv,wood,slip,0-0.01; 0.5-0.515; 1.4-1.6", columns=columns)
+    refused("is not finite", tmp_path)
+
+
+def test_a_gap_beside_an_empty_cell_is_one_that_is_too_long_to_bridge(tmp_path):
+    content, kept = gappy(tmp_path, lost=((100, 104),))
+    content[0, 104] = torch.nan
+    times = (np.arange(600) / RATE_HZ)[kept.numpy()]
+    table(tmp_path / "gaps.csv", content[:, kept], times=times)
+    source = FileRecordings(tmp_path, reading={"gaps": "bridge", "bridge_ms": 20.0})
+    read, (lost,) = first(source), source.timeline(source.ids[0]).missing_s
+    assert lost == pytest.approx((0.5, 0.525))
+    assert read[0, 100:105].isnan().all()  # five samples, where four are bridged
+    assert read[1:].isfinite().all()
+
+
+# Rows of several samples ----------------------------------------------------------------------
 
 
 def in_rows(path, order, names=True):
@@ -407,7 +419,7 @@ def test_rows_that_do_not_show_their_samples_are_refused(tmp_path):
     in_rows(tmp_path / "a.csv", "channel", names=False)
     manifest(tmp_path, "a.csv,wood,0,,,slip")
     refused("6 columns of samples, which is no multiple", tmp_path, reading={"samples_per_row": 4})
-    refused(r"say reading\.row_order=channel", tmp_path, reading={"samples_per_row": 3})
+    refused(r"say data\.reading\.row_order=channel", tmp_path, reading={"samples_per_row": 3})
     refused(r"samples_per_row must be a positive", tmp_path, reading={"samples_per_row": 0})
     refused(r"row_order must be one of channel, time", tmp_path, reading={"row_order": "x"})
 
@@ -505,7 +517,7 @@ def test_what_is_worth_a_look_is_said(tables):
 def test_a_rate_that_nobody_says_is_asked_for(tmp_path):
     table(tmp_path / "a.csv", samples(0))
     manifest(tmp_path, "a.csv,wood,0,,,")
-    said = r"no rate and has no times; give reading\.sample_rate_hz"
+    said = r"no rate and has no times; give data\.reading\.sample_rate_hz"
     refused(said, tmp_path, reading={"time": None})
     manifest(tmp_path, "a.csv,wood,250.00003", columns="file,material,sample_rate_hz")
     assert FileRecordings(tmp_path, reading={"time": None}).sample_rate_hz == 250.0
@@ -522,7 +534,7 @@ def test_a_rate_that_no_sensor_has_is_asked_for(tmp_path, rate, is_read):
         assert FileRecordings(tmp_path).sample_rate_hz == rate
     else:
         said = re.escape(f"a.csv: is of {rate:g} Hz, which is no sample rate")
-        refused(f"{said} .* say reading.time_unit=", tmp_path)
+        refused(f"{said} .* say data.reading.time_unit=", tmp_path)
 
 
 REFUSED = [

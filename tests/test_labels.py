@@ -7,14 +7,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from small_set import SmallSet, small_maker
 
 from tactslip_torch.data.labels import (
     NO_POSITION,
     LabelRule,
-    clear_of,
+    bins_of,
     label_bins,
-    slip_by_speed,
 )
 from tactslip_torch.data.recording import Timeline
 
@@ -57,7 +55,9 @@ def by_hand(rule, onsets, slides, duration_s, rate, non_slip_s=(), slip_s=()):
     for stroke, (onset, (start, end)) in enumerate(zip(onsets, slides, strict=True)):
         edge = round((onset - shift_s) * rate)
         last = min(int(end * rate), edge + lead if is_half else len(taken))
-        quiet = [s for s in range(edge - lead, edge, hop) if previous <= s <= edge - size]
+        ends = [math.ceil(e * rate - 1e-6) for _, e in slip_s]
+        free = max([previous, *(e for e in ends if e <= edge)])
+        quiet = [s for s in range(edge - lead, edge, hop) if free <= s <= edge - size]
         found += [(s, False, stroke, n - len(quiet)) for n, s in enumerate(quiet)]
         slip = [s for s in range(edge, last, hop) if s + size <= last]
         found += [(s, True, stroke, n) for n, s in enumerate(slip)]
@@ -127,7 +127,8 @@ def windows_by_hand(rule, onsets, slides, duration_s, rate, non_slip_s=(), slip_
         last = end  # of these slides a whole sample
         for place in range(min(edge, int(start * rate)), end):
             label[place] = None
-        for place in range(max(edge - round(lead * rate), previous), edge):
+        free = max([previous, *(round(e * rate) for _, e in slip_s if round(e * rate) <= edge)])
+        for place in range(max(edge - round(lead * rate), free), edge):
             label[place] = False
         for place in range(edge, min(last, edge + round(lead * rate)) if is_half else last):
             label[place] = True
@@ -164,35 +165,16 @@ def test_windows_have_the_label_of_most_samples_or_of_the_last(assign, layout, h
 
 
 def test_bins_that_need_missing_samples_are_left_out():
-    bins = lay(None, (), (), 3.0, non_slip_s=((0.0, 3.0),))
+    def laid(*missing_s, reach=(0, 0)):
+        times = Timeline(non_slip_s=((0.0, 3.0),), duration_s=3.0, missing_s=missing_s)
+        bins = bins_of(LabelRule(), times, RATE, *reach)
+        assert len(bins.starts) == len(bins.is_slip) == len(bins.stroke) == len(bins.position)
+        return set(bins.starts.tolist())
+
     gap = (1.0, 1.0 + 1 / RATE)
-    for before, after, expected in ((0, 0, [2000]), (25, 11, [1900, 2000])):
-        kept = clear_of(bins, [gap], before, after, RATE)
-        assert sorted(set(bins.starts.tolist()) - set(kept.starts.tolist())) == expected
-        assert len(kept.starts) == len(kept.is_slip) == len(kept.stroke) == len(kept.position)
-    assert 1900 in clear_of(bins, [(1.0 + 11 / RATE, 1.1)], 25, 11, RATE).starts.tolist()
-
-
-def test_a_speed_that_is_noisy_lost_or_begins_in_slip():
-    rate = 1000.0
-    speed = np.zeros(1000)
-    speed[:100] = 10.0  # slides already
-    speed[300:500] = -10.0  # either way
-    speed[400:410] = 0.0  # for 10 ms
-    speed[600:615] = 10.0  # for 15 ms
-    speed[700:750] = np.nan
-    speed[750:800] = 10.0  # since when is not known
-    found = slip_by_speed(speed, rate, 5.0)
-    np.testing.assert_allclose(found.slip_s, [[0, 0.0995], [0.75, 0.7995]])
-    np.testing.assert_allclose(found.sliding_s, [[0.2995, 0.4995]])
-    np.testing.assert_allclose(found.non_slip_s, [[0.0995, 0.2995], [0.4995, 0.7], [0.7995, 1.0]])
-    assert found.speeds_mm_s == (10.0,)
-    assert slip_by_speed(np.zeros(0), rate, 5.0) == Timeline()
-
-
-def test_a_speed_is_wanted_of_recordings_that_have_one():
-    with pytest.raises(ValueError, match=r"labels\.speed_over=5 needs recordings with a column of"):
-        small_maker(SmallSet(), speed_over=5.0)
+    assert laid() - laid(gap) == {2000}
+    assert laid() - laid(gap, reach=(25, 11)) == {1900, 2000}
+    assert 1900 in laid((1.0 + 11 / RATE, 1.1), reach=(25, 11))
 
 
 # Errors --------------------------------------------------------------------------------------

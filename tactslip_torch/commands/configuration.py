@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
 import textwrap
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,10 +34,6 @@ every command also takes:
   --cfg job                       print the configuration and stop
   --config-dir FOLDER             a folder with configuration of your own
   TACTSLIP_TRACEBACK=1            environment variable: errors show where they were raised"""
-
-
-class _Mistake(ValueError):
-    """A command line that cannot be carried out; its text is one line for the user."""
 
 
 class CommandLine(NamedTuple):
@@ -245,7 +240,7 @@ def _row(name: str, text: str) -> list[str]:
 
 class _Parser(ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        raise _Mistake(message)
+        raise ValueError(message)
 
 
 def checked(command: str, arguments: Sequence[str]) -> CommandLine:
@@ -270,9 +265,9 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
         key, _, value = unknown[0].lstrip("-").partition("=")
         near = _nearest(command, key.replace("-", "_")) or "KEY"
         hint = f"write {near}={value or 'VALUE'}, without dashes"
-        raise _Mistake(f"{command} has no option {unknown[0]}; {hint}")
+        raise ValueError(f"{command} has no option {unknown[0]}; {hint}")
     if options.config_dir is not None and not Path(options.config_dir).is_dir():
-        raise _Mistake(f"--config-dir {options.config_dir}: there is no such folder")
+        raise ValueError(f"--config-dir {options.config_dir}: there is no such folder")
     rest = list(arguments)
     for override in options.overrides:
         rest.remove(override)
@@ -280,11 +275,11 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
     known = {key.name.partition(".")[0] for key in keys_of(command, config) if key.description}
     for name in config:
         if str(name) not in known.union(_groups(config.hydra), presets(), ("hydra",)):
-            raise _Mistake(_no_key(command, str(name), config))
+            raise ValueError(_no_key(command, str(name), config))
     if list(arguments) != typed:  # of a hand.yaml
         for own in keys_of(command, config):
             if not own.description and own.name.partition(".")[0] in OF_HAND:
-                raise _Mistake(f"{HAND_FILE}: {_no_key(command, own.name, config)}")
+                raise ValueError(f"{HAND_FILE}: {_no_key(command, own.name, config)}")
     return CommandLine(command, [*overrides, *rest], typed, options, config)
 
 
@@ -308,7 +303,7 @@ def _composed(command: str, options: Namespace) -> tuple[list[str], DictConfig]:
                 known = options_of(key.lstrip("+"))
                 for option in others if known and not options.config_dir else ():
                     if option not in known:
-                        raise _Mistake(_unknown(key.lstrip("+"), option, known)) from error
+                        raise ValueError(_unknown(key.lstrip("+"), option, known)) from error
                 continue
             word = error.override if isinstance(error, OverrideParseException) else ""
             key, found, value = word.partition("=")
@@ -319,7 +314,7 @@ def _composed(command: str, options: Namespace) -> tuple[list[str], DictConfig]:
                 for words in (overrides, tried):
                     words[words.index(word)] = quoted
                 continue
-            raise _Mistake(_translated(command, tried, error)) from error
+            raise ValueError(_translated(command, tried, error)) from error
 
 
 def _translated(command: str, overrides: Sequence[str], error: Exception) -> str:
@@ -407,23 +402,3 @@ def with_lists(command: str, config: DictConfig, hydra: Any) -> None:
         is_set = key.value != "???" and not str(key.value).startswith("${")
         if is_simple and is_set and key.description.startswith("list"):
             OmegaConf.update(config, key.name, [key.value], merge=False)
-
-
-def check_folder(line: CommandLine) -> None:
-    """Refuse a results folder that cannot be made; Hydra alone would show a trace.
-
-    Raises:
-        ValueError: that says why.
-    """
-    of = "sweep" if line.options.multirun else "run"
-    where: Any = OmegaConf.to_container(line.config.hydra[of])
-    wanted = str(where["dir"]).partition("${")[0]  # what it holds of the configuration is new
-    folder = Path(wanted).absolute()
-    nearest = next(place for place in (folder, *folder.parents) if place.exists())
-    try:
-        if wanted != ".":
-            with tempfile.TemporaryDirectory(dir=nearest):
-                pass
-    except OSError as error:
-        why = f"cannot write to hydra.{of}.dir={folder}: {error.strerror} at {nearest}"
-        raise _Mistake(why) from error

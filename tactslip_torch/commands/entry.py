@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -17,7 +18,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.configuration import (
     CommandLine,
-    check_folder,
     checked,
     conf_dir,
     with_lists,
@@ -50,7 +50,7 @@ def entry_point(
     def main(given: CommandLine | None = None) -> None:
         with errors_in_one_line():
             line = given or checked(command, sys.argv[1:])
-            check_folder(line)
+            _check_folder(line)
             typed, runs = list(sys.argv), list[dict[str, Any]]()
 
             def in_folder(config: DictConfig) -> None:
@@ -137,3 +137,23 @@ class _Copied:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
+
+
+def _check_folder(line: CommandLine) -> None:
+    """Refuse a results folder that cannot be made; Hydra alone would show a trace.
+
+    Raises:
+        ValueError: that says why.
+    """
+    of = "sweep" if line.options.multirun else "run"
+    where: Any = OmegaConf.to_container(line.config.hydra[of])
+    wanted = str(where["dir"]).partition("${")[0]  # what it holds of the configuration is new
+    folder = Path(wanted).absolute()
+    nearest = next(place for place in (folder, *folder.parents) if place.exists())
+    try:
+        if wanted != ".":
+            with tempfile.TemporaryDirectory(dir=nearest):
+                pass
+    except OSError as error:
+        why = f"cannot write to hydra.{of}.dir={folder}: {error.strerror} at {nearest}"
+        raise ValueError(why) from error

@@ -188,7 +188,8 @@ def _source(folder: Path, proposal: Proposal) -> FileRecordings:
     """
     from tactslip_torch.data.file_recordings import FileRecordings
     from tactslip_torch.data.folder import guessed
-    from tactslip_torch.data.manifest import MANIFEST, Entry, Listing, label_of, read_manifest
+    from tactslip_torch.data.labels import label_of
+    from tactslip_torch.data.manifest import MANIFEST, Entry, Listing, read_manifest
     from tactslip_torch.data.recording import RecordingId, Timeline
 
     data, file = dict(proposal.settings["data"]), proposal.example
@@ -250,7 +251,7 @@ def _answers(given: argparse.Namespace) -> Answers:
     Raises:
         ValueError: if a number or word is none.
     """
-    from tactslip_torch.data.manifest import label_of
+    from tactslip_torch.data.labels import label_of
     from tactslip_torch.data.proposal import Answers
 
     words = dict.fromkeys((word for each in given.non_slip for word in each.split(",")), False)

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import grey_closing, grey_opening
 
+from tactslip_torch.runtime import setting
+
 GapRule = Literal["refuse", "missing", "bridge"]
 
 _Numbers = NDArray[np.float64]
@@ -31,7 +33,6 @@ _MOST_LOST, _FREE = 10, 1 << 16  # times as many samples may be missing as are t
 _OSCILLATOR_ERR = 1e-4  # of three digits at most are what people mean
 _FIT_ERR = 2e-6
 _SAID_ERR = 1e-5
-_STATE = "state the rate and go without the times: reading.sample_rate_hz=..., reading.time=null"
 
 
 class _Gap(NamedTuple):
@@ -92,7 +93,7 @@ def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "tim
         place = int(np.argmax(is_back))
         raise ValueError(
             f"{name}: time goes back at sample {place + 1}, from {times[place]:g} to "
-            f"{times[place + 1]:g} s; sort the file, or go without: reading.time=null"
+            f"{times[place + 1]:g} s; sort the file, or go without: {setting('reading.time')}=null"
         )
     _refuse_jumps(times, name)
     seconds = times - times[0]
@@ -103,7 +104,7 @@ def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "tim
         raise ValueError(
             f"{name}: its times are {1 / step_s:.6g} Hz, but {stated_hz:g} Hz is stated; "
             f"{_unit_hint(stated_hz * step_s)}"
-            "correct it, or go without the times: reading.time=null"
+            f"correct it, or go without the times: {setting('reading.time')}=null"
         )
     late = seconds / step_s - np.arange(len(seconds))
     gaps, jitter = _gaps_in(late, step_s, unit_s / step_s, name)
@@ -146,7 +147,7 @@ def _gaps_in(
     if spread > 1 + unit:
         raise ValueError(
             f"{name}: its times come so unevenly, by up to {spread * step_s:.3g} s, that missing "
-            f"samples cannot be told from late ones; {_STATE}"
+            f"samples cannot be told from late ones; {_hint()}"
         )
     slip = abs(unit - round(unit))
     beat = 1 / slip if slip > 2 / _MOST_FOR_STEP else 0.0  # samples until rounding repeats
@@ -162,7 +163,7 @@ def _gaps_in(
         if missing < total:
             raise ValueError(
                 f"{name}: samples {place} and before come {total - missing} steps closer than "
-                f"{1 / step_s:.6g} Hz; remove what is there twice, or {_STATE}"
+                f"{1 / step_s:.6g} Hz; remove what is there twice, or {_hint()}"
             )
         if missing > total:
             gaps.append(_Gap(place + total, missing - total, place))
@@ -182,7 +183,7 @@ def _refuse_jumps(times: _Numbers, name: str) -> None:
         place = int(np.argmax(steps))
         raise ValueError(
             f"{name}: time jumps at sample {place + 1}, from {times[place]:.9g} to "
-            f"{times[place + 1]:.9g} s; cut the file there, or {_STATE}"
+            f"{times[place + 1]:.9g} s; cut the file there, or {_hint()}"
         )
 
 
@@ -193,15 +194,21 @@ def _refuse_bursts(steps: _Numbers, name: str) -> None:
     longest = max((edges == -1).nonzero()[0] - (edges == 1).nonzero()[0], default=0)
     if longest >= _MOST_TOGETHER or not len(forward):
         raise ValueError(
-            f"{name}: {longest + 1} samples share a time, as if they came in bursts; {_STATE}"
+            f"{name}: {longest + 1} samples share a time, as if they came in bursts; {_hint()}"
         )
+
+
+def _hint() -> str:
+    """What to try if the times tell no clock."""
+    rate, time = setting("reading.sample_rate_hz"), setting("reading.time")
+    return f"state the rate and go without the times: {rate}=..., {time}=null"
 
 
 def _unit_hint(off: float) -> str:
     """What to try if a rate is off by about a unit of time."""
     for unit, factor in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
         if abs(off / factor - 1) <= 0.05:
-            return f"as if times were in {unit}: reading.time_unit={unit}; or "
+            return f"as if times were in {unit}: {setting('reading.time_unit')}={unit}; or "
     return ""
 
 
@@ -244,7 +251,7 @@ def _step_of(seconds: _Numbers, name: str) -> tuple[float, float]:
         if _is_regular(steps, unit):
             raise ValueError(
                 f"{name}: its times are rounded so coarsely that they do not tell which samples "
-                f"are missing; {_STATE}"
+                f"are missing; {_hint()}"
             )
         step = unit  # losses come at random, and stamps are not rounded
     for _ in range(3):

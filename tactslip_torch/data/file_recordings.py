@@ -18,14 +18,23 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.data.clock import Clock, even_clock, nominal_rate, snapped_rate
-from tactslip_torch.data.formats import Archived, Opened, Reading, Samples, file_of, open_file
+from tactslip_torch.data.formats import (
+    Archived,
+    Opened,
+    Reading,
+    Samples,
+    file_of,
+    open_file,
+    pieces,
+)
 from tactslip_torch.data.formats._inference import bare
-from tactslip_torch.data.formats._reading import MM_S
-from tactslip_torch.data.labels import slip_by_speed
+from tactslip_torch.data.labels import LabelColumn, LabelRule
 from tactslip_torch.data.manifest import Entry, Listing, Problem, manifest_of, read_manifest
 from tactslip_torch.data.recording import (
     MOMENTS,
@@ -38,7 +47,7 @@ from tactslip_torch.data.recording import (
     scaled,
 )
 from tactslip_torch.hand import KNOWN_KINDS, Adapting, Channel, HandLayout
-from tactslip_torch.runtime import check_number, in_processes
+from tactslip_torch.runtime import check_number, in_processes, setting, settings_in
 from tactslip_torch.signals.resampling import resample
 
 log = logging.getLogger(__name__)
@@ -94,7 +103,8 @@ class _Given:
         kind: of channels that have no row.
         adapting: of those; ``None`` as their kind does, if it is known, else slow.
         units: of samples of files that do not say it.
-        speed_over: the speed in mm/s above which slip is, by the column ``reading.speed``.
+        label: the column of labels, if there is one.
+        section: of the configuration that holds ``reading``, for messages; ``""``: it is on top.
     """
 
     reading: Reading = field(default_factory=Reading)
@@ -102,13 +112,15 @@ class _Given:
     kind: str = "electrode"
     adapting: Adapting | None = None
     units: str = "V"
-    speed_over: float | None = None
+    label: LabelColumn | None = None
+    section: str = ""
 
     @contextmanager
     def open(self, path: Path) -> Iterator[Opened]:
         """Open a file; columns that are called as channels of the hand are channels."""
         names = () if self.hand is None else self.hand.names
-        with open_file(path, replace(self.reading, hand=names)) as opened:
+        how = replace(self.reading, hand=names, label=self.label)
+        with settings_in(self.section), open_file(path, how) as opened:
             yield opened
 
 
@@ -124,8 +136,15 @@ class _Head(NamedTuple):
         num_rows: in the file.
         units: of the samples.
         own: all but the samples of a package file.
-        by_speed: what the speed of slip shows, if it is wanted.
         left_out: names of columns that are taken for no channels.
+        labels: of the column that is asked for, one of each row of the clock, until they are looked
+            at.
+        truth: when things happen in it, as far as anybody says.
+        is_labelled: whether a column says so.
+        missing: start and end, in samples, of what is missing or not finite in any channel and
+            cannot be bridged.
+        broken: what to say of samples that are not finite.
+        is_whole: whether nothing is missing, bridged or not.
     """
 
     clock: Clock
@@ -136,16 +155,13 @@ class _Head(NamedTuple):
     num_rows: int
     units: str
     own: Archived | None
-    by_speed: Timeline | None = None
     left_out: tuple[str, ...] = ()
-
-    @property
-    def truth(self) -> Timeline:
-        """What a package file says."""
-        if self.own is None:
-            return Timeline()
-        known = self.own.recording
-        return Timeline(**{name: getattr(known, name) for name in (*MOMENTS, *STRETCHES)})
+    labels: NDArray[np.float64] | None = None
+    truth: Timeline = Timeline()
+    is_labelled: bool = False
+    missing: tuple[tuple[int, int], ...] = ()
+    broken: str = ""
+    is_whole: bool = False
 
 
 def _head_of(opened: Opened, path: Path, given: _Given, stated_hz: float | None = None) -> _Head:
@@ -175,8 +191,8 @@ def _head_of(opened: Opened, path: Path, given: _Given, stated_hz: float | None 
         of_rows = Clock(stated / per_row, samples.num_samples // per_row)
     else:
         raise ValueError(
-            f"{path} says no rate and has no times; give reading.sample_rate_hz=..., or name "
-            "the column of times as reading.time=..."
+            f"{path} says no rate and has no times; give {setting('reading.sample_rate_hz')}=..., "
+            f"or name the column of times as {setting('reading.time')}=..."
         )
     try:
         hand, rows = _hand_of(opened, given)
@@ -187,13 +203,8 @@ def _head_of(opened: Opened, path: Path, given: _Given, stated_hz: float | None 
     if not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
         raise ValueError(
             f"{path} is of {rate:g} Hz, which is no sample rate of tactile sensors, 1 Hz to 1 MHz; "
-            "if its times are in another unit, say reading.time_unit=s, ms, us or ns"
+            f"if its times are in another unit, say {setting('reading.time_unit')}=s, ms, us or ns"
         )
-    by_speed = None
-    if given.speed_over is not None and opened.speed is not None:
-        speed = EvenSamples(opened.speed, of_rows).exact(0, of_rows.num_samples)[0].double()
-        mm_s = speed * MM_S[given.reading.speed_unit]
-        by_speed = slip_by_speed(mm_s.numpy(), of_rows.sample_rate_hz, given.speed_over)
     return _Head(
         clock,
         times is not None and stated is None,
@@ -203,9 +214,21 @@ def _head_of(opened: Opened, path: Path, given: _Given, stated_hz: float | None 
         samples.num_channels,
         own.recording.units if own else given.units,
         own,
-        by_speed,
         () if given.hand else opened.left_out,
+        None if opened.labels is None else _labels_on(of_rows, opened.labels, given.reading),
     )
+
+
+def _labels_on(clock: Clock, labels: Samples, reading: Reading) -> NDArray[np.float64]:
+    """The labels of rows on an even clock; in a gap that is bridged the nearest, in others NaN."""
+    found = np.full(clock.num_samples, np.nan)
+    found[~_gaps_on(clock)] = labels.stored(0, labels.num_samples)[0].astype(np.float64)
+    for start, missing, _ in clock.gaps:
+        if missing <= _most_bridged(reading, clock.sample_rate_hz):
+            half = start + (missing + 1) // 2
+            found[start:half] = found[start - 1]
+            found[half : start + missing] = found[start + missing]
+    return found
 
 
 def _hand_of(opened: Opened, given: _Given) -> tuple[HandLayout, Sequence[int]]:
@@ -239,7 +262,10 @@ def _hand_of(opened: Opened, given: _Given) -> tuple[HandLayout, Sequence[int]]:
         lacking = [name for name, place in places.items() if place is None]
         what = f"no channel {_some(lacking)}" if lacking else "a column that is two channels"
         raise ValueError(f"has {what} of data.channels; it has {has}")
-    how = "; name its columns so, or list them in the order of the hand as reading.channels"
+    how = (
+        "; name its columns so, or list them in the order of the hand as "
+        f"{setting('reading.channels')}"
+    )
     raise ValueError(
         f"has the channels {has}, not the {len(wanted)} of data.channels, "
         f"{_some(wanted)}{'' if is_ordered or is_native else how}"
@@ -264,8 +290,8 @@ class EvenSamples(Samples):
     Args:
         samples: of the file.
         clock: of its times.
-        most_bridged: gaps of at most so many samples are crossed by a straight line; others are
-            NaN.
+        most_bridged: gaps and samples that are not finite, of at most so many in a channel, are
+            crossed by a straight line; in other gaps is NaN. If it is not 0 all are read whole.
         rows: of the file, that are wanted; ``None`` for all.
 
     Attributes:
@@ -284,8 +310,8 @@ class EvenSamples(Samples):
         self.num_channels = len(self._rows)
         self._inner, self._whole = samples, None
         self.level: Tensor | None = None
-        if clock.gaps:
-            self._whole = _without_gaps(samples, clock, most_bridged)[self._rows]
+        if clock.gaps or most_bridged:
+            self._whole = _bridged(_without_gaps(samples, clock)[self._rows], most_bridged)
 
     def read(self, first: int, stop: int) -> Tensor:
         """Samples from ``first`` to before ``stop`` on the clock, ``[C, n]``."""
@@ -300,20 +326,94 @@ class EvenSamples(Samples):
         return found if self.level is None else found - self.level
 
 
-def _without_gaps(samples: Samples, clock: Clock, most_bridged: int) -> Tensor:
-    """All samples on an even clock, ``[C, T]``: in gaps a straight line, or NaN in longer ones."""
+def _without_gaps(samples: Samples, clock: Clock) -> Tensor:
+    """All samples on an even clock, ``[C, T]``: NaN in gaps."""
     read = samples.read(0, samples.num_samples)
+    if not clock.gaps:
+        return read
     whole = torch.full((len(read), clock.num_samples), torch.nan, dtype=read.dtype)
-    is_there = torch.ones(clock.num_samples, dtype=torch.bool)
-    for start, missing, place in clock.gaps:
-        is_there[start : start + missing] = False
-        if missing <= most_bridged:
-            before, behind = read[:, place - 1 : place + 1].double().split(1, dim=1)
-            weight = torch.arange(1, missing + 1, dtype=torch.float64) / (missing + 1)
-            line = before + (behind - before) * weight
-            whole[:, start : start + missing] = line.to(read.dtype)
-    whole[:, is_there] = read
+    whole[:, torch.from_numpy(~_gaps_on(clock))] = read
     return whole
+
+
+def _gaps_on(clock: Clock) -> NDArray[np.bool_]:
+    """Where samples are missing, ``[T]`` on the clock."""
+    is_missing = np.zeros(clock.num_samples, dtype=bool)
+    for start, missing, _ in clock.gaps:
+        is_missing[start : start + missing] = True
+    return is_missing
+
+
+def _runs_of(is_true: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Starts and ends of the runs of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_true, [False]])))
+    return edges[::2], edges[1::2]
+
+
+def _to_bridge(is_missing: NDArray[np.bool_], most: int) -> NDArray[np.bool_]:
+    """Which missing samples of a channel, ``[T]``, lie in runs so short that they are bridged."""
+    starts, stops = _runs_of(is_missing)
+    is_short = (stops - starts <= most) & (starts > 0) & (stops < len(is_missing))
+    change = np.zeros(len(is_missing) + 1, dtype=np.int64)
+    change[starts[is_short]], change[stops[is_short]] = 1, -1
+    return change.cumsum()[:-1] > 0
+
+
+def _bridged(whole: Tensor, most: int) -> Tensor:
+    """Samples ``[C, T]`` with a straight line across what is missing or not finite for short."""
+    if not most:
+        return whole
+    places = np.arange(whole.shape[1])
+    for row in whole:
+        is_there = row.isfinite().numpy()
+        if is_there.all() or not is_there.any():
+            continue
+        chosen = _to_bridge(~is_there, most)
+        known = row.double().numpy()[is_there]
+        line = np.interp(places[chosen], places[is_there], known)
+        row[torch.from_numpy(chosen)] = torch.from_numpy(line).to(row.dtype)
+    return whole
+
+
+_PIECE = 2**16  # samples at a time
+
+
+def _not_finite(samples: Samples, rows: Sequence[int]) -> dict[int, NDArray[np.int64]]:
+    """Of each channel, by its place in ``rows``, the samples of the file that are not finite."""
+    found: dict[int, list[NDArray[np.int64]]] = {}
+    if not samples.may_lack:
+        return {}
+    for number, piece in enumerate(pieces(samples, _PIECE)):
+        is_broken = ~piece[list(rows)].isfinite()
+        for channel in is_broken.any(-1).nonzero().flatten().tolist():
+            places = is_broken[channel].nonzero().flatten().numpy() + number * _PIECE
+            found.setdefault(channel, []).append(places)
+    return {channel: np.concatenate(parts) for channel, parts in found.items()}
+
+
+def _with_missing(head: _Head, samples: Samples, reading: Reading) -> _Head:
+    """What is missing in a file, or not finite, all samples looked at."""
+    clock, most = head.clock, _most_bridged(reading, head.rate_hz)
+    broken = _not_finite(samples, head.rows)
+    gaps = _gaps_on(clock)
+    is_lost = gaps & ~_to_bridge(gaps, most)
+    places = np.array([gap.place for gap in clock.gaps], dtype=np.int64)
+    lost_before = np.concatenate([[0], np.cumsum([gap.missing for gap in clock.gaps], dtype=int)])
+    text = ""
+    for channel, own in sorted(broken.items()):
+        on_clock = own + lost_before[np.searchsorted(places, own, side="right")]
+        is_missing = gaps.copy()
+        is_missing[on_clock] = True
+        is_lost |= is_missing & ~_to_bridge(is_missing, most)
+        if not text:
+            name, first_s = head.hand.names[channel], on_clock[0] / clock.sample_rate_hz
+            more = f" (and {len(broken) - 1} more channels)" if len(broken) > 1 else ""
+            text = f"{name}{more} is not finite in {len(own)} samples, first at {first_s:.4f} s"
+            if len(own) == samples.num_samples:
+                text = f"{name}{more} is not finite in any sample"
+    stretches = zip(*(edge.tolist() for edge in _runs_of(is_lost)), strict=True)
+    is_whole = not (broken or clock.gaps)
+    return head._replace(missing=tuple(stretches), broken=text, is_whole=is_whole)
 
 
 def _even(opened: Opened, path: Path, head: _Head, reading: Reading) -> EvenSamples:
@@ -327,7 +427,8 @@ def _even(opened: Opened, path: Path, head: _Head, reading: Reading) -> EvenSamp
     shape = found.num_channels, found.num_samples + sum(gap.missing for gap in clock.gaps)
     if shape != (head.num_rows, clock.num_samples):
         raise ValueError(f"{path} has changed since it was looked at; start again")
-    samples = EvenSamples(found, clock, _most_bridged(reading, head.rate_hz), head.rows)
+    most = 0 if head.is_whole else _most_bridged(reading, head.rate_hz)
+    samples = EvenSamples(found, clock, most, head.rows)
     if reading.tare_s is None:
         return samples
     first, stop = (round(moment * head.rate_hz) for moment in reading.tare_s)
@@ -432,8 +533,9 @@ class FileRecordings:
         reading: as ``Reading`` has it.
         skip_s: what a label of a whole recording leaves out at its start.
         slide_s: how long a slide lasts of which only the onset is known.
-        speed_over: the speed in mm/s above which slip is, by the column ``reading.speed`` (see
-            ``labels.slip_by_speed``), of recordings of which the manifest says nothing.
+        label_rule: of which ``column``, ``over``, ``unit`` and ``slip`` say which column of the
+            files has labels. What else is said of a recording holds as well: stretches take
+            precedence, a label of all of it stands where the column is empty.
         skip_failed: leave out files that cannot be read or differ, with a warning each.
         strict: refuse a set with problems; else they are in ``problems``, and what is fine is
             in ``ids``.
@@ -461,23 +563,18 @@ class FileRecordings:
         reading: Mapping[str, Any] | None = None,
         skip_s: float = 0.0,
         slide_s: float = 0.5,
-        speed_over: float | None = None,
+        label_rule: LabelRule | None = None,
         skip_failed: bool = False,
         strict: bool = True,
     ) -> None:
-        self.root, self.speed_over = Path(root), speed_over
-        how = Reading.of(reading)
-        if speed_over is not None:
-            check_number("labels.speed_over", speed_over)
-            if how.speed is None:
-                raise ValueError(
-                    f"labels.speed_over={speed_over:g} needs the column of speed: "
-                    "data.reading.speed=NAME"
-                )
+        self.root = Path(root)
+        self.label_column = None if label_rule is None else label_rule.label_column
+        with settings_in("data"):
+            how = Reading.of(reading)
         check_number("data.skip_s", skip_s, least=0)
         check_number("data.slide_s", slide_s, least=0)
         hand = _hand_from(channels)
-        self._given = _Given(how, hand, kind, adapting, units, speed_over)
+        self._given = _Given(how, hand, kind, adapting, units, self.label_column, "data")
         self._skip_s, self._slide_s = skip_s, slide_s
         if not isinstance(manifest, Listing):
             manifest = read_manifest(manifest_of(self.root, manifest), self.root)
@@ -533,9 +630,26 @@ class FileRecordings:
         path = self.root / entry.file
         try:
             with self._given.open(path) as opened:
-                return _head_of(opened, path, self._given, entry.sample_rate_hz)
+                head = _head_of(opened, path, self._given, entry.sample_rate_hz)
+                head = _with_missing(head, opened.samples, self._given.reading)
+                return self._with_truth(entry, head)
         except (ValueError, OSError) as error:
             return str(error).replace(f"{self.root}{os.sep}", "")
+
+    def _with_truth(self, entry: Entry, head: _Head) -> _Head:
+        """When things happen in a file: what is listed of it, its column of labels, or itself."""
+        told = entry.truth
+        if head.own is not None:
+            known = head.own.recording
+            own = Timeline(**{name: getattr(known, name) for name in (*MOMENTS, *STRETCHES)})
+            if told is None or told == Timeline(missing_s=told.missing_s):
+                told = own if told is None else own.joined(told)
+        elif head.labels is not None and self.label_column is not None:
+            rate_hz = head.clock.sample_rate_hz / self._given.reading.samples_per_row
+            given = (told or Timeline()).with_slides(len(head.labels) / rate_hz, self._slide_s)
+            found = self.label_column.timeline(head.labels, rate_hz, given, self._skip_s)
+            return head._replace(truth=found, labels=None, is_labelled=True)
+        return head._replace(truth=told or Timeline())
 
     def _difference(self, own: _Head, entry: Entry, first: _Head, rate_hz: float) -> str | None:
         """In what a file differs from the first, which is that of ``entry``."""
@@ -559,17 +673,21 @@ class FileRecordings:
 
     def _timed(self, entry: Entry, head: _Head) -> tuple[Timeline, list[str]]:
         """The truth of a recording on its time, and what does not fit."""
-        how, rate_hz, gaps, wrong = self._given.reading, head.rate_hz, head.clock.gaps, []
+        how, rate_hz, wrong = self._given.reading, head.rate_hz, []
         if how.resample_hz is not None:
             try:  # refuses ratios that cannot be
                 resample(torch.zeros(1, 1), rate_hz, how.resample_hz)
             except ValueError as error:
                 wrong.append(str(error))
-        if how.gaps == "refuse" and gaps:
+        truth = head.truth
+        pace = head.clock.sample_rate_hz / rate_hz
+        if head.is_measured and abs(pace - 1) > _ROUNDING:  # a person read the file's own times
+            truth = scaled(truth, pace)
+        if how.gaps == "refuse" and not _are_within(head.missing, truth.missing_s, rate_hz):
+            what = head.broken or _gaps_text(head.clock)
             wrong.append(
-                f"{sum(gap.missing for gap in gaps)} samples are missing in {len(gaps)} gaps, "
-                f"first {gaps[0].missing} at {gaps[0].start / head.clock.sample_rate_hz:.4f} "
-                "s; give reading.gaps=missing, or reading.gaps=bridge with bridge_ms"
+                f"{what}; set data.reading.gaps=missing to leave out the bins that need them, or "
+                "data.reading.gaps=bridge for a straight line across short gaps"
             )
         missing_s = self._missing_s(head)
         duration_s = self._num_recorded(head) / (how.resample_hz or rate_hz)
@@ -579,16 +697,12 @@ class FileRecordings:
                 wrong.append(f"lasts {duration_s:.4g} s, tare_s wants {last_s:g} s")
             if any(start <= first_s and last_s <= end for start, end in missing_s):
                 wrong.append(f"nothing is there to tare on from {first_s:g} to {last_s:g} s")
-        truth = entry.truth or head.by_speed or head.truth
-        pace = head.clock.sample_rate_hz / rate_hz
-        if head.is_measured and abs(pace - 1) > _ROUNDING:  # a person read the file's own times
-            truth = scaled(truth, pace)
         times, misfits = on_time(
             truth,
             duration_s,
             skip_s=self._skip_s,
             slide_s=self._slide_s,
-            slack_s=math.inf if entry.is_nominal or head.by_speed else 1.0 / rate_hz,
+            slack_s=math.inf if entry.is_nominal or head.is_labelled else 1.0 / rate_hz,
             missing_s=missing_s,
         )
         return times, [*wrong, *misfits]
@@ -603,9 +717,8 @@ class FileRecordings:
         how, rate_hz = self._given.reading, head.rate_hz
         reach_s = _REACH / min(rate_hz, how.resample_hz) if how.resample_hz else 0.0
         return [
-            (max(gap.start / rate_hz - reach_s, 0.0), (gap.start + gap.missing) / rate_hz + reach_s)
-            for gap in head.clock.gaps
-            if gap.missing > _most_bridged(how, rate_hz)
+            (max(start / rate_hz - reach_s, 0.0), stop / rate_hz + reach_s)
+            for start, stop in head.missing
         ]
 
     @property
@@ -690,6 +803,27 @@ class FileRecordings:
         )
 
 
+def _are_within(
+    missing: Sequence[tuple[int, int]], told_s: Sequence[Stretch], rate_hz: float
+) -> bool:
+    """Whether all that is missing, in samples, lies in stretches that somebody left out."""
+    return all(
+        any(
+            start_s * rate_hz <= start + 0.5 and stop - 0.5 <= end_s * rate_hz
+            for start_s, end_s in told_s
+        )
+        for start, stop in missing
+    )
+
+
+def _gaps_text(clock: Clock) -> str:
+    lost, first = sum(gap.missing for gap in clock.gaps), clock.gaps[0]
+    return (
+        f"{lost} samples are missing in {len(clock.gaps)} gaps, first {first.missing} at "
+        f"{first.start / clock.sample_rate_hz:.4f} s"
+    )
+
+
 def _common_rate(heads: Sequence[_Head]) -> float:
     """The rate of a set: that of its first file, as round as the spread of measured ones allows."""
     if not heads or not heads[0].is_measured:
@@ -704,7 +838,7 @@ def _doubts(recording: _File) -> list[str]:
     doubts = []
     if not (times.onsets_s or times.slip_s or times.non_slip_s):
         doubts.append("has no label, so no bin is taken from it")
-    if times.onsets_s and times.onsets_s[0] < _BEFORE_ONSET_S:
+    if times.onsets_s and times.onsets_s[0] < _BEFORE_ONSET_S and not head.is_labelled:
         doubts.append(
             f"slips at {times.onsets_s[0]:g} s already; labels=whole_slide takes as non-slip the "
             "second before an onset, as far as it was recorded"
@@ -712,11 +846,12 @@ def _doubts(recording: _File) -> list[str]:
     if head.left_out:
         doubts.append(
             f"has columns that are taken for no channels, {_some(head.left_out)}; if they are, "
-            "list all channels as reading.channels"
+            "list all channels as data.reading.channels; labels.column=NAME reads labels from one"
         )
-    if gaps := head.clock.gaps:
-        lost, first_s = sum(gap.missing for gap in gaps), gaps[0].start / head.rate_hz
-        doubts.append(f"lacks {lost} samples in {len(gaps)} gaps, first at {first_s:.4g} s")
+    if head.clock.gaps:
+        doubts.append(_gaps_text(head.clock))
+    if head.broken:
+        doubts.append(head.broken)
     if head.clock.jitter_s * head.rate_hz > 1:
         doubts.append(
             f"has times that are early or late by {1000 * head.clock.jitter_s:.3g} ms; "

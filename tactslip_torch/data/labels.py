@@ -8,7 +8,9 @@ second on either side of each onset.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
@@ -18,12 +20,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactslip_torch.data.recording import Stretch, Timeline
-from tactslip_torch.runtime import check_choice
+from tactslip_torch.data.recording import Label, Stretch, Timeline
+from tactslip_torch.runtime import check_choice, check_number
 
 Layout = Literal["whole_slide", "half_second"]
 OnsetSource = Literal["annotated", "exact"]
 Assign = Literal["whole", "majority", "last"]
+
+SpeedUnit = Literal["mm/s", "cm/s", "m/s", "um/s"]
+_MM_S: Mapping[SpeedUnit, float] = {"mm/s": 1.0, "cm/s": 10.0, "m/s": 1000.0, "um/s": 1e-3}
 
 NO_POSITION = torch.iinfo(torch.int64).min
 """The position of a bin that belongs to no stroke."""
@@ -44,8 +49,12 @@ class LabelRule:
             or at the start of a stretch. ``"majority"`` (slip if more than half of its samples
             are) or ``"last"`` (that of its last sample): bins begin at sample 0, a hop apart, and
             those of which every sample has a label are kept.
-        speed_over: slip is where the speed of the recordings is above so many mm/s, as
-            ``slip_by_speed`` has it; for recordings of ``data=files`` with ``reading.speed``.
+        column: the column of files that has a label for each sample, by name or by number from 0,
+            for recordings of ``data=files`` and ``data=named``; ``None``: there is none.
+        over: slip is where the magnitude of that column is above it.
+        unit: of the column and of ``over``, if it is a speed of slip; ``None``: it is a label.
+        slip: words, or numbers, of the column that are slip; all others are non-slip. ``None``:
+            words are known ones (``label_of``), numbers are compared with ``over``.
 
     Raises:
         ValueError: for an unknown layout, onset source or assignment, or a length that is not
@@ -58,15 +67,235 @@ class LabelRule:
     hop_ms: float | None = None
     shuffle_seed: int | None = None
     assign: Assign = "whole"
-    speed_over: float | None = None
+    column: str | int | None = None
+    over: float = 0.5
+    unit: SpeedUnit | None = None
+    slip: Sequence[str | float] | None = None
 
     def __post_init__(self) -> None:
         for name, kinds in (("layout", Layout), ("onsets", OnsetSource), ("assign", Assign)):
             check_choice(f"labels.{name}", getattr(self, name), get_args(kinds))
-        for name in ("bin_ms", "hop_ms", "speed_over"):
+        for name in ("bin_ms", "hop_ms"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"labels.{name} must be positive, got {value}")
+        _ = self.label_column
+
+    @property
+    def label_column(self) -> LabelColumn | None:
+        """The column that says what is slip, if one does.
+
+        Raises:
+            ValueError: for a value that cannot be.
+        """
+        if self.column is None:
+            return None
+        return LabelColumn(self.column, self.over, self.unit, self.slip)
+
+
+# Words and columns ------------------------------------------------------------------------------
+
+_WORDS: Mapping[str, Label] = {
+    **dict.fromkeys(("slip", "slipping", "true", "yes"), "slip"),
+    **dict.fromkeys(("nonslip", "noslip", "stick", "stable", "static", "hold"), "non-slip"),
+    **dict.fromkeys(("false", "no", "none"), "non-slip"),
+}
+"""What a word means, in small letters, without blanks, hyphens and underscores."""
+
+
+def _plain(word: str) -> str:
+    return re.sub(r"[\s_-]", "", word.lower())
+
+
+def label_of(word: str) -> Label | None:
+    """The label that a word is, as people spell it: ``slip``, ``Non-slip``, ``no_slip``, ``hold``.
+
+    Example:
+        >>> label_of("No slip"), label_of("stable"), label_of("grasp")
+        ('non-slip', 'non-slip', None)
+    """
+    return _WORDS.get(_plain(word))
+
+
+@dataclass(frozen=True)
+class LabelColumn:
+    """The column of a file that says of each sample whether it is slip.
+
+    Args:
+        name: of the column, or its number from 0.
+        over: slip is where the magnitude is above it.
+        unit: of the column and of ``over``, if it is a speed; ``None``: it is a label.
+        slip: words or numbers that are slip; ``None``: known words, and numbers by ``over``.
+
+    Raises:
+        ValueError: for a value that cannot be.
+    """
+
+    name: str | int
+    over: float = 0.5
+    unit: SpeedUnit | None = None
+    slip: Sequence[str | float] | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str | int) or isinstance(self.name, bool):
+            raise ValueError(f"labels.column must be a name, a number or null, got {self.name!r}")
+        check_number("labels.over", self.over, least=0)
+        check_choice("labels.unit", self.unit, (None, *_MM_S))
+        if self.slip is None:
+            return
+        if isinstance(self.slip, str) or not isinstance(self.slip, Sequence) or not self.slip:
+            raise ValueError(f"labels.slip must be a list of words or null, got {self.slip!r}")
+        if self.unit is not None:
+            raise ValueError("labels.slip is of words, labels.unit of a speed; give one of both")
+
+    def number_of(self, word: str) -> float | None:
+        """What stands for a word among numbers: infinity for slip, 0 for non-slip.
+
+        ``None`` for a word that is not known, and for every word in a column of speeds.
+        """
+        if self.unit is not None:
+            return None
+        if self.slip is not None:
+            return math.inf if _plain(word) in {_plain(str(one)) for one in self.slip} else 0.0
+        label = label_of(word)
+        return None if label is None else math.inf if label == "slip" else 0.0
+
+    def no_label(self, word: str) -> str:
+        """What to say of a word that is not known, in a line that names the file."""
+        if self.unit is not None:
+            return f"{word!r} in column {self.name!r} is no speed; set labels.unit=null for labels"
+        return (
+            f"{word!r} in column {self.name!r} is no known label; list the words that are slip, as "
+            f"labels.slip=[slip], and all others are non-slip"
+        )
+
+    def states(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
+        """1 where a value is slip, 0 where it is not, -1 where there is none; ``[T]``."""
+        is_slip = np.abs(values) > self.over
+        if self.slip is not None:
+            is_slip = np.isinf(values)
+            for one in self.slip:
+                with suppress(ValueError):
+                    is_slip |= values == float(one)
+        return np.where(np.isnan(values), -1, is_slip)
+
+    def timeline(
+        self,
+        values: NDArray[np.float64],
+        sample_rate_hz: float,
+        told: Timeline | None = None,
+        skip_s: float = 0.0,
+    ) -> Timeline:
+        """Where the column says that slip begins and ends, and what is not labelled.
+
+        Args:
+            values: of the column, NaN where a cell is empty.
+            sample_rate_hz: of the values.
+            told: what else is said of the recording, which is in the timeline as well. Its slides
+                and stretches of slip or non-slip take precedence; a label of all of it is taken
+                where the column is empty.
+            skip_s: at the start that such a label does not stand for.
+
+        Shape:
+            - values: ``[T]``
+        """
+        state = self.states(values)
+        speed = None
+        if self.unit is not None:
+            speed = np.abs(values) * _MM_S[self.unit]
+            state = _without_flicker(state, sample_rate_hz)
+        if told is None:
+            return _timeline_of(state, sample_rate_hz, speed, self.over_mm_s)
+        if told.label is not None:
+            rest = state[round(skip_s * sample_rate_hz) :]
+            rest[rest < 0] = told.label == "slip"
+        for start_s, end_s in (*told.sliding_s, *told.slip_s, *told.non_slip_s):
+            end = len(state) if end_s == math.inf else round(end_s * sample_rate_hz)
+            state[round(start_s * sample_rate_hz) : end] = _TOLD
+        found = _timeline_of(state, sample_rate_hz, speed, self.over_mm_s)
+        return replace(told, label=None).joined(found)
+
+    @property
+    def over_mm_s(self) -> float:
+        """The threshold in mm/s, if the column is a speed."""
+        return self.over * _MM_S[self.unit or "mm/s"]
+
+
+_NO_LABEL, _TOLD = -1, -2  # beside 0 and 1: an empty cell, and a sample of which others say more
+_SHORTEST_S = 0.02
+"""A speed that is above or below the threshold for less than that is noise."""
+
+
+def _without_flicker(state: NDArray[np.int64], sample_rate_hz: float) -> NDArray[np.int64]:
+    """States of which none that is shorter than 20 ms stands between two of the other kind."""
+    shortest = _SHORTEST_S * sample_rate_hz
+    for kind in (0, 1):
+        for before, (start, stop, value), behind in _neighbours(_runs(state)):
+            if value == kind and before == behind == 1 - kind and stop - start < shortest:
+                state[start:stop] = 1 - kind
+    return state
+
+
+def _timeline_of(
+    state: NDArray[np.int64],
+    sample_rate_hz: float,
+    speed_mm_s: NDArray[np.float64] | None,
+    over_mm_s: float,
+) -> Timeline:
+    """The timeline of states, ``[T]``.
+
+    Of labels it begins and ends with samples; of speeds where the straight line between two samples
+    crosses the threshold. ``speeds_mm_s`` are the median speeds of slides to two digits, so that
+    results by speed have few rows. What is slip and does not follow non-slip is ``slip_s``.
+    """
+
+    def edge(place: int) -> float:
+        is_known = 0 < place < len(state) and min(state[place - 1 : place + 1]) >= 0
+        if speed_mm_s is None or not is_known:
+            return place / sample_rate_hz
+        low, high = speed_mm_s[place - 1], speed_mm_s[place]
+        return float(place - 1 + (over_mm_s - low) / (high - low)) / sample_rate_hz
+
+    sliding, speeds, slip, rest, unlabelled = [], [], [], [], []
+    for before, (start, stop, value), _ in _neighbours(_runs(state)):
+        stretch = edge(start), edge(stop)
+        if value == _NO_LABEL:
+            unlabelled.append(stretch)
+        elif value == 0:
+            rest.append(stretch)
+        elif value == 1 and before == 0:
+            sliding.append(stretch)
+            if speed_mm_s is not None:
+                speeds.append(float(f"{np.median(speed_mm_s[start:stop]):.2g}"))
+        elif value == 1:
+            slip.append(stretch)
+    return Timeline(
+        tuple(start for start, _ in sliding),
+        speeds_mm_s=tuple(speeds),
+        sliding_s=tuple(sliding),
+        slip_s=tuple(slip),
+        non_slip_s=tuple(rest),
+        unlabelled_s=tuple(unlabelled),
+    )
+
+
+_Run = tuple[int, int, int]
+
+
+def _runs(state: NDArray[np.int64]) -> list[_Run]:
+    """Start, end and value of each run of equal values."""
+    edges = np.flatnonzero(np.diff(state)) + 1
+    bounds = [0, *edges.tolist(), len(state)]
+    return [(start, stop, int(state[start])) for start, stop in pairwise(bounds) if start < stop]
+
+
+def _neighbours(runs: Sequence[_Run]) -> list[tuple[int | None, _Run, int | None]]:
+    """Each run with the values of those before and behind it."""
+    values = [None, *(value for _, _, value in runs), None]
+    return list(zip(values[:-2], runs, values[2:], strict=True))
+
+
+# Bins -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -98,12 +327,13 @@ def label_bins(
     sample_rate_hz: float,
     non_slip_s: Sequence[Stretch] = (),
     slip_s: Sequence[Stretch] = (),
+    unlabelled_s: Sequence[Stretch] = (),
 ) -> LabelledBins:
     """Lay bins around the onsets of a recording, and in its stretches of slip or of none.
 
     With ``rule.assign="whole"`` a slip bin lies wholly before the end of its slide, a non-slip bin
-    wholly between the end of the slide before and the onset, or wholly inside a stretch. Bins of a
-    stretch start with it, a hop apart; those that would meet a bin of a stroke, one of an earlier
+    wholly between what was slip or not labelled and the onset, or wholly inside a stretch. Bins of
+    a stretch start with it, a hop apart; those that would meet a bin of a stroke, one of an earlier
     stretch, or a slide are left out. With the other assignments the same samples have a label, and
     bins are those of which all have one. Nothing is laid before the start of the recording. One
     without onsets and stretches has no bins.
@@ -116,6 +346,7 @@ def label_bins(
         sample_rate_hz: of the recording.
         non_slip_s: start and end of each stretch that is non-slip beside what is around onsets.
         slip_s: the same of slip; its bins come last if bins are whole.
+        unlabelled_s: stretches that are not non-slip although an onset follows.
 
     Raises:
         ValueError: if a slide or stretch leaves the recording, or a bin is no whole number of
@@ -126,7 +357,9 @@ def label_bins(
     if rule.hop_ms is not None:
         hop = whole_samples(rule.hop_ms, sample_rate_hz, "labels.hop_ms")
     num_samples = round(duration_s * sample_rate_hz)
-    strokes = _strokes(rule, onsets_s, sliding_s, num_samples, sample_rate_hz)
+    strokes = _strokes(
+        rule, onsets_s, sliding_s, (*slip_s, *unlabelled_s), num_samples, sample_rate_hz
+    )
     told = [(stretch, False) for stretch in non_slip_s] + [(stretch, True) for stretch in slip_s]
     stretches = [(*_samples_of(s, num_samples, sample_rate_hz), is_slip) for s, is_slip in told]
     if rule.assign != "whole":
@@ -166,7 +399,8 @@ class _Stroke(NamedTuple):
 
     Args:
         first: of the time before the onset that is non-slip; may lie before the recording.
-        free: the end of the slide before, or 0: from there on the time is non-slip.
+        free: the end of what was slip or not labelled before, or 0: from there on the time is
+            non-slip.
         edge: first sample of slip.
         last: end of slip, exclusive.
         slide_start: from here to ``slide_end`` no stretch gives a label.
@@ -185,11 +419,17 @@ def _strokes(
     rule: LabelRule,
     onsets_s: Sequence[float],
     sliding_s: Sequence[Stretch],
+    others_s: Sequence[Stretch],
     num_samples: int,
     sample_rate_hz: float,
 ) -> list[_Stroke]:
-    """What the layout labels around each onset."""
+    """What the layout labels around each onset.
+
+    No earlier time is non-slip than the end of ``others_s`` that lie before it. Onsets that a
+    column labels are exact; others are moved as the authors do.
+    """
     lead_s, shift_s = (1.0, 0.010) if rule.layout == "whole_slide" else (0.5, 0.0)
+    shift_s = 0.0 if rule.column is not None else shift_s
     lead = round(lead_s * sample_rate_hz)
     found: list[_Stroke] = []
     for onset_s, (start_s, end_s) in zip(onsets_s, sliding_s, strict=True):
@@ -203,7 +443,8 @@ def _strokes(
                 f"{last}, outside the recording of {num_samples / sample_rate_hz:.3f} s"
             )
         start = max(min(edge, int(start_s * sample_rate_hz)), 0)
-        free = found[-1].slide_end if found else 0
+        ends = (math.ceil(other_s * sample_rate_hz - 1e-6) for _, other_s in others_s)
+        free = max([found[-1].slide_end if found else 0, *(one for one in ends if one <= edge)])
         end = math.ceil(end_s * sample_rate_hz)
         found.append(_Stroke(edge - lead, free, edge, last, start, end))
     return found
@@ -271,84 +512,32 @@ def _samples_of(stretch: Stretch, num_samples: int, sample_rate_hz: float) -> tu
     return first, stop
 
 
-_SHORTEST_S = 0.02
-"""A speed that is above or below the threshold for less than that is noise."""
-
-
-def slip_by_speed(
-    speed_mm_s: NDArray[np.float64], sample_rate_hz: float, speed_over: float
-) -> Timeline:
-    """Where a speed of slip, of any sign, is above a threshold.
-
-    Onsets and ends are where the straight line between two samples crosses the threshold. What is
-    above or below it for less than 20 ms belongs to what is around it. ``speeds_mm_s`` are the
-    median speeds of slides to two digits, so that results by speed have few rows. Slides that had
-    begun before the recording, or while the speed was not known, are ``slip_s``.
+def bins_of(
+    rule: LabelRule, times: Timeline, sample_rate_hz: float, before: int, after: int
+) -> LabelledBins:
+    """The bins of a recording, without those that need missing samples; see ``label_bins``.
 
     Args:
-        speed_mm_s: of the contact against what it touches; NaN where it is not known, which is
-            neither slip nor non-slip.
-        sample_rate_hz: of the speed.
-        speed_over: the threshold in mm/s.
-
-    Shape:
-        - speed_mm_s: ``[T]``
-
-    Example:
-        >>> slip_by_speed(np.repeat([0.0, 10.0], 100), 1000.0, 5.0).sliding_s
-        ((0.0995, 0.2),)
+        rule: the layout.
+        times: of the recording.
+        sample_rate_hz: of the recording.
+        before: samples that the filter reads before a bin.
+        after: and behind it.
     """
-    speed = np.abs(speed_mm_s)
-    state = np.where(np.isnan(speed), -1, speed > speed_over)
-    shortest = _SHORTEST_S * sample_rate_hz
-    for kind in (0, 1):
-        for before, (start, stop, value), behind in _neighbours(_runs(state)):
-            if value == kind and before == behind == 1 - kind and stop - start < shortest:
-                state[start:stop] = 1 - kind
-
-    def edge(place: int) -> float:
-        if not 0 < place < len(state) or min(state[place - 1 : place + 1]) < 0:
-            return place / sample_rate_hz
-        low, high = speed[place - 1], speed[place]
-        return float(place - 1 + (speed_over - low) / (high - low)) / sample_rate_hz
-
-    sliding, speeds, slip, rest = [], [], [], []
-    for before, (start, stop, value), _ in _neighbours(_runs(state)):
-        stretch = edge(start), edge(stop)
-        if value == 0:
-            rest.append(stretch)
-        elif value == 1 and before == 0:
-            sliding.append(stretch)
-            speeds.append(float(f"{np.median(speed[start:stop]):.2g}"))
-        elif value == 1:
-            slip.append(stretch)
-    onsets = tuple(start for start, _ in sliding)
-    return Timeline(
-        onsets,
-        speeds_mm_s=tuple(speeds),
-        sliding_s=tuple(sliding),
-        slip_s=tuple(slip),
-        non_slip_s=tuple(rest),
+    bins = label_bins(
+        rule,
+        times.annotated_onsets_s if rule.onsets == "annotated" else times.onsets_s,
+        times.sliding_s,
+        times.duration_s,
+        sample_rate_hz,
+        times.non_slip_s,
+        times.slip_s,
+        times.unlabelled_s,
     )
+    return _clear_of(bins, times.missing_s, before, after, sample_rate_hz)
 
 
-_Run = tuple[int, int, int]
-
-
-def _runs(state: NDArray[np.int64]) -> list[_Run]:
-    """Start, end and value of each run of equal values."""
-    edges = np.flatnonzero(np.diff(state)) + 1
-    bounds = [0, *edges.tolist(), len(state)]
-    return [(start, stop, int(state[start])) for start, stop in pairwise(bounds) if start < stop]
-
-
-def _neighbours(runs: Sequence[_Run]) -> list[tuple[int | None, _Run, int | None]]:
-    """Each run with the values of those before and behind it."""
-    values = [None, *(value for _, _, value in runs), None]
-    return list(zip(values[:-2], runs, values[2:], strict=True))
-
-
-def clear_of(
+def _clear_of(
     bins: LabelledBins,
     missing_s: Sequence[Stretch],
     before: int,

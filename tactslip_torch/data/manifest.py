@@ -17,11 +17,11 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, NamedTuple
 
 from tactslip_torch.data.formats import is_there
+from tactslip_torch.data.labels import label_of
 from tactslip_torch.data.recording import (
     MOMENTS,
     SPANS,
     TIMES,
-    Label,
     RecordingId,
     Stretch,
     Timeline,
@@ -51,7 +51,6 @@ class Problem(NamedTuple):
 
 # When slip begins and ends ----------------------------------------------------------------------
 
-_LABELS: dict[str, Label] = {"slip": "slip", "nonslip": "non-slip", "noslip": "non-slip"}
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _SPAN = re.compile(rf"({_NUMBER})\s*(?:-|\N{{EN DASH}}|\.\.|to)\s*({_NUMBER}|end)")
 _TOUCH_S = 1e-6  # by less than that stretches only touch
@@ -151,11 +150,6 @@ def _overlaps(truth: Timeline) -> list[str]:
         if onset >= end:
             found.append(f"the onset at {onset:g} s is not before the end of its slide, {end:g} s")
     return found
-
-
-def label_of(word: str) -> Label | None:
-    """The label that a word is, as people spell it: ``slip``, ``Non-slip``, ``no_slip``."""
-    return _LABELS.get(re.sub(r"[\s_-]", "", word.lower()))
 
 
 def _items(cell: str) -> list[Any]:

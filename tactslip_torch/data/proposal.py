@@ -36,7 +36,8 @@ from tactslip_torch.data.formats._inference import (
     without_comment,
 )
 from tactslip_torch.data.formats._text import _opened_text
-from tactslip_torch.data.manifest import MANIFEST, Entry, label_of, read_manifest
+from tactslip_torch.data.labels import label_of
+from tactslip_torch.data.manifest import MANIFEST, Entry, read_manifest
 from tactslip_torch.signals.wavelet import highest_level
 
 _Numbers = NDArray[np.float64]

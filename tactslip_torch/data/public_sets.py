@@ -10,11 +10,11 @@ from typing import Any
 
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.folder import guessed, recording_files
+from tactslip_torch.data.labels import label_of
 from tactslip_torch.data.manifest import (
     Entry,
     Listing,
     Problem,
-    label_of,
     manifest_of,
     read_manifest,
     twice,

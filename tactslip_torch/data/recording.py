@@ -48,7 +48,7 @@ Label = Literal["slip", "non-slip"]
 MOMENTS = ("onsets_s", "annotated_onsets_s", "speeds_mm_s")
 STRETCHES = ("sliding_s", "slip_s", "non_slip_s", "released_s")
 """What a ``Recording`` says of its time: numbers, one of each slide, and pairs of start and end."""
-SPANS = (*STRETCHES, "missing_s")
+SPANS = (*STRETCHES, "missing_s", "unlabelled_s")
 TIMES = (*MOMENTS, *SPANS)
 """What a ``Timeline`` says beside the duration and a label."""
 
@@ -71,6 +71,8 @@ class Timeline:
             where that is not known.
         label: of all of the recording; none is left in what a ``RecordingSource`` gives.
         duration_s: length of the recording; 0 before it is opened.
+        unlabelled_s: stretches of which nobody knows whether they are slip, although an onset
+            follows; the time before other onsets is taken as non-slip.
     """
 
     onsets_s: tuple[float, ...] = ()
@@ -83,6 +85,43 @@ class Timeline:
     released_s: tuple[Stretch, ...] = ()
     label: Label | None = None
     duration_s: float = 0.0
+    unlabelled_s: tuple[Stretch, ...] = ()
+
+    def with_slides(self, duration_s: float, slide_s: float) -> Timeline:
+        """The same, in which every onset has its slide.
+
+        One of which only the onset is known lasts ``slide_s``, or ends before that with the next
+        onset, stretch without slip, or the recording.
+        """
+        if self.sliding_s:
+            return self
+        onsets = self.onsets_s
+        stops = [*onsets, duration_s, *(start for start, _ in self.non_slip_s)]
+        ends = [min([onset + slide_s, *(s for s in stops if s > onset)]) for onset in onsets]
+        return replace(self, sliding_s=tuple(zip(onsets, ends, strict=True)))
+
+    def joined(self, other: Timeline) -> Timeline:
+        """What both say, of different parts of a recording; every onset must have its slide."""
+        strokes = sorted(
+            (onset, annotated, speed, slide)
+            for times in (self, other)
+            for onset, annotated, speed, slide in zip(
+                times.onsets_s,
+                times.annotated_onsets_s or times.onsets_s,
+                times.speeds_mm_s or (0.0,) * len(times.onsets_s),
+                times.sliding_s,
+                strict=True,
+            )
+        )
+        onsets, annotated, speeds, slides = zip(*strokes, strict=True) if strokes else ((),) * 4
+        spans: dict[str, Any] = {
+            name: tuple(sorted((*getattr(self, name), *getattr(other, name))))
+            for name in ("slip_s", "non_slip_s", "missing_s", "unlabelled_s")
+        }
+        is_known = self.released_s and not other.onsets_s
+        released = self.released_s if is_known else ()
+        both = replace(self, onsets_s=onsets, annotated_onsets_s=annotated, speeds_mm_s=speeds)
+        return replace(both, sliding_s=slides, released_s=released, **spans)
 
 
 def on_time(
@@ -100,8 +139,7 @@ def on_time(
         truth: as it was annotated.
         duration_s: of the recording.
         skip_s: at the start that a label of all of it does not stand for.
-        slide_s: how long a slide lasts of which only the onset is known; it ends before that with
-            the next onset, stretch without slip, or the recording.
+        slide_s: how long a slide lasts of which only the onset is known (``Timeline.with_slides``).
         slack_s: by which a stretch may leave the recording; it is cut then.
         missing_s: further stretches without samples, of the file.
     """
@@ -121,15 +159,12 @@ def on_time(
         )
     if problems:
         return Timeline(duration_s=duration_s), problems
+    truth = truth.with_slides(duration_s, slide_s)
     onsets = truth.onsets_s
     cut: dict[str, Any] = {
         name: tuple((start, min(end, duration_s)) for start, end in getattr(truth, name))
         for name in SPANS
     }
-    if not cut["sliding_s"]:
-        stops = [*onsets, duration_s, *(start for start, _ in truth.non_slip_s)]
-        ends = [min([onset + slide_s, *(s for s in stops if s > onset)]) for onset in onsets]
-        cut["sliding_s"] = tuple(zip(onsets, ends, strict=True))
     if truth.label is not None:
         cut["slip_s" if truth.label == "slip" else "non_slip_s"] = ((skip_s, duration_s),)
     cut["missing_s"] = tuple(sorted({*cut["missing_s"], *missing_s}))

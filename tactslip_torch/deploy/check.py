@@ -23,7 +23,7 @@ from tactslip_torch.deploy.bins import Precision, RawBin, Timing
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decisions import AlarmSettings
+from tactslip_torch.onset.decisions import HOST_COLUMNS, AlarmSettings
 from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.runtime import PACKAGE
@@ -40,19 +40,6 @@ _CLOSE = 1e-9  # of times, and of onset scores, which are float64 always
 _NUM_BINS, _NUM_DECISIONS = 128, 12
 _QUIET_V = 0.02  # span at rest of a channel of the recording, at most
 
-_OF_STREAM = {
-    "score": "score",
-    "probability": "probability",
-    "statistic": "statistic",
-    "valid": "is_valid",
-    "in_range": "in_range",
-    "channels_lost": "channels_lost",
-    "alarm": "is_alarm",
-    "on": "is_on",
-    "time_s": "available_s",
-    "onset_s": "onset_s",
-}
-"""Outputs of the graph, and the fields of ``Decisions`` that they are."""
 _OF_ONSETS = {"onset_score": "onset_score", "by_onset": "by_onset"}
 _OF_CHANNELS = ("valid", "in_range", "channels_lost")
 
@@ -168,7 +155,7 @@ def _stream_by_both(
     As a host does: tail and state are handed on, and nothing else is.
     """
     settings = AlarmSettings.of(exact)
-    columns = _OF_STREAM if settings.onset is None else _OF_STREAM | _OF_ONSETS
+    columns = HOST_COLUMNS if settings.onset is None else HOST_COLUMNS | _OF_ONSETS
     threshold = np.empty(0)
     if not is_whole:
         usual = StreamingDetector(exact, settings, dtype=torch.float64).push(samples.double().T)

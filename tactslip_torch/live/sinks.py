@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.onset.decisions import Alarm, Decisions
+from tactslip_torch.onset.decisions import HOST_COLUMNS, Alarm, Decisions
 from tactslip_torch.onset.rules import NOTHING_YET
 
 Array = NDArray[Any]
@@ -190,28 +190,15 @@ def decision_columns(decisions: Decisions, *, has_onset: bool) -> dict[str, list
         ``channels_lost`` (names), ``statistic``, ``alarm`` and ``on`` (``export/README.md``), ``m``
         entries each; ``None`` for what is not finite, and where there is no statistic or score yet.
     """
-    columns = {
-        "time_s": decisions.available_s,
-        "onset_s": decisions.onset_s,
-        "score": decisions.score,
-        "probability": decisions.probability,
-        "valid": decisions.is_valid,
-        "in_range": decisions.in_range,
-        "statistic": decisions.statistic,
-        "alarm": decisions.is_alarm,
-        "on": decisions.is_on,
+    is_lost = decisions.channels_lost.any(-1).tolist()
+    plain: dict[str, list[Any]] = {
+        name: [list(decisions.names_lost(i)) if any_ else [] for i, any_ in enumerate(is_lost)]
+        if name == "channels_lost"
+        else _known(getattr(decisions, column).tolist())
+        for name, column in HOST_COLUMNS.items()
     }
     if has_onset:
-        columns["onset_score"] = decisions.onset_score
-    plain: dict[str, list[Any]] = {}
-    for name, values in columns.items():
-        plain[name] = _known(values.tolist())
-        if name == "in_range":
-            lost = decisions.channels_lost.any(-1).tolist()
-            plain["channels_lost"] = [
-                list(decisions.names_lost(i)) if any_lost else [] for i, any_lost in enumerate(lost)
-            ]
-    if has_onset:
+        plain["onset_score"] = _known(decisions.onset_score.tolist())
         by = zip(plain["alarm"], decisions.by_onset.tolist(), strict=True)
         plain["raised_by"] = [("onset" if o else "status") if alarm else None for alarm, o in by]
     return plain

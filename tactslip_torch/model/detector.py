@@ -43,7 +43,6 @@ from tactslip_torch.package_files import load_table, reading, save_table
 from tactslip_torch.runtime import (
     PACKAGE,
     are_unchanged,
-    full_precision,
     has_values,
     is_concrete,
     is_traced,
@@ -303,17 +302,6 @@ class SlipDetector(nn.Module):
         """Probabilities of non-slip and slip, ``[*, 2]``; otherwise as ``probability``."""
         slip = self.probability(samples)
         return torch.stack([1 - slip, slip], -1)
-
-    def score_features(self, features: Tensor) -> Tensor:
-        """Score features that are neither pooled nor scaled.
-
-        Shape:
-            - features: ``[*, M]`` in the order of ``selected``
-            - output: ``[*]``, dtype of the detector
-        """
-        with full_precision(features):
-            score: Tensor = self.head(self.scaled(features))
-        return score
 
     def columns(self, features: Tensor, is_lost: Tensor | None = None) -> Tensor:
         """What the scaler takes: features, pooled over channels where the detector does that.

@@ -170,7 +170,7 @@ def kernel_from_dict(values: Mapping[str, Any]) -> Polynomial:
 # Heads -------------------------------------------------------------------------------------------
 
 
-class Cost(NamedTuple):
+class _Cost(NamedTuple):
     """What a head costs: multiply-adds to score one bin, and bytes to keep.
 
     Powers are not counted.
@@ -269,10 +269,10 @@ class QuadraticForm(nn.Module):
         return self.quadratic.numel() == 0
 
     @property
-    def cost(self) -> Cost:
+    def cost(self) -> _Cost:
         """Multiply-adds a bin and bytes, whatever the number of training bins."""
         num_values = self.num_features + self.quadratic.numel()
-        return Cost(num_values, (num_values + 1) * self.linear.element_size())
+        return _Cost(num_values, (num_values + 1) * self.linear.element_size())
 
     def forward(self, z: Tensor) -> Tensor:
         """The score.
@@ -330,11 +330,11 @@ class KernelSum(nn.Module):
         return self.support.shape[1]
 
     @property
-    def cost(self) -> Cost:
+    def cost(self) -> _Cost:
         """Multiply-adds a bin and bytes; both grow with the number of training bins."""
         num_bins, num_features = self.support.shape
         num_values = num_bins * (num_features + 1)
-        return Cost(num_values, num_values * self.support.element_size())
+        return _Cost(num_values, num_values * self.support.element_size())
 
     def forward(self, z: Tensor) -> Tensor:
         """The score; holds a kernel matrix of all bins given by all training bins.

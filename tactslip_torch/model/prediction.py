@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.runtime import full_precision, is_concrete, thread_map
-from tactslip_torch.signals.filtering import refuse_nonfinite
 
 ChannelMask = Sequence[str] | Tensor
 """Channels that are not to be listened to: their names, or a mask ``[C]``, bool."""
@@ -57,7 +56,7 @@ def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
     if policy not in get_args(Nonfinite):
         raise ValueError(f"nonfinite must be 'mask' or 'raise', got {policy!r}")
     if policy == "raise":
-        refuse_nonfinite(samples, names, "repair the samples, or take nonfinite='mask'")
+        _refuse_nonfinite(samples, names, "repair the samples, or take nonfinite='mask'")
 
 
 def predict_in_parts(predict: Callable[[Tensor], Prediction], x: Tensor) -> Prediction:
@@ -70,7 +69,7 @@ def predict_in_parts(predict: Callable[[Tensor], Prediction], x: Tensor) -> Pred
     return Prediction(*whole)
 
 
-def channel_mask(masked: ChannelMask, names: Sequence[str]) -> Tensor:
+def _channel_mask(masked: ChannelMask, names: Sequence[str]) -> Tensor:
     """The mask ``[C]`` of masked channels.
 
     Raises:
@@ -98,9 +97,9 @@ def masked_names(masked: ChannelMask, names: Sequence[str]) -> tuple[str, ...]:
     """Names of masked channels, in the order of the hand.
 
     Raises:
-        ValueError: as ``channel_mask``.
+        ValueError: as ``_channel_mask``.
     """
-    mask = channel_mask(masked, names).tolist()
+    mask = _channel_mask(masked, names).tolist()
     return tuple(name for name, is_masked in zip(names, mask, strict=True) if is_masked)
 
 
@@ -108,9 +107,32 @@ def without(samples: Tensor, masked: ChannelMask | None, names: Sequence[str]) -
     """Samples ``[*, C, n]`` with NaN in masked channels, which is how a missing one looks.
 
     Raises:
-        ValueError: as ``channel_mask``.
+        ValueError: as ``_channel_mask``.
     """
     if masked is None:
         return samples
-    mask = channel_mask(masked, names).to(samples.device)
+    mask = _channel_mask(masked, names).to(samples.device)
     return samples.masked_fill(mask[:, None], torch.nan) if bool(mask.any()) else samples
+
+
+def _refuse_nonfinite(samples: Tensor, names: Sequence[str], advice: str) -> None:
+    """Raise if a sample is NaN or Inf.
+
+    Args:
+        samples: in any unit.
+        names: of the channels, for the message.
+        advice: what to do about it, the end of the message.
+
+    Shape:
+        - samples: ``[*, C, n]``
+
+    Raises:
+        ValueError: naming bin, channel and sample of the first one.
+    """
+    is_bad = ~samples.isfinite()
+    if not bool(is_bad.any()):
+        return
+    *bins, channel, sample = is_bad.nonzero()[0].tolist()
+    value = float(samples[(*bins, channel, sample)])
+    place = f"bin {', '.join(map(str, bins))}, " if bins else ""
+    raise ValueError(f"{place}channel {names[channel]}, sample {sample} is {value}; {advice}")

@@ -160,7 +160,7 @@ class AlarmSettings:
             raise ValueError(f"no alarm settings of this version: {error}") from error
 
     @classmethod
-    def of(cls, detector: HasInfo) -> AlarmSettings:
+    def of(cls, detector: _HasInfo) -> AlarmSettings:
         """The settings in a detector's file.
 
         Raises:
@@ -174,7 +174,7 @@ class AlarmSettings:
         return cls.from_dict(detector.info[KEY], detector.pool.hand, detector.pool.sample_rate_hz)
 
 
-class HasInfo(Protocol):
+class _HasInfo(Protocol):
     """What alarm settings are read from: ``SlipDetector``, with the content of its file."""
 
     @property
@@ -349,6 +349,21 @@ class Decisions(NamedTuple):
         """Names of the channels that a decision was made without."""
         flags = self.channels_lost[index].tolist()
         return tuple(name for name, lost in zip(self.channels, flags, strict=True) if lost)
+
+
+HOST_COLUMNS = {
+    "time_s": "available_s",
+    "onset_s": "onset_s",
+    "score": "score",
+    "probability": "probability",
+    "valid": "is_valid",
+    "in_range": "in_range",
+    "channels_lost": "channels_lost",
+    "statistic": "statistic",
+    "alarm": "is_alarm",
+    "on": "is_on",
+}
+"""Names that all hosts give the columns of ``Decisions`` (``export/README.md``), in their order."""
 
 
 def joined_decisions(parts: Sequence[Decisions]) -> Decisions:

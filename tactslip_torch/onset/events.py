@@ -328,6 +328,20 @@ class Bootstrap:
             low, high = min(low, number["low"]), max(high, number["high"])
         return number | {"low": low, "high": high}
 
+    def statistic(self, of: Callable[[Tensor], Tensor], counts: Tensor) -> Number:
+        """A statistic of counts that are summed over recordings, such as a difference of scores.
+
+        Args:
+            of: the statistic, ``[n, ...] -> [n]``; NaN where a draw has none.
+            counts: of each recording.
+
+        Shape:
+            - counts: ``[R, ...]``
+        """
+        values = counts.double()
+        drawn = of(torch.tensordot(self._times, values, 1))
+        return self._number(float(of(values.sum(0)[None])), drawn, torch.arange(len(values)))
+
     def quantile(self, values: Tensor, recording: Tensor, share: float) -> Number:
         """Quantile of values, linear between neighbours, each value drawn with its recording.
 
@@ -380,7 +394,7 @@ def pooled_metrics(
       of.
     - ``per_material``, ``per_scene``, ``per_speed``: the same of groups, without groups, level and
       quantiles; a false alarm has no speed. Of several scenes, materials and speeds are of the
-      paper's alone.
+      paper's alone, where it is one of them.
 
     A number with an interval is ``{"value", "low", "high"}``, by bootstrap over recordings;
     what bears one name is one recording.
@@ -390,8 +404,9 @@ def pooled_metrics(
         num_resamples: draws.
     """
     events = sorted(events, key=lambda one: (*_name(one), one.quiet_s, str(one.onsets)))
-    is_one = len({one.scene for one in events}) < 2
-    counted = [one for one in events if is_one or one.scene == PAPER_SCENE]
+    scenes = {one.scene for one in events}
+    is_all = len(scenes) < 2 or PAPER_SCENE not in scenes
+    counted = [one for one in events if is_all or one.scene == PAPER_SCENE]
 
     def summary(own: Sequence[RecordingEvents], *, is_group: bool = True) -> dict[str, Any]:
         numbers = _summary(own, num_resamples)

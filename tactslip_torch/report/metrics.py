@@ -93,7 +93,8 @@ def bin_metrics(
     ``"<-20"`` and later ones as ``"20+"``.
 
     Of several kinds of scenes, materials, speeds and positions count bins of the paper's scene
-    alone: pooled, they would say more of which scenes there are than of a material.
+    alone, where it is one of them: pooled, they would say more of which scenes there are than of a
+    material.
 
     Args:
         is_slip_true: what each bin is.
@@ -118,8 +119,8 @@ def bin_metrics(
         if labels is not None and len(labels) != num_bins:
             raise ValueError(f"{name} must have one entry per bin, {num_bins}, got {len(labels)}")
 
-    is_one = scenes is None or len(set(scenes)) < 2
-    counted = [is_one or scene == PAPER_SCENE for scene in scenes or [PAPER_SCENE] * num_bins]
+    is_all = scenes is None or len(set(scenes)) < 2 or PAPER_SCENE not in scenes
+    counted = [is_all or scene == PAPER_SCENE for scene in scenes or [PAPER_SCENE] * num_bins]
     members = {
         "per_material": _members(materials, counted),
         "per_speed": _members([f"{float(speed):g}" for speed in speeds_mm_s], counted),
@@ -153,7 +154,8 @@ def summed_metrics(scores: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 def merged_metrics(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Scores of all bins of several ``bin_metrics`` together, from their summed counts.
 
-    Groups are those that any of them has; of several kinds of scenes again the paper's alone.
+    Groups are those that any of them has; of several kinds of scenes again the paper's alone,
+    where it is one of them.
 
     Example:
         >>> half = {**split_metrics([[1, 0], [0, 1]]), "per_material": {}, "per_speed": {}}
@@ -161,8 +163,9 @@ def merged_metrics(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         [[2, 0], [0, 2]]
     """
     groups: dict[str, dict[str, Any]] = {}
-    is_one = len({scene for own in scores for scene in own.get("per_scene", {})}) < 2
-    counted = [own for own in scores if is_one or PAPER_SCENE in own.get("per_scene", {})]
+    scenes = {scene for own in scores for scene in own.get("per_scene", {})}
+    is_all = len(scenes) < 2 or PAPER_SCENE not in scenes
+    counted = [own for own in scores if is_all or PAPER_SCENE in own.get("per_scene", {})]
     for kind in ("per_material", "per_speed", "per_scene", "per_position"):
         if not any(kind in own for own in scores):
             continue

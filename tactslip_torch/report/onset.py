@@ -20,6 +20,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from tactslip_torch.report import style
+from tactslip_torch.report.results import few_events
 from tactslip_torch.runtime import write_json
 
 Array = NDArray[np.float64]
@@ -28,7 +29,7 @@ Segments = Sequence[tuple[float, float]]
 
 REST, SLIP = style.BLUE, style.ORANGE
 COLUMNS = (
-    *("file", "alarm_s", "onset_s", "end_s", "score", "probability", "statistic", "is_valid"),
+    *("file", "alarm_s", "onset_s", "end_s", "score", "probability", "statistic"),
     *("in_range", "channels_lost", "raised_by"),
     *("outcome", "true_onset_s", "delay_s", "simulated"),
 )
@@ -40,6 +41,7 @@ _WIDTH, _ROOM = 1.2, 40  # of marks, in points, as long as there are no more of 
 _INVALID: dict[str, Any] = {
     "facecolor": "none", "edgecolor": "#999999", "hatch": "////", "linewidth": 0, "zorder": 0.5,
 }  # fmt: skip
+_LANE, _LEAST_LANE, _HIGH = 0.3, 0.15, 7.2  # inches: of a channel, its least, of many together
 _MOST_DELAYS = 12  # reported beside their alarms
 _ONSET: dict[str, Any] = {"color": style.INK, "linestyle": "-."}
 _RELEASE: dict[str, Any] = {"color": style.GREY, "linestyle": ":"}
@@ -281,8 +283,8 @@ def onsets_title(entry: Mapping[str, Any], *, of_simulated: bool) -> str:
         entry: of ``onsets.json``.
         of_simulated: whether the detector was trained on simulated data.
     """
-    title = [f"{'SIMULATED recording' if entry['simulated'] else 'Recording'} {entry['file']}"]
-    title += [f"material {entry['material']}"] if entry["material"] else []
+    of = f" of {entry['material']}" if entry["material"] else ""
+    title = [f"{'SIMULATED recording' if entry['simulated'] else 'Recording'} {entry['file']}{of}"]
     count = len(entry["alarms"])
     title += [f"{count} alarm{'s' * (count != 1)}"]
     if truth := entry["truth"]:
@@ -309,7 +311,8 @@ def onsets_table(content: Mapping[str, Any]) -> str:
         cells |= {"true onset s": _seconds(row["true_onset_s"])}
         cells |= {"delay s": _seconds(row["delay_s"]), "outcome": row["outcome"]}
         shown.append(cells)
-    lines = [style.table(shown, merged=1) if rows else "no alarm, and no slip missed"]
+    nothing = "no alarm, and no slip missed"
+    lines = [style.table(shown, merged=1, kept=1) if rows else nothing]
     if len(rows) > _MOST_ROWS:
         lines.append(f"and {len(rows) - _MOST_ROWS} more, see onsets.csv")
     return style.marked(content["simulated"], *lines)
@@ -347,6 +350,7 @@ def onsets_summary(content: Mapping[str, Any], seconds: float) -> str:
             f"false alarms: {events['num_false_alarms']} in {60 * events['quiet_hours']:.2f} "
             "minutes without slip"
         )
+        lines += [few] if (few := few_events(events)) else []
     return "\n".join(lines)
 
 
@@ -387,7 +391,8 @@ def onset_figure(
         onset_threshold: of the onset classifier; ``None``: there is none.
         title: of the figure; says what is simulated.
     """
-    heights = [max(1.2, 0.3 * len(traces.channels)), 0.55, 1.3]
+    lane = min(_LANE, max(_LEAST_LANE, _HIGH / len(traces.channels)))
+    heights = [max(1.2, lane * len(traces.channels)), 0.55, 1.3]
     heights += [] if onset_threshold is None else [1.3]
     figure = style.new_figure(12.0, sum(heights) + 1.3, title)
     panels = figure.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights})
@@ -457,10 +462,11 @@ def _draw_channels(axes: Axes, traces: Traces, slips: Segments) -> None:
     axes.set_yticks(middles, list(traces.channels), fontsize=7)
     axes.set_ylim(middles[-1] - 0.8, 0.8)
     axes.grid(visible=False)
-    heights_shown = ", ".join(
-        f"{kind} {high:.2g} {traces.units}".strip() for kind, high in heights.items()
+    shown = ", ".join(
+        f"{kind} {float(f'{high:.2g}'):g} {traces.units}".strip() for kind, high in heights.items()
     )
-    axes.set_ylabel(f"channels; distance of lanes: {heights_shown}")
+    text = f"distance of channels: {shown}"
+    axes.set_title(text, loc="right", fontsize=7.5, color=style.GREY, pad=14)  # above the delays
 
 
 def _tell_delays(axes: Axes, alarms: Sequence[Mapping[str, Any]]) -> None:

@@ -23,6 +23,8 @@ from tactslip_torch.runtime import write_json
 
 PAPER_LINE = f"paper: {published.PAPER}; real hand, random split over bins"
 _PAPER_SCENE_LINE = "of several scenes: materials and speeds are of the paper's scene alone"
+_SCENE_LINE = f"of several scenes: objects and speeds are of the scene {style.UNNAMED_SCENE} alone"
+_NO_SPEED = {"0": "no slide", "nan": "speed not known"}
 BASELINES = {
     "best_pooled_number": "best pooled number",
     "logistic_regression": "logistic regression, same features",
@@ -30,6 +32,20 @@ BASELINES = {
     "random_forest_simple": "random forest on mean, std, rms",
 }
 """What baselines (``tactslip_torch.training.learner``) are called in tables."""
+_OF_SIMPLE = (
+    "try recipe.use=[channel], longer bins (labels.bin_ms) and recordings of more objects; where "
+    "it stays ahead, a classifier on mean, std and rms is the better one for this hand"
+)
+_ADVICE = {
+    "best_pooled_number": "try recipe.use=[pooled], few features (recipe.num_features=[10,30]) and "
+    "more recordings",
+    "logistic_regression": "try recipe.degree=[1], which is linear as well, and more recordings",
+    "logistic_regression_simple": _OF_SIMPLE,
+    "random_forest_simple": _OF_SIMPLE,
+}
+"""What to do where a baseline is ahead."""
+FEWEST_SLIPS, FEWEST_HOURS = 30, 1
+"""Slips and hours without slip below which a rate says little."""
 _SCORES = {
     "accuracy": "accuracy %",
     "balanced_accuracy": "balanced %",
@@ -73,7 +89,8 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
 
 def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> None:
     """Print the tables of a run."""
-    texts = [splits_table(metrics), *_trained_on_lines(metrics), materials_table(metrics)]
+    texts = [splits_table(metrics), *_comparison_lines(metrics), *_trained_on_lines(metrics)]
+    texts.append(materials_table(metrics))
     for key, tables in (
         ("events", (events_table,)),
         ("alarm", (alarm_table, _scenes_table, reliability_table)),
@@ -123,24 +140,82 @@ def splits_table(metrics: _Metrics) -> str:
     return style.marked(metrics["simulated"], style.table(rows), *source)
 
 
-def materials_table(metrics: _Metrics) -> str:
-    """The same scores within each split for each material, stroke speed and, of several, scene.
+def _comparison_lines(metrics: _Metrics) -> list[str]:
+    """A line for each held-out split: which baseline is ahead of the detector, or that none is.
 
-    Where there are several scenes, a line above says that materials and speeds are of the paper's
-    alone (``bin_metrics``).
+    One is ahead where the whole interval of its difference is above 0. Then the line says what to
+    do; else it names the best baseline.
+
+    Args:
+        metrics: the content of ``metrics.json``.
+    """
+    lines = []
+    for role, found in metrics.get("comparison", {}).items():
+        known = found["baselines"]
+        differences = {name: own["difference"] for name, own in known.items()}
+        sure = {name: own for name, own in differences.items() if own["low"] is not None}
+        ahead = [name for name, own in sure.items() if own["low"] > 0]
+        best = max(ahead or known, key=lambda name: float(differences[name]["value"]))
+        named, score = BASELINES[best], style.percent(known[best]["balanced_accuracy"], 1)
+        own_score, between = style.percent(found["detector"], 1), "too few for an interval"
+        if best in sure:
+            what = _group_word(metrics, found["drawn"])
+            low, high = (f"{100 * sure[best][end]:.1f}" for end in ("low", "high"))
+            drawn = f"95 % interval over {found['num_drawn']} {what}s"
+            between = f"difference {low} to {high} points, {drawn}"
+        if ahead:
+            lines.append(
+                f"{named} is ahead of the detector on {role} recordings: {score} against "
+                f"{own_score} % balanced ({between}); {_ADVICE[best]}"
+            )
+            continue
+        is_behind = len(sure) == len(known) and all(own["high"] < 0 for own in sure.values())
+        begin = "the detector is ahead of every baseline" if is_behind else "no baseline is ahead"
+        lines.append(
+            f"{begin} on {role} recordings: the detector has {own_score} % balanced, {named}, the "
+            f"best of them, {score} ({between})"
+        )
+    return ["\n".join(lines)] if lines else []
+
+
+def _group_word(metrics: _Metrics, group: str) -> str:
+    """What a group of recordings is called: a material of the paper's hand, else an object."""
+    return "object" if group == "material" and not _is_papers_hand(metrics) else group
+
+
+def _is_papers_hand(metrics: _Metrics) -> bool:
+    return bool(metrics.get("is_papers_hand", True))
+
+
+def _scene_name(metrics: _Metrics, scene: str) -> str:
+    """A scene as it is shown; the paper's is the default where nothing names one."""
+    is_default = scene == published.PAPER_SCENE and not _is_papers_hand(metrics)
+    return style.UNNAMED_SCENE if is_default else scene
+
+
+def materials_table(metrics: _Metrics) -> str:
+    """The same scores within each split for each material, speed and, of several, scene.
+
+    Speeds are shown where some are known. Of another hand than the paper's, recordings that were
+    trained on are left out. Of several scenes a line above says where materials and speeds are of
+    the paper's alone (``bin_metrics``).
 
     Args:
         metrics: the content of ``metrics.json``.
     """
     rows: list[_Row] = []
-    head = []
-    for name, split in metrics["splits"].items():
+    head, splits = [], dict(metrics["splits"])
+    if len(splits) > 1 and not _is_papers_hand(metrics):
+        splits.pop("train", None)
+    for name, split in splits.items():
         groups = dict(split.get("per_material", {}))
-        for speed, scores in split.get("per_speed", {}).items():
-            groups["no stroke" if speed == "0" else f"{speed} mm/s"] = scores
+        speeds = split.get("per_speed", {})
+        for speed, scores in speeds.items() if set(speeds) - {"0", "nan"} else ():
+            groups[_NO_SPEED.get(speed, f"{speed} mm/s")] = scores
         if len(scenes := split.get("per_scene", {})) > 1:
-            head = [_PAPER_SCENE_LINE]
-            groups |= {f"scene {scene}": scores for scene, scores in scenes.items()}
+            if published.PAPER_SCENE in scenes:
+                head = [_PAPER_SCENE_LINE if _is_papers_hand(metrics) else _SCENE_LINE]
+            groups |= {f"scene {_scene_name(metrics, s)}": of for s, of in scenes.items()}
         rows += [{"split": name, "group": group} | _score_cells(of) for group, of in groups.items()]
     return style.marked(metrics["simulated"], *head, style.table(rows, num_left=2, merged=1))
 
@@ -152,17 +227,27 @@ def _trained_on_lines(metrics: _Metrics) -> list[str]:
     """
     if number := metrics.get("num_recordings"):
         folds = len(metrics.get("folds") or [metrics])
+        held_out = " and ".join(role for role in metrics["splits"] if role != "train")
         return [
-            f"test and unseen: {folds} folds, each of a detector trained without these recordings\n"
+            f"{held_out}: {folds} folds, each of a detector trained without these recordings\n"
             f"detector.pt: trained on all {number} recordings; no number above was measured on it, "
-            "test and unseen say what to expect of it"
+            f"{held_out} shows what to expect of it"
         ]
     lines = []
     for name, fold in (metrics.get("folds") or {"": metrics}).items():
-        if known := fold.get("trained_on"):
+        if known := _trained_on(metrics, fold.get("trained_on", {})):
             listed = "; ".join(f"{what} {', '.join(names)}" for what, names in known.items())
             lines.append(f"{name} trained on {listed}".strip())
     return ["\n".join(lines)] if lines else []
+
+
+def _trained_on(metrics: _Metrics, known: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str]]:
+    """What was trained on, in the user's words; without a session or scene that is the only one."""
+    if _is_papers_hand(metrics):
+        return dict(known)
+    found = {"objects" if what == "materials" else what: names for what, names in known.items()}
+    found["scenes"] = [_scene_name(metrics, scene) for scene in found.get("scenes", ())]
+    return {what: names for what, names in found.items() if what == "objects" or len(names) > 1}
 
 
 def _timing_table(timing_s: Mapping[str, float]) -> str:
@@ -265,13 +350,14 @@ def _selected_table(selected: Sequence[Mapping[str, str]]) -> str:
 
     The paper's counts stand beside where it prints them; for descriptors it gives only an order,
     so their column holds a rank such as ``#1``, and ``0`` for the two it never selects. Features
-    of another hand than the paper's stand alone.
+    of another hand than the paper's stand alone, without what all of them have in common.
 
     Args:
         selected: one mapping per feature with ``channel``, ``component``, ``domain``,
             ``descriptor``, ``kind`` and ``finger``.
     """
     is_papers = _is_of_papers_hand(selected)
+    number = "ours" if is_papers else "features"
     gauges, films = published.SELECTED_BY_FINGER.values()
     by_finger = {finger: gauges[finger] + films[finger] for finger in films}
     ranks = {name: f"#{rank}" for rank, name in enumerate(published.DESCRIPTORS_RANKED, 1)}
@@ -287,10 +373,12 @@ def _selected_table(selected: Sequence[Mapping[str, str]]) -> str:
     for key, of_paper in beside.items():
         shown = of_paper if is_papers else {}
         counted = Counter(each[key] for each in selected)
+        if len(counted) < 2 and not is_papers:
+            continue
         for value in dict.fromkeys([*dict(counted.most_common()), *shown]):
-            row = {"selected by": key, "": value, "ours": counted[value]}
+            row = {"selected by": key, "": value, number: counted[value]}
             rows.append(row | ({"paper": shown.get(value)} if is_papers else {}))
-    rows.append({"selected by": "all", "": "", "ours": len(selected)})
+    rows.append({"selected by": "all", "": "", number: len(selected)})
     if not is_papers:
         return style.table(rows, num_left=2, merged=1)
     rows[-1]["paper"] = published.NUM_SELECTED
@@ -306,11 +394,12 @@ _DOMAIN_WORDS = {"time": "time domain", "freq": "frequency domain"}
 def selected_features_figure(
     selected: Sequence[Mapping[str, str]], path: str | Path, *, simulated: bool
 ) -> None:
-    """Write where the selected features come from: four panels, the paper's counts beside.
+    """Write where the selected features come from, the paper's counts beside.
 
-    By sensor kind, by signal component, by finger, and by descriptor. For components and
-    descriptors the paper prints no counts, so words and the order of its ranking stand in.
-    Features of another hand than the paper's stand alone. What the paper published is hatched.
+    Panels are sensor kinds, signal components, fingers or statistics over channels, and
+    descriptors. For components and descriptors the paper prints no counts, so words and the order
+    of its ranking stand in. Features of another hand than the paper's stand alone, without the
+    panels that would have one bar. What the paper published is hatched.
 
     Args:
         selected: one mapping per feature, at least one, with ``channel``, ``component``,
@@ -321,38 +410,56 @@ def selected_features_figure(
     """
     title = f"Where the {len(selected)} selected features come from"
     figure = style.new_figure(12.0, 8.4, title, simulated=simulated)
-    grid = figure.add_gridspec(3, 2, width_ratios=[1.15, 1], height_ratios=[0.5, 1.1, 1])
-    kind, component, finger = (figure.add_subplot(grid[row, 0]) for row in range(3))
-    descriptor = figure.add_subplot(grid[:, 1])
     is_papers = _is_of_papers_hand(selected)
     by_kind = published.SELECTED_BY_KIND if is_papers else {}
     by_finger = published.SELECTED_BY_FINGER if is_papers else {}
     kinds = [feature["kind"] for feature in selected]
     colours = style.kind_colours([*by_kind, *sorted(set(kinds))])
-
-    of_paper = {name: {name: count} for name, count in by_kind.items()}
-    _counts(kind, "(a) sensor kind", zip(kinds, kinds, strict=True), colours, colours, of_paper)
-
-    pairs = [(_DOMAIN_WORDS[feature["domain"]], feature["component"]) for feature in selected]
     domains = dict(zip(_DOMAIN_WORDS.values(), (style.PURPLE, style.GREEN), strict=True))
-    _counts(component, "(b) signal component", pairs, _COMPONENTS, domains)
-
+    components = [feature["component"] for feature in selected]
+    of_domain = [_DOMAIN_WORDS[feature["domain"]] for feature in selected]
     is_pooled = any(feature.get("statistic") for feature in selected)
-    places = [feature.get("statistic") or feature["finger"] for feature in selected]
-    what = "(c) statistic over channels" if is_pooled else "(c) finger"
-    order = by_finger.get("SG", ())
-    _counts(finger, what, zip(kinds, places, strict=True), order, colours, by_finger)
+    apart = "of each channel" if is_pooled and not is_papers else None
+    places = [feature.get("statistic") or apart or feature["finger"] for feature in selected]
+    where = "statistic over channels" if is_pooled else "finger"
 
+    layers = {"sensor kind": kinds, "signal component": of_domain, where: kinds}
+    names = {"sensor kind": kinds, "signal component": components, where: places}
+    left = [name for name, of in names.items() if is_papers or len(set(of)) > 1]
+    left = left or ["signal component"]
+    orders = {
+        "sensor kind": colours,
+        "signal component": [c for c in _COMPONENTS if is_papers or c in components],
+        where: by_finger.get("SG", {}),
+    }
+    of_paper = {"sensor kind": {name: {name: n} for name, n in by_kind.items()}, where: by_finger}
+    heights = [{"sensor kind": 0.5, "signal component": 1.1}.get(name, 1.0) for name in left]
+    grid = figure.add_gridspec(len(left), 2, width_ratios=[1.15, 1], height_ratios=heights)
+    panels = {name: figure.add_subplot(grid[row, 0]) for row, name in enumerate(left)}
+    titles = [f"({letter}) {name}" for letter, name in zip("abcd", [*left, ""], strict=False)]
+    for (name, axes), panel_title in zip(panels.items(), titles, strict=False):
+        pairs = zip(layers[name], names[name], strict=True)
+        hues = domains if name == "signal component" else colours
+        is_told = is_papers or name == "signal component"  # else in the legend of all panels
+        _counts(
+            axes, panel_title, pairs, orders[name], hues, of_paper.get(name), with_legend=is_told
+        )
+
+    descriptor = figure.add_subplot(grid[:, 1])
     ranks = dict.fromkeys(published.DESCRIPTORS_NEVER, "-") if is_papers else {}
     ranked = published.DESCRIPTORS_RANKED if is_papers else ()
     ranks = {name: str(rank) for rank, name in enumerate(ranked, 1)} | ranks
-    places = [feature["descriptor"] for feature in selected]
-    what = f"(d) descriptor{'  [rank in the paper]' if is_papers else ''}"
-    names = _counts(descriptor, what, zip(kinds, places, strict=True), ranks, colours)
+    described = [feature["descriptor"] for feature in selected]
+    what = f"{titles[-1]}descriptor{'  [rank in the paper]' if is_papers else ''}"
+    pairs = zip(kinds, described, strict=True)
+    shown = _counts(descriptor, what, pairs, ranks, colours, with_legend=is_papers)
+    if not is_papers:
+        handles = [Patch(color=colour, label=kind) for kind, colour in colours.items()]
+        style.legend_below(figure, handles, 6)
     if is_papers:
         said = f"paper: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
-        component.set_xlabel(said)
-        style.lanes(descriptor, [f"{style.words(name)}  [{ranks[name]}]" for name in names])
+        panels["signal component"].set_xlabel(said)
+        style.lanes(descriptor, [f"{style.words(name)}  [{ranks[name]}]" for name in shown])
         descriptor.set_xlabel("features; the paper never selects [-]")
     style.save(figure, path, dpi=180)
 
@@ -364,6 +471,8 @@ def _counts(
     order: Iterable[str],
     colours: Mapping[str, str],
     of_paper: Mapping[str, Mapping[str, int]] | None = None,
+    *,
+    with_legend: bool = True,
 ) -> list[str]:
     """Counts of (layer, name) pairs as stacked bars, the paper's hatched below each; the names."""
     counts = Counter(pairs)
@@ -389,7 +498,8 @@ def _counts(
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
     axes.margins(x=0.1)
     place_of: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
-    axes.legend(ncols=4, borderaxespad=0.3, handlelength=1.4, **place_of)
+    if with_legend:
+        axes.legend(ncols=4, borderaxespad=0.3, handlelength=1.4, **place_of)
     return names
 
 
@@ -515,7 +625,8 @@ def confound_table(metrics: _Metrics) -> str:
     rows: list[_Row] = []
     recalls = ("non_slip_recall", "slip_recall", "balanced_accuracy")
     for row in _scene_rows(metrics):
-        cells: _Row = {"evaluated on": row["role"], "scene": row["scene"]}
+        scene = _scene_name(metrics, row["scene"])
+        cells: _Row = {"evaluated on": row["role"], "scene": scene}
         cells |= {"detector": row["detector"], "trained on it": row["is_trained"]}
         cells |= {"bins": row["scores"]["num_bins"]}
         rows.append(cells | _percents(row["scores"], {key: _SCORES[key] for key in recalls}))
@@ -538,12 +649,16 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
     roles, scenes = (list(dict.fromkeys(row[key] for row in rows)) for key in ("role", "scene"))
     colours = style.colours_of(row["detector"] for row in rows)
     height = 1.7 + len(roles) * (0.8 + 0.28 * len(scenes))
+    is_papers = _is_papers_hand(metrics)
+    names = {published.PAPER_SCENE: "paper's protocol" if is_papers else style.UNNAMED_SCENE}
     title = "Does it detect slip, or the motion of the arm?"
+    title = title if is_papers else "Scores of each kind of scene"
     figure = style.new_figure(10.5, height, title, simulated=metrics["simulated"])
     panels = figure.subplots(len(roles), 2, sharex="col", sharey=True, squeeze=False)
     dot: dict[str, Any] = {"marker": "o", "ls": "", "ms": 7.5, "mew": 1.8}
     sides = {"non_slip_recall": "nothing but slip", "slip_recall": "no slip in this scene"}
     named = {"test": "test cycles of seen materials", "unseen": "unseen materials"}
+    named = named if is_papers else {}
     for role, pair in zip(roles, panels, strict=True):
         for axes, (key, nothing) in zip(pair, sides.items(), strict=True):
             for lane, scene in enumerate(scenes):
@@ -560,9 +675,7 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
                 if not own:
                     look: dict[str, Any] = {"color": style.GREY, "ha": "center", "va": "center"}
                     axes.text(0.5, lane, nothing, transform=axes.get_yaxis_transform(), **look)
-            style.lanes(
-                axes, [{"paper": "paper's protocol"}.get(s, style.words(s)) for s in scenes]
-            )
+            style.lanes(axes, [names.get(scene, style.words(scene)) for scene in scenes])
         pair[0].set_title(named.get(role, role))
     left, right = panels[-1]
     left.set_xlim(left=0)
@@ -572,7 +685,7 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
     handles = [Line2D([], [], color=colours[name], label=name, **dot) for name in colours]
     if any(row["is_trained"] is False for row in rows):
         labels = {
-            style.GREY: "trained on other cycles of that scene",
+            style.GREY: "trained on other recordings of that scene",
             "white": "scene not trained on",
         }
         for fill, label in labels.items():
@@ -694,8 +807,9 @@ def events_table(metrics: _Metrics) -> str:
 
     ``delay`` is the median from the exact onset to the alarm, look-ahead within, ``mm slid`` the
     way slid meanwhile at most; ``slip-free`` is how long an alarm would have been false. Rates are
-    by the hour where that is at least an hour, else by the minute. Where compute was measured, the
-    parts of the mean delay follow in a second table.
+    by the hour where that is at least an hour, else by the minute. Columns in which nothing is
+    known are left out, and a line says where slips or hours are too few. Where compute was
+    measured, the parts of the mean delay follow in a second table.
 
     Args:
         metrics: the content of ``metrics.json``, with ``events``.
@@ -714,8 +828,17 @@ def events_table(metrics: _Metrics) -> str:
                 ms = latency.get(name)
                 delay[title] = None if ms is None else f"{ms:.1f}"
             delays.append(delay)
-    lines = [style.table(rows, num_left=2, merged=1)]
     found = [numbers for by_rule in metrics["events"].values() for numbers in by_rule.values()]
+    is_any = any(numbers["num_onsets"] or numbers["quiet_hours"] for numbers in found)
+    lines = [style.table(rows, num_left=2, merged=1, kept=2)] if is_any else []
+    if is_any and not any(numbers["num_onsets"] for numbers in found):
+        lines.append("no slip has a known onset: false alarms alone can be counted")
+    lines += [
+        f"{role}: {few}"
+        for role, by_rule in metrics["events"].items()
+        for few in [few_events(*list(by_rule.values())[:1])]
+        if few and role != "train"
+    ]
     if reasons := dict.fromkeys(of["reason"] for of in found if of.get("reason")):
         lines.append(f"no events: {'; '.join(reasons)}")
     if any(row["compute beside"] for row in delays):
@@ -723,10 +846,27 @@ def events_table(metrics: _Metrics) -> str:
     return style.marked(metrics["simulated"], *lines)
 
 
+def few_events(numbers: Mapping[str, Any]) -> str:
+    """That slips or hours are too few for a rate; empty where they are enough or there are none.
+
+    Args:
+        numbers: of ``pooled_metrics``.
+    """
+    slips, hours = numbers["num_onsets"], numbers["quiet_hours"]
+    counts, wanted = [f"{hours:.1f} h without slip"], [f"{FEWEST_HOURS} h"]
+    if slips:
+        counts.insert(0, f"{slips} slip{'s' * (slips != 1)}")
+        wanted.insert(0, str(FEWEST_SLIPS))
+    if not (slips or hours) or (hours >= FEWEST_HOURS and (not slips or slips >= FEWEST_SLIPS)):
+        return ""
+    are = "are" if slips else "is"
+    return f"{' and '.join(counts)}: too few for a rate; {' and '.join(wanted)} {are} wanted"
+
+
 def _drawn_events(metrics: _Metrics) -> dict[str, dict[str, Mapping[str, Any]]]:
-    """By role, the rules in words that were evaluated on some recording."""
+    """By role, the rules in words that were evaluated on some slip whose onset is known."""
     drawn = {
-        role: {style.words(rule): own for rule, own in by_rule.items() if own["num_recordings"]}
+        role: {style.words(rule): own for rule, own in by_rule.items() if own["num_onsets"]}
         for role, by_rule in metrics.get("events", {}).items()
     }
     return {role: by_rule for role, by_rule in drawn.items() if by_rule}
@@ -736,12 +876,12 @@ def _drawn_events(metrics: _Metrics) -> dict[str, dict[str, Mapping[str, Any]]]:
 def events_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write slips found by time since the onset, and what became of all, as a PNG.
 
-    A row for each role: to the left the fraction of slips that were found so many ms behind the
-    onset, a line for each rule, of which the latest 5 % may leave the picture; to the right found,
-    early and missed, with the false alarms.
+    A row for each role that has slips: to the left the fraction of slips that were found so many ms
+    behind the onset, a line for each rule, of which the latest 5 % may leave the picture; to the
+    right found, early and missed, with the false alarms.
 
     Args:
-        metrics: the content of ``metrics.json``, with events of some recording.
+        metrics: the content of ``metrics.json``, with events of some slip.
         path: the PNG to write, replaced as a whole if it exists.
     """
     events = _drawn_events(metrics)
@@ -857,7 +997,7 @@ def _target_line(metrics: _Metrics) -> str:
     )
 
 
-def budget_rows(metrics: _Metrics) -> list[_Row]:
+def _budget_rows(metrics: _Metrics) -> list[_Row]:
     """False alarms of each scene and method beside the budget, on recordings that set nothing.
 
     Args:
@@ -878,9 +1018,9 @@ def budget_rows(metrics: _Metrics) -> list[_Row]:
 
 
 def alarm_table(metrics: _Metrics) -> str:
-    """``_target_line``, ``_rate_rows`` and ``budget_rows`` for the terminal."""
+    """``_target_line``, ``_rate_rows`` and ``_budget_rows`` for the terminal."""
     rows = style.table(_rate_rows(metrics), num_left=2, merged=1)
-    budget = style.table(budget_rows(metrics), num_left=3)
+    budget = style.table(_budget_rows(metrics), num_left=3)
     return style.marked(metrics["simulated"], _target_line(metrics), rows, budget)
 
 
@@ -931,7 +1071,7 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
     title = f"Without slip at most {target:g} false alarms an hour (dashed)"
     height = 2.2 + 0.5 * max(len(alarm["methods"]), len(scenes))
     figure = style.new_figure(12.0, height, title, simulated=metrics["simulated"])
-    left, right = figure.subplots(1, 2)
+    left, *others = figure.subplots(1, 2 if scenes else 1, squeeze=False)[0]
     quiet = {role: _quiet_rates(metrics, role) for role in _STREAMS}
     methods = [name for name in alarm["methods"] if any(name in rates for rates in quiet.values())]
     hours = []
@@ -942,15 +1082,20 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
         own = [
             by_role[role][alarm["rule"]] if role in by_role else {} for by_role in scenes.values()
         ]
-        _draw_rates(right, [of.get("false_alarms_per_hour") for of in own], aside, colour)
+        for right in others:
+            rates = [of.get("false_alarms_per_hour") for of in own]
+            _draw_rates(right, rates, aside, colour)
     left.set_title(f"Without slip: {' and '.join(hours)}")
     left.axvline(target, color=style.INK, linewidth=1, linestyle="--", zorder=1)
-    right.set_title(f"Confounding scenes, by {style.words(alarm['rule'])} (bars: their budgets)")
     limits = {row["scene"]: row["limit"] for row in alarm["budget"] if not row["is_share"]}
-    for lane, scene in enumerate(scenes):
-        if scene in limits:
-            right.vlines(limits[scene], lane - 0.35, lane + 0.35, color=style.INK, linewidth=1.6)
-    for axes, names in ((left, methods), (right, scenes)):
+    for right in others:
+        title = f"Confounding scenes, by {style.words(alarm['rule'])} (bars: their budgets)"
+        right.set_title(title)
+        for lane, scene in enumerate(scenes):
+            ends = lane - 0.35, lane + 0.35
+            if scene in limits:
+                right.vlines(limits[scene], *ends, color=style.INK, linewidth=1.6)
+    for axes, names in zip([left, *others], [methods, scenes], strict=False):
         style.lanes(axes, list(map(style.words, names)))
         axes.set(
             xscale="log", xlabel="false alarms an hour, with interval (none: at the left edge)"

@@ -23,18 +23,27 @@ from tactslip_torch.runtime import whole_file
 
 SIMULATED_LINE = "SIMULATED data: numbers of a simulated hand, not of the paper's"
 
+UNNAMED_SCENE = "unnamed"
+"""The scene of recordings of another hand than the paper's that nothing names."""
+
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 PALETTE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 INK, GREY, LIGHT = "#222222", "#666666", "#DDDDDD"
 ALARM = "#C6361B"
+_EMPTY: set[object] = {None, "-"}
 _KIND_COLOURS = {"SG": ORANGE, "PVDF": BLUE}
 
 UPPER_LEFT_OUTSIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 
 
 # Tables ------------------------------------------------------------------------------------------
-def table(rows: Sequence[Mapping[str, object]], num_left: int = 1, merged: int = 0) -> str:
+def table(
+    rows: Sequence[Mapping[str, object]],
+    num_left: int = 1,
+    merged: int = 0,
+    kept: int | None = None,
+) -> str:
     """Columns padded to their widest cell: ``num_left`` flush left, the others flush right.
 
     Args:
@@ -43,6 +52,8 @@ def table(rows: Sequence[Mapping[str, object]], num_left: int = 1, merged: int =
         num_left: number of columns that hold words.
         merged: number of leading columns in which a cell that repeats the one above is left
             blank, as long as those to its left repeat as well.
+        kept: number of leading columns that are always there; behind them those are left out in
+            which no row has a value. ``None``: all are there.
 
     Example:
         >>> print(table([{"stage": "solve", "s": "9.50"}, {"stage": "total", "s": None}]))
@@ -50,6 +61,9 @@ def table(rows: Sequence[Mapping[str, object]], num_left: int = 1, merged: int =
         solve  9.50
         total     -
     """
+    if kept is not None and rows:
+        titles = [t for i, t in enumerate(rows[0]) if i < kept or {row[t] for row in rows} - _EMPTY]
+        rows = [{title: row[title] for title in titles} for row in rows]
     texts = cells(rows)
     shown = [list(row) for row in texts]
     for above, row, own in zip(texts[1:], texts[2:], shown[2:], strict=False):

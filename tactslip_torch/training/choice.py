@@ -31,7 +31,7 @@ from tactslip_torch.features.sensing import Sensing, SpanFeatures
 from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.runtime import for_each, steps
+from tactslip_torch.runtime import for_each, one_thread, steps, trim_memory
 from tactslip_torch.training.bins import SampledBins
 
 log = logging.getLogger(__name__)
@@ -160,6 +160,7 @@ def choose_model(
 
         def leave_out(fold: frozenset[int]) -> None:
             table.leave_out(fold, structures, penalties)
+            trim_memory()  # of what the fold has left, in each thread
             shown.update()
 
         for_each(leave_out, folds)
@@ -241,6 +242,7 @@ class CandidateBins:
         thinned.__dict__.update(self.__dict__, is_kept=is_kept, weights=weights)
         return thinned
 
+    @one_thread()
     def select(self, structure: Structure) -> FeatureSelection:
         """Compression, ranking and scaling of a structure, learned from all of these bins."""
         everything = torch.ones_like(self.is_slip)
@@ -265,12 +267,12 @@ class _Columns:
     """Scaled columns of some sampled bins, learned from the training bins among them.
 
     Attributes:
-        train: which of the bins are training bins, ``[n]``.
-        z: the columns, ``[n, K]``, those of channels before pooled ones.
+        z: the columns of training bins, ``[n, K]``, those of channels before pooled ones.
+        left_out: the columns of the others, ``[m, K]``.
         names: of the columns.
         pooling: that made the pooled ones.
         sensing: of the training bins, for pooled columns.
-        is_lost: silent channels of the bins, ``[n, C]``, left out of the pools.
+        is_lost: silent channels, ``[n + m, C]``, left out of the pools; training bins come first.
     """
 
     sensing: Sensing
@@ -279,7 +281,8 @@ class _Columns:
     def __init__(
         self, bins: CandidateBins, rows: Tensor, train: Tensor, parts: Sequence[str]
     ) -> None:
-        self.train = train[rows]
+        rows = torch.cat([train.nonzero()[:, 0], (rows & ~train).nonzero()[:, 0]])
+        num = int(train.sum())
         self._is_slip, self._groups = bins.is_slip[train], bins.groups[train]
         features, scaled = bins.features[rows], list[Tensor]()
         self.names, self.pooling = list[FeatureName](), None
@@ -289,20 +292,22 @@ class _Columns:
             if part == "pooled":
                 assert bins.pooling is not None  # General
                 spans = bins.spans[rows]
-                self.sensing = Sensing.fit(spans[self.train], 1, 1)
+                self.sensing = Sensing.fit(spans[:num], 1, 1)
                 self.is_lost = bins.span_features.is_silent(spans, self.sensing)
-                known, lost = features[self.train], self.is_lost[self.train]
+                known, lost = features[:num], self.is_lost[:num]
                 layer = ChannelPooling.fit(bins.hand, names, known, bins.pooling, lost)
                 place = {name: index for index, name in enumerate(names)}
                 inputs = [place[name] for name in layer.inputs]
                 x, names = layer(features[:, inputs].double(), self.is_lost), list(layer.names)
                 self.pooling = layer
             x = x.double()
-            scaler = FeatureScaler.fit(x[self.train], compress=True, tail=TAIL)
-            scaled.append(torch.cat([scaler(few) for few in x.split(_SCALED_BINS)]))
+            scaler = FeatureScaler.fit(x[:num], compress=True, tail=TAIL)
+            for few in x.split(_SCALED_BINS):
+                few.copy_(scaler(few))
+            scaled.append(x)
             self._places[part] = torch.arange(len(names)) + len(self.names)
             self.names += names
-        self.z = torch.cat(scaled, 1)
+        self.z, self.left_out = torch.cat(scaled, 1).tensor_split([num])
 
     def places(self, structure: Structure) -> Tensor:
         """Which columns a structure takes, best first; all in their order."""
@@ -312,21 +317,29 @@ class _Columns:
         order = self._scores[places].argsort(descending=True, stable=True)
         return places[order[: structure.num_features]]
 
-    def products(self, structure: Structure) -> Tensor:
-        """Inner products of all bins with the training bins, ``[n, train]``."""
+    def taken(self, structure: Structure) -> tuple[Tensor, Tensor]:
+        """The columns that a structure takes, of training bins and of the others."""
+        places = self.places(structure)
         if structure.num_features is not None:
-            z = self.z[:, self.places(structure)]
-            return z @ z[self.train].mT
+            return self.z[:, places], self.left_out[:, places]
+        neighbours = slice(int(places[0]), int(places[-1]) + 1)  # nothing is copied
+        return self.z[:, neighbours], self.left_out[:, neighbours]
+
+    def products(self, structure: Structure) -> Tensor:
+        """Inner products of the training bins, ``[n, n]``."""
+        if structure.num_features is not None:
+            z, _ = self.taken(structure)
+            return z @ z.mT
         for part in structure.parts:
             if part not in self._products:
-                z = self.z[:, self._places[part]]
-                self._products[part] = z @ z[self.train].mT
+                z, _ = self.taken(structure._replace(use=part))
+                self._products[part] = z @ z.mT
         first, *others = (self._products[part] for part in structure.parts)
         return sum(others, first)
 
     @cached_property
     def _scores(self) -> Tensor:
-        return group_scores(self.z[self.train], self._is_slip, self._groups)
+        return group_scores(self.z, self._is_slip, self._groups)
 
 
 def group_scores(columns: Tensor, is_slip: Tensor, groups: Tensor) -> Tensor:
@@ -446,27 +459,31 @@ def _ridge_scores(
 
     Through the primal or the dual, whichever has fewer unknowns.
     """
-    kernel, is_train = structure.kernel, columns.train
-    places = columns.places(structure)
-    if kernel.degree == 1 and len(places) < len(targets):
-        z = columns.z[:, places]
-        x = torch.cat([z, torch.full_like(z[:, :1], math.sqrt(kernel.offset))], 1)
-        system = x[is_train].mT @ (x[is_train] * weights[:, None])
-        right, others, each = x[is_train].mT @ (weights * targets), x[~is_train], torch.ones(())
+    kernel, (z, left_out) = structure.kernel, columns.taken(structure)
+    is_primal = kernel.degree == 1 and z.shape[1] < len(z)
+    if is_primal:
+        constant = math.sqrt(kernel.offset)
+        z, left_out = (torch.nn.functional.pad(x, (0, 1), value=constant) for x in (z, left_out))
+        system, right = z.mT @ (z * weights[:, None]), z.mT @ (weights * targets)
     else:
-        gram = (columns.products(structure) + kernel.offset) ** kernel.degree
-        system, right, others, each = gram[is_train], targets, gram[~is_train], 1 / weights
+        system = (columns.products(structure) + kernel.offset) ** kernel.degree
+        right = targets
+    diagonal, ridge = system.diagonal().clone(), torch.ones(()) if is_primal else 1 / weights
     solved = []
     for penalty in penalties:
-        ridged = system.clone()
-        ridged.diagonal().add_(each / penalty)
-        factor, info = torch.linalg.cholesky_ex(ridged)
+        system.diagonal().copy_(diagonal + ridge / penalty)
+        factor, info = torch.linalg.cholesky_ex(system)
         if int(info):  # a weak penalty on columns that repeat each other
-            found = torch.linalg.lstsq(ridged, right[:, None], driver="gelsd").solution
+            found = torch.linalg.lstsq(system, right[:, None], driver="gelsd").solution
         else:
             found = torch.cholesky_solve(right[:, None], factor)
         solved.append(found)
-    return (others @ torch.cat(solved, 1)).mT
+    unknowns = torch.cat(solved, 1)
+    if is_primal:
+        return (left_out @ unknowns).mT
+    if kernel.degree == 1:  # by the weights of the columns: fewer products than with every bin
+        return (left_out @ (z.mT @ unknowns) + kernel.offset * unknowns.sum(0)).mT
+    return ((left_out @ z.mT + kernel.offset) ** kernel.degree @ unknowns).mT
 
 
 def _means(table: Accuracies) -> dict[Candidate, float]:

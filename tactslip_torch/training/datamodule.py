@@ -17,8 +17,7 @@ from torch.utils.data import DataLoader
 from tactslip_torch.data.labels import (
     LabelledBins,
     LabelRule,
-    clear_of,
-    label_bins,
+    bins_of,
     needed_windows,
     shuffled,
     whole_samples,
@@ -122,10 +121,10 @@ class FeatureMaker:
         bin_samples = whole_samples(rule.bin_ms, source.sample_rate_hz, "labels.bin_ms")
         if rule.hop_ms is not None:
             whole_samples(rule.hop_ms, source.sample_rate_hz, "labels.hop_ms")
-        if rule.speed_over is not None and getattr(source, "speed_over", None) != rule.speed_over:
+        if rule.label_column != getattr(source, "label_column", None):
             raise ValueError(
-                f"labels.speed_over={rule.speed_over:g} needs recordings with a column of speed: "
-                "data=files data.reading.speed=NAME"
+                f"labels.column={rule.column} must be that with which the recordings are read: "
+                "data=files or data=named; in Python FileRecordings(..., label_rule=rule)"
             )
         if pool.bin_samples != bin_samples:
             raise ValueError(
@@ -196,21 +195,8 @@ class FeatureMaker:
 
         Bins that would need missing samples are left out.
         """
-        onsets = times.annotated_onsets_s if self.rule.onsets == "annotated" else times.onsets_s
-        rate = self.source.sample_rate_hz
-        bins = label_bins(
-            self.rule,
-            onsets,
-            times.sliding_s,
-            times.duration_s,
-            rate,
-            times.non_slip_s,
-            times.slip_s,
-        )
-        if not times.missing_s:
-            return bins
         before, after = (max(reach) for reach in zip(*self.channel_filter.reaches, strict=True))
-        return clear_of(bins, times.missing_s, before, after, rate)
+        return bins_of(self.rule, times, self.source.sample_rate_hz, before, after)
 
     def _features(
         self,

@@ -18,7 +18,9 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.data.labels import NO_POSITION
+from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.onset.events import (
+    Bootstrap,
     EventRecord,
     EventRules,
     LatencyParts,
@@ -42,6 +44,9 @@ RULES: Mapping[str, tuple[int, int]] = MappingProxyType(
 """From decisions to alarms, each k of the last n: the paper's, every first slip bin after a
 non-slip one, and two of three. Either is armed again by a decision for which it does not hold."""
 
+FEWEST_GROUPS = 5
+"""Materials or sessions over which an interval can be drawn; with fewer it is over recordings."""
+
 BINS_APART = "bins of one stroke are on both sides of this split"
 """Why a split by bin has no events."""
 
@@ -60,6 +65,36 @@ class EvaluatedBins(NamedTuple):
     says_slip: Tensor
     baselines: Mapping[str, Tensor]
     is_whole: bool
+
+
+class Outcomes(NamedTuple):
+    """Confusions of each recording, of the detector and of the baselines on the same bins.
+
+    Attributes:
+        recordings: ``R``.
+        confusions: by method, ``[R, 2, 2]``, truth by row; the first is ``"detector"``.
+    """
+
+    recordings: tuple[RecordingId, ...]
+    confusions: Mapping[str, Tensor]
+
+    @classmethod
+    def of(cls, parts: Sequence[EvaluatedBins]) -> Outcomes:
+        """The confusions of the recordings; nothing of a recording without baselines."""
+        number = torch.arange(len(parts)).repeat_interleave(
+            torch.tensor([len(part.says_slip) for part in parts])
+        )
+        cell = 4 * number + 2 * torch.cat([part.bins.is_slip for part in parts]).long()
+        decisions = {"detector": torch.cat([part.says_slip for part in parts])}
+        for name in parts[0].baselines:
+            decisions[name] = torch.cat([part.baselines[name] for part in parts])
+        return cls(
+            tuple(part.bins.recording for part in parts),
+            {
+                name: torch.bincount(cell + says_slip, minlength=4 * len(parts)).view(-1, 2, 2)
+                for name, says_slip in decisions.items()
+            },
+        )
 
 
 def evaluated_bins(
@@ -98,6 +133,61 @@ def bin_scores(parts: Sequence[EvaluatedBins]) -> tuple[dict[str, Any], dict[str
             confusion_matrix(truth, torch.cat([part.baselines[name] for part in parts]))
         )
         for name in parts[0].baselines
+    }
+
+
+def compared(outcomes: Sequence[Outcomes], role: str) -> dict[str, Any]:
+    """By how much the balanced accuracy of each baseline differs from the detector's.
+
+    Returns:
+        ``baselines``: of each its ``balanced_accuracy``, and ``difference`` from the detector's
+        with a 95 % interval, above 0 where the baseline is better; ``detector``: its balanced
+        accuracy. The interval is a bootstrap over ``num_drawn`` of what ``drawn`` says: recordings
+        or, where whole materials (or sessions) are left out and there are five or more, those.
+        Empty without baselines or where a class is absent.
+
+    Args:
+        outcomes: of one or several folds that have no bin in common.
+        role: what the recordings are.
+    """
+    names = [name for name in outcomes[0].confusions if name != "detector"]
+    recordings = [recording for own in outcomes for recording in own.recordings]
+    counts = {
+        name: torch.cat([own.confusions[name] for own in outcomes]) for name in ("detector", *names)
+    }
+    if not names or not counts["detector"].sum((0, 2)).all():
+        return {}
+    drawn, groups = "recording", [str(recording) for recording in recordings]
+    for group in ("material", "session") if role.endswith("unseen") else ():
+        own = [str(getattr(recording, group)) for recording in recordings]
+        if len(set(own)) >= FEWEST_GROUPS:
+            drawn, groups = group, own
+            break
+    places = {group: place for place, group in enumerate(dict.fromkeys(groups))}
+    place = torch.tensor([places[group] for group in groups])
+    bootstrap = Bootstrap(len(places))
+
+    def difference(sums: Tensor) -> Tensor:
+        """``[n, 2, 2, 2]``, of the detector and a baseline, to ``[n]``."""
+        detector, baseline = (sums.diagonal(dim1=-2, dim2=-1) / sums.sum(-1)).mean(-1).unbind(1)
+        return baseline - detector
+
+    def summed(name: str) -> Tensor:
+        return torch.zeros(len(places), 2, 2).long().index_add(0, place, counts[name])
+
+    detector = summed("detector")
+    return {
+        "drawn": drawn,
+        "num_drawn": len(places),
+        "detector": split_metrics(detector.sum(0).tolist())["balanced_accuracy"],
+        "baselines": {
+            name: {
+                "balanced_accuracy": split_metrics(own.sum(0).tolist())["balanced_accuracy"],
+                "difference": bootstrap.statistic(difference, torch.stack([detector, own], 1)),
+            }
+            for name in names
+            for own in [summed(name)]
+        },
     }
 
 
@@ -179,6 +269,7 @@ def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Even
 def merged_results(
     folds: Mapping[str, Mapping[str, Any]],
     recording_events: Mapping[str, Mapping[str, Mapping[str, Sequence[RecordingEvents]]]],
+    outcomes: Mapping[str, Mapping[str, Outcomes]] = MappingProxyType({}),
     *,
     by_fold: bool = False,
 ) -> dict[str, Any]:
@@ -187,11 +278,14 @@ def merged_results(
     Args:
         folds: of each its ``metrics`` as ``SlipLearner`` has them.
         recording_events: of each its ``events`` as ``SlipLearner`` has them.
+        outcomes: of each its ``outcomes`` as ``SlipLearner`` has them, by role; none without
+            baselines.
         by_fold: whether folds have the same bins, which then are not summed: results have each role
             of each fold, such as ``"protocol/unseen"``.
     """
     splits = defaultdict[str, list[Any]](list)
     baselines, events = (defaultdict[str, Any](lambda: defaultdict(list)) for _ in range(2))
+    by_role = defaultdict[str, list[Outcomes]](list)
     for fold, found in folds.items():
         before = f"{fold}/" if by_fold else ""
         for role, scores in found["splits"].items():
@@ -202,13 +296,18 @@ def merged_results(
         for role, by_rule in recording_events[fold].items():
             for name, recordings in by_rule.items():
                 events[before + role][name] += list(recordings)
+        for role, own in outcomes.get(fold, {}).items():
+            by_role[before + role].append(own)
     summed = {
-        name: {"splits": {role: summed_metrics(own) for role, own in by_role.items()}}
-        for name, by_role in baselines.items()
+        name: {"splits": {role: summed_metrics(own) for role, own in of_roles.items()}}
+        for name, of_roles in baselines.items()
     }
     only = next(iter(folds.values()))["baselines"] if len(folds) == 1 else None
     return {
         "splits": {role: merged_metrics(scores) for role, scores in splits.items()},
         "baselines": summed if only is None else only,  # what they are is told of one fold alone
+        "comparison": {
+            role: found for role, of in by_role.items() if (found := compared(of, role))
+        },
         "events": event_numbers(events),
     }

@@ -113,15 +113,16 @@ def run_experiment(experiment: Experiment, folder: Path) -> dict[str, Any]:
     shared = set(first["selected"]).intersection(*(of["selected"] for of in others))
     features = [row for row in first["features"] if row["name"] in shared]
     recording_events = [of.pop("recording_events") for of in results.values()]
+    outcomes = {name: of.pop("outcomes") for name, of in results.items()}
     for of in results.values():
         del of["features"]
     metrics = dict(first)
     if others:
         events = dict(zip(results, recording_events, strict=True))
-        metrics = merged_results(results, events, by_fold=have_same_bins(folds))
+        metrics = merged_results(results, events, outcomes, by_fold=have_same_bins(folds))
         metrics |= {"selected": [row["name"] for row in features], "folds": results}
     if on_all:  # what was measured is of the folds, all else of the detector to use
-        measured = {"splits", "baselines", "events", "recording_events"}
+        measured = {"splits", "baselines", "comparison", "events", "recording_events", "outcomes"}
         features = on_all["features"]
         metrics |= {key: value for key, value in on_all.items() if key not in measured}
     return metrics | {
@@ -162,6 +163,7 @@ def _run_fold(experiment: Experiment, data: SlipDataModule, folder: Path) -> dic
         "events": learner.metrics["events"] | alarm.pop("events", {}),
         **({"alarm": alarm} if alarm else {}),
         "recording_events": learner.events,
+        "outcomes": learner.outcomes,
         **learner.metadata,
         "selected": [str(name) for name in detector.selected_names],
         "features": feature_rows(detector.selected_names, maker.source.hand),

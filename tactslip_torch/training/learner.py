@@ -13,13 +13,15 @@ from tactslip_torch.data.splits import ROLES
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.events import LatencyParts, RecordingEvents
-from tactslip_torch.runtime import from_first_process, gathered
+from tactslip_torch.runtime import from_first_process, gathered, one_thread
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.baselines import Baselines
 from tactslip_torch.training.datamodule import RecordingFeatures, TrainingBins
 from tactslip_torch.training.evaluation import (
     EvaluatedBins,
+    Outcomes,
     bin_scores,
+    compared,
     evaluated_bins,
     event_numbers,
     events_by_rule,
@@ -41,8 +43,11 @@ class SlipLearner(L.LightningModule):
     Attributes:
         detector: the result, after the training step.
         metadata: how it was made, such as the penalty.
-        metrics: ``{"splits": ..., "baselines": ..., "events": ...}`` after a test.
+        metrics: ``{"splits": ..., "baselines": ..., "comparison": ..., "events": ...}`` after a
+            test.
         events: of each recording, by role and rule, after a test; to be pooled with others.
+        outcomes: of the recordings that are held out, by role, after a test; to be compared with
+            others.
         seconds: time of each stage of the fit.
 
     Raises:
@@ -73,6 +78,7 @@ class SlipLearner(L.LightningModule):
         self.metadata: dict[str, Any] = {}
         self.metrics: dict[str, Any] = {}
         self.events: dict[str, dict[str, list[RecordingEvents]]] = {}
+        self.outcomes: dict[str, Outcomes] = {}
         self.seconds: dict[str, float] = {}
         self._evaluated: dict[str, list[EvaluatedBins]] = {}
         # nothing is trained by it: torch's DistributedDataParallel refuses a module without one
@@ -94,9 +100,10 @@ class SlipLearner(L.LightningModule):
         info = self.metadata | {"calibration": fit.calibration}
         if self.with_baselines:
             sample = fit.sample
-            self.baselines = from_first_process(
-                lambda: Baselines(self.pool, fit.selection(sample.features), sample)
-            )
+            with one_thread():
+                self.baselines = from_first_process(
+                    lambda: Baselines(self.pool, fit.selection(sample.features), sample)
+                )
             self.seconds["baselines"] = time.perf_counter() - fitted
         self.detector = fit.detector(self.pool, self.channel_filter, info)
 
@@ -110,6 +117,7 @@ class SlipLearner(L.LightningModule):
             raise ValueError("nothing to test: fit first, or give the learner a detector")
         self._evaluated = {role: [] for role in ROLES}
 
+    @one_thread()  # a recording is small: threads would mostly wait
     def test_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
         """Score the bins of one recording."""
         detector = self.detector
@@ -123,10 +131,11 @@ class SlipLearner(L.LightningModule):
         for role, part in evaluated_bins(batch, score >= 0, baselines).items():
             self._evaluated[role].append(part)
 
+    @one_thread()
     def on_test_epoch_end(self) -> None:
         """Turn decisions into metrics."""
         assert self.detector is not None  # on_test_start
-        self.metrics, self.events = {"splits": {}}, {}
+        self.metrics, self.events, self.outcomes = {"splits": {}, "comparison": {}}, {}, {}
         known = self.baselines.metadata if self.baselines else {}
         baselines = {name: metadata | {"splits": {}} for name, metadata in known.items()}
         pool = self.detector.pool
@@ -144,6 +153,10 @@ class SlipLearner(L.LightningModule):
                 baselines[name]["splits"][role] = found
             self.metrics["splits"][role] = scores
             self.events[role] = events_by_rule(parts, latency)
+            if self.baselines and role != "train":
+                self.outcomes[role] = Outcomes.of(parts)
+                if found := compared([self.outcomes[role]], role):
+                    self.metrics["comparison"][role] = found
             for name in ("accuracy", "balanced_accuracy"):
                 if scores[name] is not None:
                     self.log(f"{role}/{name}", scores[name], batch_size=1)

@@ -48,6 +48,7 @@ from tactslip_torch.runtime import (
     check_number,
     from_first_process,
     gathered,
+    one_thread,
 )
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.bins import BinSample, RecordingBins, SampledBins, bin_keys
@@ -243,20 +244,22 @@ class _Recipe(ABC):
             ValueError: if a class is absent, or a solve fails.
         """
         statistics = self._statistics(pool)
-        for some in bins:
-            statistics.update(some)
+        with one_thread():  # a recording is small: threads would mostly wait
+            for some in bins:
+                statistics.update(some)
         statistics = _merged(statistics)
         plan: _Plan = from_first_process(lambda: self._plan(statistics, pool, is_nested, show))
         size, degree, kept = plan.selection.size, plan.kernel.degree, {}
         sums = None  # where bins are fewer than products, which may have no place in memory
         if plan.num_bins > plan.kernel.num_monomials(size):
             sums = SufficientStats(size, degree=degree)
-        for some in bins:
-            part = self._weighted(plan, some)
-            if sums is None:
-                kept[some.name] = part
-            else:
-                sums.update(some.name, *part)
+        with one_thread():
+            for some in bins:
+                part = self._weighted(plan, some)
+                if sums is None:
+                    kept[some.name] = part
+                else:
+                    sums.update(some.name, *part)
         if sums is None:
             kept = dict(itertools.chain(*(own.items() for own in gathered(kept))))
         else:

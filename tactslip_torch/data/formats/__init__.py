@@ -134,8 +134,8 @@ class Format:
                 self._check(path)
                 opened = self._adapter("read")(path, how, stack)
                 if opened.archived is None:
-                    if how.speed is not None and opened.speed is None:
-                        raise Refused(f"is of {self.name}, of which reading.speed is not read")
+                    if how.label is not None and opened.labels is None:
+                        raise Refused(f"is of {self.name}, of which labels.column is not read")
                     if how.samples_per_row > 1:
                         opened = unfolded(opened, how)
             yield opened

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -40,6 +41,7 @@ from tactslip_torch.data.formats._reading import (
     Samples,
     check_plausible,
     header_in,
+    label_numbers,
     needs,
     opened_columns,
     opened_from,
@@ -48,6 +50,7 @@ from tactslip_torch.data.formats._reading import (
     text_of,
 )
 from tactslip_torch.data.recording import MOMENTS, STRETCHES
+from tactslip_torch.runtime import setting
 
 _NOT_NUMBERS = {"b": "true or false", "c": "complex numbers", "V": "compound values"}
 _NOT_NUMBERS |= {"O": "objects or text", "S": "text", "U": "text"}
@@ -127,13 +130,13 @@ def _choose(
     called = {word for array in columns if array in within for word in (array.name, array.leaf)}
     is_matrix = bool(matrices) and (how.channels is None or not called.issuperset(how.channels))
 
-    def apart(wanted: str | int | None, what: str) -> Sequence[_Array]:
+    def apart(wanted: str | int | None, key: str) -> Sequence[_Array]:
         """Arrays that are not the samples; none of what is a column of a matrix."""
         if wanted is None:
             return []
         if isinstance(wanted, int):
             is_there = columns and not is_matrix
-            return [columns[position_of(None, len(columns), wanted, what)]] if is_there else []
+            return [columns[position_of(None, len(columns), wanted, key)]] if is_there else []
         if is_matrix and any(wanted in labels for array in several for labels in array.labels):
             return []
         return _named(wanted, several, refused)
@@ -141,13 +144,15 @@ def _choose(
     if how.time == "auto":
         times: Sequence[_Array] = [array for array in columns if is_time(array.leaf)]
     else:
-        times = apart(how.time, "time")
-    speeds = apart(how.speed, "speed")
-    how = replace(how, speed=None) if speeds else how  # of the columns
+        times = apart(how.time, setting("reading.time"))
+    label = how.label
+    words = _label_words(found, how, separator)
+    labels = [] if words else apart(None if label is None else label.name, "labels.column")
+    how = replace(how, label=None) if words or labels else how  # of the columns
     singles = [array for array in columns if array in within]
     passed: list[_Array] = []
     if how.channels is None:
-        singles = [array for array in singles if array not in (*times, *speeds)]
+        singles = [array for array in singles if array not in (*times, *labels)]
         if len(within) > 1 or how.samples is None:
             places = no_channels([array.leaf for array in singles], how.hand)
             passed = [singles[place] for place in places]
@@ -156,11 +161,14 @@ def _choose(
     if cubes and how.samples is None and how.channels is None:
         raise Refused(
             f"holds {cubes[0]!r}, which {refused[cubes[0]]}; a recording has 2, channels and time: "
-            "cut windows are no recording (SlipClassifier takes them), else say reading.samples"
+            f"cut windows are no recording (SlipClassifier takes them), else say "
+            f"{setting('reading.samples')}"
         )
     if is_matrix:
         if len(matrices) > 1:
-            raise Refused(f"holds several arrays, {_listed(matrices)}; say reading.samples")
+            raise Refused(
+                f"holds several arrays, {_listed(matrices)}; say {setting('reading.samples')}"
+            )
         opened, near = _of_matrix(path, matrices[0], times, how), matrices[0]
     elif singles:
         opened, near = _of_columns(path, singles, columns, how)
@@ -168,21 +176,57 @@ def _choose(
         named = {array.name: "is a label or book-keeping by its name" for array in passed}
         whys = "; ".join([f"{name!r} {why}" for name, why in (refused | named).items()][:3])
         reasons = f" ({whys})" if whys else " but times" if times else ""
-        raise Refused(f"holds no samples{reasons}; say reading.samples if it does")
+        raise Refused(f"holds no samples{reasons}; say {setting('reading.samples')} if it does")
     length = opened.samples.num_samples
     fitting = [a for a in times if a.is_column and a.length == length]
     if opened.stamps is None and fitting:
         unit = how.time_unit or time_unit_in(fitting[0].leaf)
         opened = opened._replace(stamps=Samples(path, [fitting[0].values]), time_unit=unit)
     elif opened.stamps is None and times and how.time != "auto":
-        raise Refused(f"has times {_listed(times)} for {length} samples; say reading.time")
-    if speeds:
-        if not speeds[0].is_column or speeds[0].length != length:
-            raise Refused(f"has speeds {_listed(speeds)} for {length} samples; say reading.speed")
-        opened = opened._replace(speed=Samples(path, [speeds[0].values]))
+        raise Refused(
+            f"has times {_listed(times)} for {length} samples; say {setting('reading.time')}"
+        )
+    if labels:
+        if not labels[0].is_column or labels[0].length != length:
+            raise Refused(f"has labels {_listed(labels)} for {length} samples; say labels.column")
+        opened = opened._replace(labels=Samples(path, [labels[0].values]))
+    if words:
+        if len(words) != length:
+            raise Refused(f"has {len(words)} labels for {length} samples; say labels.column")
+        assert label is not None  # there are words of it
+        opened = opened._replace(labels=Samples(path, [label_numbers(label, words)]))
     rate = near.sample_rate_hz or _single_rate(arrays, near.name)
     beside = tuple(array.name for array in passed if array.length == length)
     return opened._replace(sample_rate_hz=rate, left_out=(*opened.left_out, *beside))
+
+
+def _as_labels(name: str, values: Any, how: Reading) -> Any:
+    """The column of labels as numbers or a tuple of words, if it is asked for and holds none.
+
+    ``None`` of all else; true and false are 1 and 0.
+    """
+    if how.label is None or how.label.name not in (
+        name,
+        name.strip("/"),
+        re.split("[/.]", name)[-1],
+    ):
+        return None
+    if values.dtype.kind not in "bUSO" or sum(length > 1 for length in values.shape) > 1:
+        return None
+    whole = np.ravel(values[()])
+    return whole.astype(np.int8) if whole.dtype.kind == "b" else _decoded(whole)
+
+
+def _label_words(found: Mapping[str, Any], how: Reading, separator: str) -> Sequence[str]:
+    """The words of the column of labels, if it holds words and not numbers."""
+    wanted = "" if how.label is None else str(how.label.name).strip("/")
+    for name, kept in found.items():
+        if isinstance(kept, tuple) and wanted in (
+            name.strip("/"),
+            name.rpartition(separator)[2],
+        ):
+            return kept
+    return ()
 
 
 def _arrays_of(
@@ -230,7 +274,7 @@ def _time_axis(matrix: _Array, lengths: set[int], how: Reading) -> int:
     if rows == columns:
         raise Refused(
             f"holds {matrix.name!r} of {rows} by {columns}, so it does not show which axis is "
-            "time; say reading.time_first=true or false"
+            f"time; say {setting('reading.time_first')}=true or false"
         )
     return 0 if rows > columns else 1
 
@@ -242,13 +286,16 @@ def _of_columns(
     chosen = list(singles)
     if how.channels is not None:
         chosen = [
-            columns[position_of(None, len(columns), wanted, "channels")]
+            columns[position_of(None, len(columns), wanted, setting("reading.channels"))]
             if isinstance(wanted, int)
             else _named(wanted, singles, {})[0]
             for wanted in how.channels
         ]
     if len({column.length for column in chosen}) > 1:
-        raise Refused(f"holds columns of several lengths, {_listed(chosen)}; say reading.channels")
+        raise Refused(
+            f"holds columns of several lengths, {_listed(chosen)}; say "
+            f"{setting('reading.channels')}"
+        )
     names = tuple(column.leaf for column in chosen)
     if len(set(names)) < len(names):
         names = tuple(column.name for column in chosen)
@@ -338,8 +385,11 @@ def read_npz(path: Path, how: Reading, stack: ExitStack) -> Opened:
         return opened_from(_npz_header(found), path, Samples(path, found["samples"], 1))
     if how.samples is None and "samples" in found:
         how = replace(how, samples="samples")
-    arrays = {n: kept for n, kept in found.items() if isinstance(kept, np.ndarray)}
-    return _choose(path, found | {n: _why_not_numbers(a) or a for n, a in arrays.items()}, how)
+    for name, kept in found.items():
+        if isinstance(kept, np.ndarray):
+            labels = _as_labels(name, kept, how)
+            found[name] = (_why_not_numbers(kept) or kept) if labels is None else labels
+    return _choose(path, found, how)
 
 
 def _npz_header(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -410,6 +460,8 @@ def read_hdf5(path: Path, how: Reading, stack: ExitStack) -> Opened:
     for name, dataset in _datasets(file):
         is_list = name.rpartition("/")[2].lower() in CHANNEL_LISTS and _are_words(dataset)
         found[name] = _decoded(dataset[()]) if is_list else _why_no_dataset(dataset) or dataset
+        if isinstance(found[name], str) and (labels := _as_labels(name, dataset, how)) is not None:
+            found[name] = labels
     return _choose(path, found, how, attributes=_attributes)
 
 
@@ -451,6 +503,8 @@ def _why_no_dataset(dataset: Any) -> str | None:
 
 def _attributes(dataset: Any) -> tuple[_Labels, float | None]:
     """Words that may name the channels of a dataset and its rate, the nearest attributes first."""
+    if isinstance(dataset, np.ndarray):  # labels that were true and false
+        return [], None
     around = [dataset]
     while around[-1].name != "/":
         around.append(around[-1].parent)
@@ -537,7 +591,7 @@ def read_mat(path: Path, how: Reading, stack: ExitStack) -> Opened:
         raise Refused("must be a MAT file of version 5 or 7.3, and is damaged or none of them")
     if is_hdf5:
         handle = stack.enter_context(needs("h5py", "reading .mat of version 7.3").File(path, "r"))
-        found = _hdf5_variables(handle)
+        found = _hdf5_variables(handle, how)
         if how.time_first is not None:
             how = replace(how, time_first=not how.time_first)  # as MATLAB shows it
     else:
@@ -549,14 +603,14 @@ def read_mat(path: Path, how: Reading, stack: ExitStack) -> Opened:
         found = {}
         for name, value in scipy.io.loadmat(path, mat_dtype=True, spmatrix=False).items():
             if not name.startswith("__"):
-                _look(name, value, found)
+                _look(name, value, found, how)
     own = header_in(found.get("header"))
     if own is not None:
         return opened_from(own, path, Samples(path, found["samples"], 0 if is_hdf5 else 1))
     return _choose(path, found, how, ".", _attributes if is_hdf5 else lambda _: ([], None))
 
 
-def _look(name: str, value: Any, found: dict[str, Any]) -> None:
+def _look(name: str, value: Any, found: dict[str, Any], how: Reading) -> None:
     """Sort a variable of version 5, or the fields of a struct, into ``found``.
 
     An array is numbers, a tuple words, and a text the reason why it is neither.
@@ -566,7 +620,7 @@ def _look(name: str, value: Any, found: dict[str, Any]) -> None:
     elif value.dtype.names is not None:
         found |= {name: "is a struct array"} if value.size != 1 else {}
         for inner in value.dtype.names if value.size == 1 else ():
-            _look(f"{name}.{inner}", value.reshape(-1)[0][inner], found)
+            _look(f"{name}.{inner}", value.reshape(-1)[0][inner], found, how)
     elif value.dtype.kind == "U":
         found[name] = tuple(str(word).rstrip(" \0") for word in value.reshape(-1))
     elif value.dtype.kind == "O":
@@ -575,11 +629,13 @@ def _look(name: str, value: Any, found: dict[str, Any]) -> None:
         found[name] = "is a cell array"
         if len(cells) and are_words:
             found[name] = tuple(str(c.reshape(-1)[0]) if c.size else "" for c in cells)
+    elif (labels := _as_labels(name, value, how)) is not None:
+        found[name] = labels
     else:
         found[name] = _why_not_numbers(value) or value
 
 
-def _hdf5_variables(file: Any) -> dict[str, Any]:
+def _hdf5_variables(file: Any, how: Reading) -> dict[str, Any]:
     """Numbers, words, or why they are neither, by name and by the classes MATLAB wrote."""
     found: dict[str, Any] = {}
     for place, thing in _datasets(file):
@@ -592,7 +648,8 @@ def _hdf5_variables(file: Any) -> dict[str, Any]:
         elif kind == "char":
             found[name] = _characters(thing) or "is a char array"
         elif kind == "logical":
-            found[name] = "holds true or false"
+            is_label = how.label is not None and how.label.name in (name, name.split(".")[-1])
+            found[name] = thing if is_label else "holds true or false"
         elif "MATLAB_object_decode" in thing.attrs or kind not in _CLASSES:
             found[name] = f"is of class {kind[:40]}"
         elif "MATLAB_sparse" in thing.parent.attrs:

@@ -11,6 +11,7 @@ import csv
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime, timedelta
 from typing import Literal, NamedTuple
 
 
@@ -40,6 +41,9 @@ _EPOCH_S = 1e9, 4e9
 where neither a person nor the file says it."""
 
 
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
 def is_time(name: str) -> bool:
     """Whether a column of that name holds times."""
     return _TIME_NAME.fullmatch(name.strip().casefold()) is not None
@@ -50,6 +54,48 @@ def time_unit_in(name: str | None) -> TimeUnit | None:
     word = (name or "").strip().casefold()
     found = _TIME_NAME.fullmatch(word)
     return _UNITS.get((found[1] or found[2] or "") if found else word.strip("()[] "))
+
+
+_PAIR = re.compile(r"(.*?)(secs?|seconds)"), re.compile(r"(.*?)(n(?:ano)?secs?|nanoseconds)")
+
+
+def seconds_and_nanoseconds(names: Sequence[str]) -> tuple[int, ...]:
+    """The places of two columns that are one time, whole seconds and the nanoseconds beyond.
+
+    Example:
+        >>> seconds_and_nanoseconds(("a", "stamp.sec", "stamp.nanosec"))
+        (1, 2)
+    """
+    words = [name.strip().casefold() for name in names]
+    of_seconds, of_rest = (
+        {found[1]: n for n, word in enumerate(words) if (found := pattern.fullmatch(word))}
+        for pattern in _PAIR
+    )
+    pairs = ((of_seconds[stem], of_rest[stem]) for stem in of_seconds if stem in of_rest)
+    return next(pairs, ())
+
+
+_STAMP = re.compile(r"\d{4}([-/])\d\d\1\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[+-]\d\d:?\d\d)?")
+
+
+def microseconds_in(cell: str) -> float | None:
+    """A date and time as ISO 8601 writes it, in microseconds since 1970; ``None`` of other text.
+
+    Example:
+        >>> microseconds_in("1970-01-01T00:00:01.5Z"), microseconds_in("12:00")
+        (1500000.0, None)
+    """
+    if _STAMP.fullmatch(cell) is None:
+        return None
+    whole, _, fraction = cell.replace(",", ".").replace("/", "-").partition(".")
+    digits = re.match(r"\d*", fraction)[0]  # type: ignore[index]  # matches always
+    try:
+        moment = datetime.fromisoformat(whole + fraction[len(digits) :])
+    except ValueError:  # the 31st of February
+        return None
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    return (moment - _EPOCH) // timedelta(seconds=1) * 1e6 + float(f"0.{digits or 0}") * 1e6
 
 
 def epoch_unit(stamp: float) -> TimeUnit | None:
@@ -140,6 +186,7 @@ _TO_COUNT = 1024  # rows that show whether a first line numbers the columns
 _NO_THOUSANDS = re.compile(r",\d{0,2}(?!\d)|,\d{4}|(?<!\d)0,|\d{4},|(?<!\d),")
 _COMMENT = re.compile(r"(?:^|(?<=\s))#.*")
 _WHOLE = re.compile(r"[+-]?\d+")
+_DIGITS = re.compile(r"[+-]?[\d.,]*\d[\d.,]*(e[+-]?\d+)?", re.IGNORECASE)
 _BLANKS = " "
 _WITH_COMMAS = ("\t", ";")  # between columns whose decimals may stand behind a comma
 
@@ -213,7 +260,7 @@ def text_layout(head: str, delimiter: str | None = None) -> TextLayout:
     place, mark = next(rows, None) or _row_with_words(map(split, range(len(lines))))
     above = [n for n in range(place) if bare_lines[n].strip()]
     num_columns = len(cells_of(bare_lines[place], mark))
-    while above and _has_words(cells_of(bare_lines[above[-1]], mark), num_columns):
+    while above and _has_words(cells_of(bare_lines[above[-1]], mark), mark, num_columns):
         place = above.pop()  # rows too, some cells of which are no numbers
     below = [n for n in range(place + 1, len(lines)) if bare_lines[n].strip()]
     rest = [cells_of(bare_lines[n], mark) for n in below[:_TO_COUNT]]
@@ -251,18 +298,22 @@ def quoted(cell: str) -> str:
 
 def _is_row(cells: Sequence[str], delimiter: str, is_lvm: bool) -> bool:
     """Whether cells are numbers, the first of them there; of others some may be missing."""
-    if delimiter in _WITH_COMMAS:
-        cells = [cell.replace(",", ".", 1) for cell in cells]
     if not cells[0] and not is_lvm:
         return False
-    return any(cells) and all(not cell or NUMBER.fullmatch(cell) for cell in cells)
+    return any(cells) and all(not cell or _is_number(cell, delimiter) for cell in cells)
+
+
+def _is_number(cell: str, delimiter: str) -> bool:
+    """Whether a cell is a number, with a decimal comma where columns are not separated by one."""
+    plain = cell.replace(",", ".", 1) if delimiter in _WITH_COMMAS else cell
+    return NUMBER.fullmatch(plain) is not None
 
 
 def _row_with_words(lines: Iterable[Iterable[tuple[str, list[str]]]]) -> tuple[int, str]:
     """The first of two lines that have numbers in the same cells and words in all others."""
     before: dict[str, list[bool]] = {}
     for place, cells_by_mark in enumerate(lines):
-        shapes = {mark: [bool(NUMBER.fullmatch(c)) for c in cells] for mark, cells in cells_by_mark}
+        shapes = {mark: [_is_number(c, mark) for c in cells] for mark, cells in cells_by_mark}
         for mark, shape in shapes.items():
             if any(shape) and len(shape) > 1 and before.get(mark) == shape:
                 return place - 1, mark
@@ -273,9 +324,11 @@ def _row_with_words(lines: Iterable[Iterable[tuple[str, list[str]]]]) -> tuple[i
     )
 
 
-def _has_words(cells: Sequence[str], num_columns: int) -> bool:
-    """Whether cells above a row are one as well: a number first, and words."""
-    return len(cells) == num_columns > 1 and NUMBER.fullmatch(cells[0]) is not None
+def _has_words(cells: Sequence[str], delimiter: str, num_columns: int) -> bool:
+    """Whether cells above a row are one as well: a number or a stamp first, and words."""
+    if len(cells) != num_columns or num_columns == 1:
+        return False
+    return _is_number(cells[0], delimiter) or microseconds_in(cells[0]) is not None
 
 
 def _numbering(num_columns: int) -> tuple[str, ...]:
@@ -311,7 +364,10 @@ def _of_rows(lines: Sequence[str], number: int, delimiter: str) -> TextLayout:
     rows = [line.rstrip(" ") for line in lines if line.strip()]
     is_ended = all(row.endswith(delimiter) for row in rows[:100])
     has_tail = delimiter != _BLANKS and len(first) > 1 and is_ended
-    text = "\n".join(rows) if delimiter in _WITH_COMMAS else ""
+    text = ""
+    if delimiter in _WITH_COMMAS:
+        cells = (cell.strip(' "') for row in rows for cell in row.split(delimiter))
+        text = "\n".join(filter(_DIGITS.fullmatch, cells))
     has_commas = "," in text and "." not in text
     if has_commas and not _NO_THOUSANDS.search(text):
         raise Refused(

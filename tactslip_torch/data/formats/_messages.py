@@ -40,6 +40,7 @@ from tactslip_torch.data.formats._reading import (
     opened_from,
     text_of,
 )
+from tactslip_torch.runtime import setting
 
 TOPIC = "/tactile"
 HEADER = "tactslip_torch"
@@ -250,6 +251,7 @@ class TopicColumns:
         num_channels: of the samples.
         names: of the channels, if messages have names.
         time_name: of the number that is the time, since nothing else is.
+        is_paired: whether that is whole seconds, and another the nanoseconds beyond.
         is_small: whether float32 holds all numbers.
         left_out: names of numbers that are no channels by what they are called.
 
@@ -271,10 +273,11 @@ class TopicColumns:
             raise Refused("two numbers of one name")
         if how.time == _LOG_TIME or (how.time == "auto" and (is_stamped or names is None)):
             how = replace(how, time=None)
-        self._chosen = chosen_columns(names, num_columns, replace(how, speed=None))
+        self._chosen = chosen_columns(names, num_columns, replace(how, label=None))
         time, named = self._chosen.time, names or ()
         self.names = None if names is None else tuple(named[n] for n in self._chosen.channels)
         self.time_name = named[time] if named and time is not None else None
+        self.is_paired = self._chosen.nanoseconds is not None
         self.left_out = tuple(named[n] for n in self._chosen.left_out)
         self.num_channels = len(self._chosen.channels)
         self.is_small = self._is_array and np.can_cast(rows.dtype, np.float32)
@@ -315,7 +318,10 @@ class TopicColumns:
                 f"holds a message on {self.topic} with other channels than the first: "
                 f"{rows.shape[1]} numbers, or other names"
             )
-        named = None if self._chosen.time is None else rows[0, self._chosen.time]
+        time = self._chosen.time
+        named = None if time is None else rows[0, time]
+        if self._chosen.nanoseconds is not None:
+            named = int(rows[0, time]) * _SECOND + int(rows[0, self._chosen.nanoseconds])
         return rows[:, self._chosen.channels], stamp, named
 
 
@@ -356,7 +362,8 @@ class _TopicSamples(TopicColumns):
         if times is stamps and (stamps == 0).sum() > 1:  # one alone may be where a clock begins
             raise Refused(
                 f"has no stamp in message {int(np.argmin(stamps != 0)) + 1} on {self.topic}, and "
-                "one in others; say reading.time=log_time to go by the times of recording"
+                f"one in others; say {setting('reading.time')}=log_time to go by the times of "
+                "recording"
             )
         if self._named:
             times = self._named_times()
@@ -374,8 +381,8 @@ class _TopicSamples(TopicColumns):
         """Nanoseconds since the least of the times that are numbers in messages."""
         times = np.array(self._named)
         if times.dtype.kind not in "iuf" or not np.isfinite(times).all():
-            raise Refused("holds a time that is no number; say reading.time")
-        unit = self._how.time_unit or time_unit_in(self.time_name)
+            raise Refused(f"holds a time that is no number; say {setting('reading.time')}")
+        unit = "ns" if self.is_paired else self._how.time_unit or time_unit_in(self.time_name)
         seconds = SECONDS[unit or epoch_unit(float(times.max())) or "s"]
         return np.asarray(np.round((times - times.min()) * round(seconds * _SECOND)), np.int64)
 
@@ -476,7 +483,7 @@ def _read_topic(
         if found is not None:
             raise Refused(
                 f"has several topics that may hold samples, {found.topic}, "
-                f"{topic.name}; say which by reading.samples"
+                f"{topic.name}; say which by {setting('reading.samples')}"
             )
         found = one
         found.add(message)

@@ -33,11 +33,13 @@ from tactslip_torch.data.formats._reading import (
     Samples,
     check_plausible,
     header_in,
+    label_numbers,
     needs,
     opened_columns,
     opened_from,
     text_of,
 )
+from tactslip_torch.runtime import setting
 
 _GROUP_BYTES = 4 * 2**20
 
@@ -92,6 +94,10 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     refused = [n for n, good in enumerate(is_number) if not good and n not in stamps]
 
     def samples(places: Sequence[int]) -> Samples:
+        if how.label is not None and len(places) == 1 and places[0] in refused:
+            values = file.read(columns=[names[places[0]]], use_threads=False).column(0).to_pylist()
+            words = [None if value is None else str(value) for value in values]
+            return Samples(path, [label_numbers(how.label, words)])
         if wrong := [place for place in places if place in refused]:
             kind = str(kinds[wrong[0]])[:40]
             raise Refused(f"holds {kind!r} in column {names[wrong[0]]!r}")
@@ -112,8 +118,8 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         place = (wrong or refused)[0]
         raise Refused(
             f"holds no samples that are a column each: {names[place]!r} holds "
-            f"{str(kinds[place])[:40]!r}; list columns of numbers as reading.channels, or "
-            "give the folder if it is a LeRobot dataset"
+            f"{str(kinds[place])[:40]!r}; list columns of numbers as "
+            f"{setting('reading.channels')}, or give the folder if it is a LeRobot dataset"
         )
     opened = opened_columns(names, len(names), how, samples, refused, stamps)
     numbers: dict[str, float] = {}
@@ -243,8 +249,8 @@ def _features_in(info: Mapping[str, Any], how: Reading) -> dict[str, int]:
         what = f"no feature {wanted!r}" if not chosen else f"several, {', '.join(chosen)}"
         listed = ", ".join(numbers) or "none"
         raise Refused(
-            f"has {what[:200]}; say reading.samples=NAME, with * for any text; its features of "
-            f"numbers are {listed[:400]}"
+            f"has {what[:200]}; say {setting('reading.samples')}=NAME, with * for any text; its "
+            f"features of numbers are {listed[:400]}"
         )
     if not 0 < (total := sum(chosen.values())) <= MOST_CHANNELS:
         raise Refused(f"has {total} numbers a frame, 1 to {MOST_CHANNELS} are read")

@@ -28,14 +28,17 @@ from tactslip_torch.data.formats._inference import (
     SECONDS,
     Refused,
     TimeUnit,
+    bare,
     epoch_unit,
     is_time,
     no_channels,
+    seconds_and_nanoseconds,
     time_unit_in,
 )
+from tactslip_torch.data.labels import LabelColumn
 from tactslip_torch.data.recording import MOMENTS, STRETCHES, Recording
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.runtime import check_choice, check_number
+from tactslip_torch.runtime import check_choice, check_number, setting
 
 # Limits, and faults in one line -----------------------------------------------------------------
 
@@ -116,8 +119,6 @@ def needs(module: str, what: str) -> ModuleType:
 
 # How files are read -----------------------------------------------------------------------------
 
-_SpeedUnit = Literal["mm/s", "cm/s", "m/s", "um/s"]
-MM_S: dict[_SpeedUnit, float] = {"mm/s": 1.0, "cm/s": 10.0, "m/s": 1000.0, "um/s": 1e-3}
 _RowOrder = Literal["channel", "time"]
 
 
@@ -138,21 +139,20 @@ class Reading:
             the only one that can.
         time_first: whether arrays are ``[T, C]``; ``None``: the longer axis is time.
         delimiter: between columns of text; ``None``: found from the first lines.
-        speed: the column or array of the speed of slip, which is no channel; ``None``: there is
-            none.
-        speed_unit: of that speed.
         samples_per_row: how many samples of each channel, one behind the other in time, a row of
             the table or array holds. Its time is that of the first.
         row_order: of the columns of such a row. ``"channel"``: all samples of the first channel,
             then those of the second; ``"time"``: the first sample of all channels, then the second.
             ``None``: as names such as ``a_0, a_1, b_0, b_1`` tell.
-        gaps: ``"refuse"`` files in which samples are missing, let them be ``"missing"`` (bins that
-            need them are left out), or ``"bridge"`` short gaps by a straight line.
+        gaps: ``"refuse"`` files in which samples are missing (rows, or cells that are empty or not
+            finite), let them be ``"missing"`` (bins that need them are left out), or ``"bridge"``
+            short gaps by a straight line.
         bridge_ms: the longest gap that is bridged; longer ones are missing.
         resample_hz: the rate that all files of a set are brought to; ``None`` for their own.
         tare_s: start and end of the stretch whose mean is taken off each channel.
         hand: names of channels that are wanted: a column of such a name is a channel, whatever it
-            is called. Set by who knows the hand.
+            is called, and if all are there, no other is. Set by who knows the hand.
+        label: the column of labels, which is no channel. Set by who knows the labels.
 
     Raises:
         ValueError: for a value that cannot be.
@@ -165,8 +165,6 @@ class Reading:
     samples: str | None = None
     time_first: bool | None = None
     delimiter: str | None = None
-    speed: str | int | None = None
-    speed_unit: _SpeedUnit = "mm/s"
     samples_per_row: int = 1
     row_order: _RowOrder | None = None
     gaps: GapRule = "refuse"
@@ -174,19 +172,19 @@ class Reading:
     resample_hz: float | None = None
     tare_s: tuple[float, float] | None = None
     hand: Sequence[str] = ()
+    label: LabelColumn | None = None
 
     def __post_init__(self) -> None:
         for name in ("sample_rate_hz", "bridge_ms", "resample_hz"):
             if (value := getattr(self, name)) is not None:
-                check_number(f"reading.{name}", value)
-        check_number("reading.samples_per_row", self.samples_per_row, whole=True)
+                check_number(setting(f"reading.{name}"), value)
+        check_number(setting("reading.samples_per_row"), self.samples_per_row, whole=True)
         for name, known in (
             ("time_unit", (*SECONDS, None)),
-            ("speed_unit", tuple(MM_S)),
             ("row_order", (*get_args(_RowOrder), None)),
             ("gaps", get_args(GapRule)),
         ):
-            check_choice(f"reading.{name}", getattr(self, name), known)
+            check_choice(setting(f"reading.{name}"), getattr(self, name), known)
         columns, mark, tare = (
             _listed(getattr(self, n)) for n in ("channels", "delimiter", "tare_s")
         )
@@ -197,7 +195,6 @@ class Reading:
             ("samples", isinstance(self.samples, str | None), "the name of an array or topic"),
             ("time_first", self.time_first in (True, False, None), "true, false or null"),
             ("time", self.time is None or _is_column(self.time), "a name, a number or null"),
-            ("speed", self.speed is None or _is_column(self.speed), "a name, a number or null"),
             (
                 "delimiter",
                 mark is None or (isinstance(mark, str) and len(mark) == 1),
@@ -215,9 +212,11 @@ class Reading:
             ),
         ):
             if not is_right:
-                raise ValueError(f"reading.{name} must be {wanted}, got {getattr(self, name)!r}")
+                key = setting(f"reading.{name}")
+                raise ValueError(f"{key} must be {wanted}, got {getattr(self, name)!r}")
         if columns and len(set(columns)) < len(columns):
-            raise ValueError(f"reading.channels names a column twice: {list(columns)}")
+            key = setting("reading.channels")
+            raise ValueError(f"{key} names a column twice: {list(columns)}")
         object.__setattr__(self, "channels", columns)
         object.__setattr__(self, "tare_s", tare and (float(tare[0]), float(tare[1])))
 
@@ -228,14 +227,17 @@ class Reading:
         Raises:
             ValueError: for a key or value that is none.
         """
-        known = [one.name for one in fields(cls) if one.name != "hand"]
+        known = [one.name for one in fields(cls) if one.name not in _SET_BY_OTHERS]
         if given is not None and not (isinstance(given, Mapping) and set(given) <= set(known)):
-            raise ValueError(f"reading must be of {', '.join(known)}, got {given!r}")
+            raise ValueError(f"{setting('reading')} must be of {', '.join(known)}, got {given!r}")
         return cls(**dict(given or {}))
 
     def key(self) -> dict[str, Any]:
         """What decides the samples that are read, as plain values."""
-        return {name: value for name, value in asdict(self).items() if name != "hand"}
+        return {name: value for name, value in asdict(self).items() if name not in _SET_BY_OTHERS}
+
+
+_SET_BY_OTHERS = "hand", "label"  # beside the section of a configuration
 
 
 def _listed(value: Any) -> Any:
@@ -265,12 +267,14 @@ class Samples:
     Attributes:
         dtype: in which they are read: the smaller of ``float32`` and ``float64`` that holds all
             numbers exactly (whole numbers beyond 2**53 are rounded), unless it is set.
+        may_lack: whether any may be not finite; whole numbers never are.
     """
 
     path: str | os.PathLike[str]
     num_channels: int
     num_samples: int
     dtype: torch.dtype
+    may_lack: bool
 
     def __init__(
         self,
@@ -283,6 +287,7 @@ class Samples:
         self._rows = None if rows is None else list(rows)
         columns: Sequence[Any] = source if isinstance(source, list) else [source]
         stored = [column.dtype for column in columns]
+        self.may_lack = any(kind.kind not in "iu" for kind in stored)
         is_small = all(kind.itemsize <= (4 if kind.kind == "f" else 2) for kind in stored)
         self.dtype = torch.float32 if is_small else torch.float64
         if isinstance(source, list):
@@ -319,7 +324,7 @@ _INDEX = re.compile(r"[\s_.\-\[(]*\d+[\])]?$")
 
 
 def unfolded(opened: Opened, how: Reading) -> Opened:
-    """An open file whose rows hold several samples of each channel; times and speed are of rows.
+    """An open file whose rows hold several samples of each channel; times and labels are of rows.
 
     Raises:
         Refused: if the columns are no such number, or their order is not known.
@@ -327,8 +332,9 @@ def unfolded(opened: Opened, how: Reading) -> Opened:
     k, num = how.samples_per_row, opened.samples.num_channels
     if num % k:
         raise Refused(
-            f"has {num} columns of samples, which is no multiple of reading.samples_per_row={k}; "
-            "list the columns that are channels as reading.channels"
+            f"has {num} columns of samples, which is no multiple of "
+            f"{setting('reading.samples_per_row')}={k}; list the columns that are channels as "
+            f"{setting('reading.channels')}"
         )
     stems = [_INDEX.sub("", name) for name in opened.names or ()]
     named: dict[_RowOrder, tuple[str, ...]] = {}
@@ -341,7 +347,8 @@ def unfolded(opened: Opened, how: Reading) -> Opened:
     if found is None and num != k:
         raise Refused(
             f"does not show how its rows hold {k} samples of each channel; say "
-            "reading.row_order=channel (a_0, a_1, b_0, b_1) or time (a_0, b_0, a_1, b_1)"
+            f"{setting('reading.row_order')}=channel (a_0, a_1, b_0, b_1) or time (a_0, b_0, a_1, "
+            "b_1)"
         )
     order, samples = found or "channel", opened.samples
     rows = samples.stored(0, samples.num_samples)  # [C * k, T]
@@ -390,7 +397,8 @@ class Opened(NamedTuple):
             several samples, when the first of each was.
         time_unit: of the stamps, if anybody says it.
         sample_rate_hz: if the file says; what a person says is not here.
-        speed: of slip, in the only channel, at the same times as ``stamps``.
+        labels: of the column that is asked for, in the only channel, at the same times as
+            ``stamps``.
         left_out: names of columns that are taken for no channels, by what they are called or hold.
     """
 
@@ -400,7 +408,7 @@ class Opened(NamedTuple):
     stamps: Samples | None = None
     time_unit: TimeUnit | None = None
     sample_rate_hz: float | None = None
-    speed: Samples | None = None
+    labels: Samples | None = None
     left_out: tuple[str, ...] = ()
 
     def times(self) -> NDArray[np.float64] | None:
@@ -448,14 +456,16 @@ class Columns(NamedTuple):
     Args:
         time: of the times, if there is such a column.
         channels: in the order of the samples.
-        speed: of the speed of slip, if it is wanted.
+        label: of the labels, if they are asked for.
         left_out: those taken for no channels by what they are called or hold.
+        nanoseconds: of what is added to the times, which are whole seconds then.
     """
 
     time: int | None
     channels: list[int]
-    speed: int | None = None
+    label: int | None = None
     left_out: tuple[int, ...] = ()
+    nanoseconds: int | None = None
 
 
 def chosen_columns(
@@ -465,10 +475,11 @@ def chosen_columns(
     others: Iterable[int] = (),
     stamps: Iterable[int] = (),
 ) -> Columns:
-    """Which columns are times, channels and speed.
+    """Which columns are times, channels and labels.
 
-    If ``how`` does not say which hold samples, all do but ``others`` and those that are called as
-    times, labels or book-keeping are.
+    If ``how`` does not say which hold samples, those that are called as channels of its hand do; if
+    not all of these are there, all but ``others`` and those that are called as times, labels or
+    book-keeping are.
 
     Args:
         names: of all columns, if the file says.
@@ -481,29 +492,37 @@ def chosen_columns(
         Refused: if there is no such column, or none is left for samples.
     """
 
-    def place(wanted: str | int | None, what: str) -> int | None:
-        return None if wanted is None else position_of(names, num_columns, wanted, what)
+    def place(wanted: str | int | None, key: str) -> int | None:
+        return None if wanted is None else position_of(names, num_columns, wanted, key)
 
     stamps = set(stamps)
+    pair = seconds_and_nanoseconds(names or ())
     if how.time == "auto":
         called = {n for n, name in enumerate(names or ()) if is_time(name)}
-        time = min(called | stamps, default=None)
+        time = min(called | stamps | set(pair[:1]), default=None)
     else:
-        time = place(how.time, "time")
-    speed = place(how.speed, "speed")
+        time = place(how.time, setting("reading.time"))
+    nanoseconds = pair[1] if pair and time == pair[0] else None
+    label = place(None if how.label is None else how.label.name, "labels.column")
     if how.channels is not None:
-        places = [position_of(names, num_columns, one, "channels") for one in how.channels]
-        return Columns(time, places, speed)
-    beside = {time, speed, *others, *stamps, *no_channels(names or (), how.hand)}
-    channels = [n for n in range(num_columns) if n not in beside]
+        key = setting("reading.channels")
+        places = [position_of(names, num_columns, one, key) for one in how.channels]
+        return Columns(time, places, label, (), nanoseconds)
+    wanted = set(map(bare, how.hand))
+    channels = [n for n, name in enumerate(names or ()) if bare(name) in wanted and n != label]
+    if not wanted or {bare(names[n]) for n in channels if names} < wanted:
+        own = {time, label, *others, *stamps, *pair}
+        beside = own | {*no_channels(names or (), how.hand)}
+        channels = [n for n in range(num_columns) if n not in beside]
     if not channels:
         which = f"{some(list(map(repr, names)))} is" if names else "its only column is"
         raise Refused(
             f"has no column of samples: {which} taken for times, a label or book-keeping; if one "
-            "is a channel, list it as reading.channels and say reading.sample_rate_hz"
+            f"is a channel, list it as {setting('reading.channels')} and say "
+            f"{setting('reading.sample_rate_hz')}"
         )
-    left = {*range(num_columns)} - {*channels, *stamps, time, speed}
-    return Columns(time, channels, speed, tuple(sorted(left)) if names else ())
+    left = {*range(num_columns)} - {*channels, *stamps, *pair, time, label}
+    return Columns(time, channels, label, tuple(sorted(left)) if names else (), nanoseconds)
 
 
 def opened_columns(
@@ -529,19 +548,43 @@ def opened_columns(
     chosen = chosen_columns(names, num_columns, how, others, stamps)
     time = chosen.time
     opened = Opened(samples(chosen.channels))
-    if chosen.speed is not None:
-        opened = opened._replace(speed=samples([chosen.speed]))
+    if chosen.label is not None:
+        opened = opened._replace(labels=samples([chosen.label]))
     if names is not None:
         of = tuple(tuple(names[n] for n in places) for places in (chosen.channels, chosen.left_out))
         opened = opened._replace(names=of[0], left_out=of[1])
     if time is None:
         return opened
+    if chosen.nanoseconds is not None:
+        both = samples([time, chosen.nanoseconds])
+        seconds, rest = both.stored(0, both.num_samples).astype(np.float64)
+        if not (np.isfinite(seconds).all() and np.isfinite(rest).all()):
+            raise Refused(f"has a time without a number, in column {time} or {chosen.nanoseconds}")
+        whole = rest.astype(np.int64)
+        if (whole < 10**9).all():  # others are the whole time in another unit
+            whole += seconds.astype(np.int64) * 10**9
+        return opened._replace(stamps=Samples(both.path, [whole]), time_unit="ns")
     unit = how.time_unit or time_unit_in(names[time] if names else None) or units.get(time)
     return opened._replace(stamps=samples([time]), time_unit=stamps.get(time, unit))
 
 
-def position_of(names: Sequence[str] | None, num_columns: int, wanted: str | int, what: str) -> int:
-    """The place of a column that ``reading.what`` says by name or number.
+def label_numbers(label: LabelColumn, words: Sequence[str | None]) -> NDArray[np.float64]:
+    """What stands for words of a column of labels, ``[T]``; NaN of empty ones.
+
+    Raises:
+        Refused: naming the first word that is no label.
+    """
+    numbers: dict[str | None, float] = {None: math.nan, "": math.nan}
+    for word in set(words) - set(numbers):
+        number = label.number_of(str(word))
+        if number is None:
+            raise Refused(f"cannot be labelled: {label.no_label(str(word)[:40])}")
+        numbers[word] = number
+    return np.array([numbers[word] for word in words], np.float64)
+
+
+def position_of(names: Sequence[str] | None, num_columns: int, wanted: str | int, key: str) -> int:
+    """The place of a column that a setting says by name or number.
 
     Raises:
         Refused: if there is none.
@@ -553,7 +596,7 @@ def position_of(names: Sequence[str] | None, num_columns: int, wanted: str | int
     there = f"{num_columns} columns{' without names' * (names is None)}, 0 to {num_columns - 1}"
     if isinstance(wanted, str) and names is not None:
         there = some(list(map(repr, names)))
-    raise Refused(f"has no column {wanted!r} that reading.{what} names; it has {there}")
+    raise Refused(f"has no column {wanted!r} that {key} names; it has {there}")
 
 
 def some(words: Sequence[str]) -> str:

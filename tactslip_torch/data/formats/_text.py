@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import codecs
 import csv
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -25,7 +27,9 @@ from tactslip_torch.data.formats._inference import (
     NUMBER,
     Refused,
     TextLayout,
+    TimeUnit,
     cells_of,
+    microseconds_in,
     number_in,
     quoted,
     text_layout,
@@ -45,11 +49,101 @@ from tactslip_torch.data.formats._reading import (
     opened_from,
     text_of,
 )
+from tactslip_torch.data.labels import LabelColumn
+from tactslip_torch.runtime import setting
 
 _TO_WRITE = 4096  # rows at a time
 _TO_COUNT = 1024  # rows that show whether a column is their number
-_Words = dict[int, tuple[int, str]]
-"""The first cell of a column that is no number, with its line."""
+
+
+class _Cells:
+    """What stands for cells that are no numbers: labels, dates and NaN.
+
+    Args:
+        layout: of the table.
+        label: the column of labels, if there is one.
+
+    Attributes:
+        words: by column, the first cell of which nothing is known, with its line.
+        stamps: columns that hold dates and times.
+    """
+
+    def __init__(self, layout: TextLayout, label: LabelColumn | None) -> None:
+        self.words: dict[int, tuple[int, str]] = {}
+        self.stamps: set[int] = set()
+        self._layout, self._label = layout, label
+        self._place = None if label is None else label.name
+        if isinstance(self._place, str):
+            names = layout.names or ()
+            self._place = names.index(self._place) if self._place in names else None
+
+    def number(self, place: int, line: int, cell: str) -> float:
+        """The number of a cell, NaN if it is empty or not known."""
+        plain = cell
+        if self._layout.has_commas:  # a point beside them would be one of thousands
+            plain = cell.replace(".", "?").replace(",", ".", 1)
+        if not plain or NUMBER.fullmatch(plain):
+            return number_in(plain)
+        if place == self._place and self._label is not None:
+            number = self._label.number_of(cell)
+        elif (number := microseconds_in(cell)) is not None:
+            self.stamps.add(place)
+        if number is None:
+            self.words.setdefault(place, (line, cell))
+            return math.nan
+        return number
+
+    def converters(self) -> dict[int | str, Callable[[str], float]]:
+        """For ``numpy.loadtxt``, of columns that may hold what is no number.
+
+        They raise a ValueError of a label or stamp that is not known.
+        """
+        found: dict[int | str, Callable[[str], float]] = dict.fromkeys(self.words, _number_or_nan)
+        found |= dict.fromkeys(self.stamps, _stamp_of)
+        if self._label is not None and self._place is not None:
+            found[int(self._place)] = self._label_of
+        return found
+
+    def _label_of(self, cell: str) -> float:
+        cell = cell.strip()
+        if not cell or NUMBER.fullmatch(cell):
+            return number_in(cell)
+        number = None if self._label is None else self._label.number_of(cell)
+        if number is None:
+            raise ValueError(cell)
+        return number
+
+    def refuse_words(self, places: Iterable[int]) -> None:
+        """Refuse columns that hold what is no number.
+
+        Raises:
+            Refused: naming the first such cell.
+        """
+        for place in places:
+            if place not in self.words:
+                continue
+            line, cell = self.words[place]
+            if place == self._place and self._label is not None:
+                raise wrong_line(line, self._label.no_label(cell[:40]))
+            names = self._layout.names
+            name = names[place] if names else place
+            raise wrong_line(
+                line,
+                f"{quoted(cell)} is no number, in column {name!r}; leave empty what is missing, "
+                f"list the columns that are channels as {setting('reading.channels')}, or name the "
+                "one that has labels as labels.column",
+            )
+
+
+def _stamp_of(cell: str) -> float:
+    number = microseconds_in(cell.strip())
+    if number is None:
+        raise ValueError(cell)
+    return number
+
+
+def _number_or_nan(cell: str) -> float:
+    return number_in(cell.strip()) if NUMBER.fullmatch(cell.strip()) else math.nan
 
 
 def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
@@ -83,7 +177,6 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     Raises:
         Refused: if it is no table of numbers, naming the line; or lacks a column of ``how``.
     """
-    words: _Words = {}
     with _opened_text(path) as file:
         own = _header(file)
         if own is not None:
@@ -96,14 +189,16 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
             file.seek(0)
             for _ in range(layout.first_line - 1):
                 file.readline(HEAD)
+        cells = _Cells(layout, how.label)
         spool = Spool(layout.num_columns, np.float64, stack)
         for line, lines in _blocks(file, layout.first_line):
-            spool.add(_rows_of(lines, layout, line, words))
+            spool.add(_rows_of(lines, layout, line, cells))
     table = spool.array()
 
     def columns(places: Iterable[int]) -> Samples:
-        _refuse_words(words, places, layout)
-        return Samples(path, table, 0, list(places))
+        places = list(places)
+        cells.refuse_words(places)
+        return Samples(path, table, 0, places)
 
     if own is not None:
         return opened_from(own, path, columns(range(1, layout.num_columns)))
@@ -114,7 +209,10 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         others.append(0)
         how = replace(how, time=None) if how.time == "auto" else how
     units = {n: unit for n, cell in enumerate(layout.units) if (unit := time_unit_in(cell))}
-    opened = opened_columns(layout.names, layout.num_columns, how, columns, others, units=units)
+    stamps: dict[int, TimeUnit] = dict.fromkeys(sorted(cells.stamps), "us")
+    opened = opened_columns(
+        layout.names, layout.num_columns, how, columns, others, stamps, units=units
+    )
     return opened._replace(sample_rate_hz=layout.sample_rate_hz)
 
 
@@ -171,11 +269,11 @@ def _blocks(file: IO[str], line: int) -> Iterator[tuple[int, list[str]]]:
     yield line, [rest]
 
 
-def _rows_of(lines: list[str], layout: TextLayout, line: int, words: _Words) -> NDArray[np.float64]:
+def _rows_of(lines: list[str], layout: TextLayout, line: int, cells: _Cells) -> NDArray[np.float64]:
     """The numbers of whole lines, ``[n, columns]``; the first line has the number ``line``.
 
     Lines without anything and comments are passed over; a cell with nothing in it is NaN, and so is
-    one that is no number: the first of each column is noted in ``words``.
+    one that ``cells`` does not know.
 
     Raises:
         Refused: naming the first line that has another number of cells.
@@ -190,41 +288,34 @@ def _rows_of(lines: list[str], layout: TextLayout, line: int, words: _Words) -> 
     if layout.has_commas:  # a point beside them would be one of thousands
         plain = [one.replace(".", "?").replace(",", ".") for one in plain]
     delimiter = None if layout.delimiter == " " else layout.delimiter
-    try:
-        rows: NDArray[Any] = np.loadtxt(plain, delimiter=delimiter, comments=None, ndmin=2)
-        if rows.shape[1] == layout.num_columns:
-            return rows
-    except ValueError:  # cell by cell, so that what is empty is NaN and what is wrong has a line
-        pass
-    found = [_row_of(one, layout, number, words) for number, one in numbered]
+    filled = plain
+    for converters in ({}, cells.converters()):
+        with suppress(ValueError):
+            rows: NDArray[Any] = np.loadtxt(
+                filled,
+                delimiter=delimiter,
+                comments=None,
+                ndmin=2,
+                converters=converters or None,
+                encoding=None,
+            )
+            if rows.shape[1] == layout.num_columns:
+                return rows
+        if delimiter is None or any('"' in one for one in plain):
+            break
+        mark = re.escape(delimiter)
+        empty = re.compile(rf"(?:^|(?<={mark})) *(?=$|{mark})")
+        filled = [empty.sub("nan", one) for one in plain if one.strip(blanks)]
+    # cell by cell, so that what is wrong has a line
+    found = [_row_of(one, layout, number, cells) for number, one in numbered]
     return np.array(found, dtype=np.float64).reshape(-1, layout.num_columns)
 
 
-def _row_of(line: str, layout: TextLayout, number: int, words: _Words) -> list[float]:
-    cells = cells_of(line, layout.delimiter)
-    if layout.has_tail and not cells[-1]:
-        cells.pop()
-    if len(cells) != layout.num_columns:
+def _row_of(line: str, layout: TextLayout, number: int, cells: _Cells) -> list[float]:
+    texts = cells_of(line, layout.delimiter)
+    if layout.has_tail and not texts[-1]:
+        texts.pop()
+    if len(texts) != layout.num_columns:
         wanted = f"the row at line {layout.first_line} has {layout.num_columns}"
-        raise wrong_line(number, f"{len(cells)} cells, {wanted}; mend the line or take it out")
-    row = []
-    for place, cell in enumerate(cells):
-        plain = cell.replace(".", "?").replace(",", ".", 1) if layout.has_commas else cell
-        if plain and not NUMBER.fullmatch(plain):
-            words.setdefault(place, (number, cell))
-            plain = ""
-        row.append(number_in(plain))
-    return row
-
-
-def _refuse_words(words: _Words, places: Iterable[int], layout: TextLayout) -> None:
-    """Refuse columns that hold what is no number."""
-    for place in places:
-        if place in words:
-            line, cell = words[place]
-            name = layout.names[place] if layout.names else place
-            raise wrong_line(
-                line,
-                f"{quoted(cell)} is no number, in column {name!r}; leave empty what is missing, "
-                "or list the columns that are channels as reading.channels",
-            )
+        raise wrong_line(number, f"{len(texts)} cells, {wanted}; mend the line or take it out")
+    return [cells.number(place, number, text) for place, text in enumerate(texts)]
