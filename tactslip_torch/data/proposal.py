@@ -36,13 +36,14 @@ from tactslip_torch.data.formats._inference import (
     time_unit_in,
     without_comment,
 )
+from tactslip_torch.data.formats._reading import FORM
 from tactslip_torch.data.formats._text import _opened_text
 from tactslip_torch.data.labels import label_of
 from tactslip_torch.data.manifest import MANIFEST, Entry, read_manifest
 from tactslip_torch.signals.wavelet import highest_level
 
 _Numbers = NDArray[np.float64]
-_MOST_FILES = 40  # that are read
+_MOST_FILES = 24  # that are read
 _MOST_BYTES = 200e6  # of files that are read, beside the first three
 _HEAD = 2**16  # characters that show the layout of a text
 _SAME_RATE = 0.01  # rates of files that differ by less are one
@@ -193,7 +194,7 @@ class Look:
 
 
 def look(folder: Path, answers: Answers | None = None) -> Look:
-    """Read some of the recordings of a folder and of its folders, evenly chosen, at most 40.
+    """Read some of the recordings of a folder and of its folders, evenly chosen, at most 24.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -237,7 +238,7 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
     how = Reading(time=answers.time or "auto", time_unit=answers.time_unit)
     form = find_format(path)
     is_text = form is not None and form.name == "text"
-    if is_text and form is not None and not form.is_native(path):
+    if is_text and not _is_of_package(path):
         names, cells, delimiter = _cells(path)
         words = {
             name: column
@@ -292,6 +293,13 @@ def _read(
     return _Table(
         file, kept, samples, words, times, time, unit, rate_hz, delimiter, own is not None
     )
+
+
+def _is_of_package(path: Path) -> bool:
+    """Whether a text begins as those that this package writes."""
+    mark = f"# {FORM[:-1]}".encode()
+    with path.open("rb") as file:
+        return file.read(len(mark)) == mark
 
 
 def _cells(path: Path) -> tuple[list[str | int], list[list[str]], str]:
