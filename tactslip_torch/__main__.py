@@ -15,6 +15,7 @@ COMMANDS = {
     "setup": "look at your recordings, write how they are read: hand.yaml, and a picture",
     "train": "fit a detector, evaluate, save and export it",
     "evaluate": "evaluate a saved detector on recordings",
+    "calibrate": "set a detector's alarm and threshold on recordings of its use",
     "detect": "find slips in recordings",
     "stream": "find slips in samples as they come: serial port, socket, stdin or file",
     "generate": "write simulated recordings as files",

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from tactslip_torch.report import style
+from tactslip_torch.report import published, style
 from tactslip_torch.report.onset import Array, Envelope, Segments, lane_height, median, span
 
 Channels = Sequence[Mapping[str, str]]
@@ -32,6 +32,7 @@ _SLIP: dict[str, Any] = {"facecolor": style.VERMILION, "alpha": 0.14, "linewidth
 _NON_SLIP: dict[str, Any] = {"facecolor": style.BLUE, "alpha": 0.12, "linewidth": 0, "zorder": 0}
 _ONSET: dict[str, Any] = {"color": style.INK, "linestyle": "-.", "linewidth": 1.0, "zorder": 1}
 _NUM_SEGMENTS = 1200  # of each line, of which the least and the greatest sample are drawn
+_COLUMN = 3.8  # least width of one, in inches, for its titles to stand side by side
 _LANE = 0.13  # least height of one, in inches, for its name to be read
 _MOST_LANES = 24
 _NAMES = 6.5  # font size of channels in points
@@ -84,9 +85,14 @@ def trials_table(trials: Rows, *, simulated: bool) -> str:
             "non-slip s": f"{sum(trial['non_slip_s'] for trial in group):.1f}",
         }
 
-    tables = [_grouped("material", trials, cells)]
+    scenes = {published.PAPER_SCENE: style.UNNAMED_SCENE}
+    own = [
+        {**trial, "object": trial["material"], "scene": scenes.get(trial["scene"], trial["scene"])}
+        for trial in trials
+    ]
+    tables = [_grouped("material" if simulated else "object", trials if simulated else own, cells)]
     if len({trial["scene"] for trial in trials}) > 1:
-        tables.append(_grouped("scene", trials, cells))
+        tables.append(_grouped("scene", trials if simulated else own, cells))
     return style.marked(simulated, "\n\n".join(tables))
 
 
@@ -295,7 +301,8 @@ def signals_figure(
     columns = _columns(channels)
     colours = _channel_colours(channels)
     height = max(1.9, *(_LANE * len(places) for _, places, _ in columns))
-    figure = style.new_figure(13.0, height * len(rows) + 1.3, title)
+    width = max(13.0, _COLUMN * len(columns))
+    figure = style.new_figure(width, height * len(rows) + 1.3, title)
     widths = {"width_ratios": [1.0 if in_lanes else 0.75 for _, _, in_lanes in columns]}
     grid = figure.subplots(len(rows), len(columns), squeeze=False, gridspec_kw=widths)
     for panels, (row_title, row), view in zip(grid, rows, views, strict=True):
@@ -397,7 +404,7 @@ def _legend(rows: Sequence[Recording], channels: Channels) -> list[Any]:
     fingers = style.colours_of(channel["finger"] for channel in channels)
     handles: list[Any] = [
         Line2D([], [], color=colour, linewidth=2, label=finger)
-        for finger, colour in fingers.items()
+        for finger, colour in (fingers.items() if len(fingers) > 1 else ())
     ]
     if len({channel["segment"] for channel in channels} & set(_PALER)) > 1:
         handles.append(Line2D([], [], color="#CCCCCC", linewidth=2, label="paler: nearer the palm"))

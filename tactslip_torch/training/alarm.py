@@ -253,7 +253,7 @@ def event_record(stream: Stream, decisions: Decisions) -> EventRecord:
 
 
 def threshold_curve(
-    quiet: Sequence[Stream], settings: AlarmSettings, timing: Timing
+    quiet: BudgetScores, settings: AlarmSettings, timing: Timing
 ) -> list[list[float]]:
     """Thresholds and the false alarms of the detector an hour at each, by the rule in the settings.
 
@@ -264,29 +264,19 @@ def threshold_curve(
     is below one alarm in all of them.
 
     Args:
-        quiet: recordings in which nothing slips.
-        settings: calibration, rule, re-arming; their threshold does not count.
+        quiet: decisions where nothing slips.
+        settings: that made them; their threshold does not count.
         timing: of the scores.
     """
-    scores, raised = list[NDArray[Any]](), list[NDArray[np.bool_]]()
-    for _, made in decide(quiet, settings, timing):
-        status = made.statistic.numpy()
-        scores.append(status if settings.onset is None else made.onset_score.numpy())
-        is_raised = np.zeros(len(status), bool)
-        raised.append(is_raised if settings.onset is None else status >= settings.threshold)
-    rate_hz = timing.sample_rate_hz
-    hours = sum(map(len, scores)) * settings.decision_samples / rate_hz / 3600
-    falling = np.sort(np.concatenate(scores))[::-1]
-    falling = falling[falling > NOTHING_YET]
+    onset = settings.onset
+    scores = quiet.statistic if onset is None else quiet.onset_score
+    falling = np.concatenate([own[of] for own, of in zip(scores, quiet.is_quiet, strict=True)])
+    falling = np.sort(falling[falling > NOTHING_YET])[::-1]
     ranks = np.unique(np.geomspace(1, len(falling), _NUM_TRIED).astype(int)) - 1
-    times = settings.latch_times(rate_hz)
     points = list[list[float]]()
     for value in dict.fromkeys(falling[ranks].tolist()):
-        alarms = sum(
-            len(false_alarms((own >= value) | other, np.ones(len(own), bool), **times))
-            for own, other in zip(scores, raised, strict=True)
-        )
-        rate = alarms / hours
+        alarms = sum(map(len, quiet.alarms(settings.at_threshold(value), timing.sample_rate_hz)))
+        rate = alarms / quiet.amount
         if rate > MOST:
             break
         if rate >= LEAST and (not points or rate > points[-1][1]):
@@ -370,6 +360,8 @@ def within_budgets(
     streams: Sequence[Stream],
     timing: Timing,
     budgets: Sequence[Budget],
+    allowed: int | None = None,
+    scored: Sequence[BudgetScores] | None = None,
 ) -> AlarmSettings:
     """Settings with the lowest thresholds that keep every budget, and what they gave as metadata.
 
@@ -383,56 +375,68 @@ def within_budgets(
         streams: of each budget those of its scene, scored.
         timing: of the scores.
         budgets: the first is of recordings without slip, whose rate is stated.
+        allowed: alarms, in place of those that each budget allows.
+        scored: ``budget_scores`` of all this, where they are known.
 
     Raises:
         ValueError: if streams are too few to show a budget.
     """
     rule, onset = settings.rule, settings.onset
     settings = replace(settings, threshold=math.inf)
-    scored = _budget_scores(streams, settings, timing, budgets)
+    scored = scored or budget_scores(streams, settings, timing, budgets)
+    most = [of.budget.allowed(of.amount) if allowed is None else allowed for of in scored]
     part = _OF_BINS if onset else 1.0
-    value = _lowest(scored, settings, timing, "statistic", of_allowed=part)
+    value = _lowest(scored, [int(part * of) for of in most], settings, timing, "statistic")
     value = max(value, _LEAST_THRESHOLD)
     while True:
         value, made = value if value <= rule.ceiling else math.inf, rule
         if isinstance(rule, Cusum) and rule.ceiling == math.inf:
             made = replace(rule, ceiling=_CEILING * value)
         settings = replace(settings, rule=made, threshold=value)
-        scored = _budget_scores(streams, settings, timing, budgets)
+        if made != rule:
+            scored = budget_scores(streams, settings, timing, budgets)
         if onset:
-            threshold = _lowest(scored, settings, timing, "onset_score")
+            threshold = _lowest(scored, most, settings, timing, "onset_score")
             settings = replace(settings, onset=replace(onset, threshold=threshold))
-        settings = _with_counts(settings, scored, timing)
+        settings = _with_counts(settings, scored, most, timing)
         if all(row["alarms"] <= row["allowed"] for row in settings.metadata["budget"]):
             return settings
         value *= _STEP
 
 
 @dataclass
-class _Scores:
-    """Of the recordings of a budget's scene, each a row of decisions; ``amount`` of it there is."""
+class BudgetScores:
+    """Decisions on recordings of a budget's scene, by which thresholds are set.
+
+    Attributes:
+        budget: of them.
+        statistic: of the rule, ``[N]`` of each recording.
+        onset_score: of the onset classifier, likewise.
+        is_quiet: where an alarm is false; a decision that is not valid raises none.
+        amount: hours, or knocks.
+    """
 
     budget: Budget
     statistic: list[NDArray[Any]] = field(default_factory=list)
     onset_score: list[NDArray[Any]] = field(default_factory=list)
     is_quiet: list[NDArray[np.bool_]] = field(default_factory=list)
     amount: float = 0
-    allowed: int = 0
 
     def raised(self, settings: AlarmSettings) -> list[NDArray[np.bool_]]:
         """Where bins alone would raise an alarm."""
         return [own >= settings.threshold for own in self.statistic]
 
-    def alarms(self, settings: AlarmSettings, times: Mapping[str, int]) -> list[int]:
-        """False alarms of each recording."""
+    def alarms(self, settings: AlarmSettings, sample_rate_hz: float) -> list[NDArray[np.int64]]:
+        """Places of the false alarms of each recording."""
         raised, onset = self.raised(settings), settings.onset
+        times = settings.latch_times(sample_rate_hz)
         if onset is not None:
             raised = [
                 of_bins | (own >= onset.threshold)
                 for of_bins, own in zip(raised, self.onset_score, strict=True)
             ]
         pairs = zip(raised, self.is_quiet, strict=True)
-        return [len(false_alarms(is_high, is_quiet, **times)) for is_high, is_quiet in pairs]
+        return [false_alarms(is_high, is_quiet, **times) for is_high, is_quiet in pairs]
 
 
 def _decisions_h(settings: AlarmSettings, timing: Timing) -> float:
@@ -440,21 +444,24 @@ def _decisions_h(settings: AlarmSettings, timing: Timing) -> float:
     return 3600 * timing.sample_rate_hz / settings.decision_samples
 
 
-def _budget_scores(
+def budget_scores(
     streams: Sequence[Stream],
     settings: AlarmSettings,
     timing: Timing,
     budgets: Sequence[Budget],
-) -> list[_Scores]:
-    """What thresholds are set on, of each budget."""
+) -> list[BudgetScores]:
+    """What thresholds are set on, of each budget; the shortest streams first.
+
+    Alarms are false where nothing slips, outside slides and what is left of them in bins and rules.
+    """
     settle_s = (timing.bin_samples + timing.look_ahead) / timing.sample_rate_hz + _SETTLE_S
     found = []
     for budget in budgets:
-        scores = _Scores(budget)
+        scores = BudgetScores(budget)
         own = [stream for stream in streams if stream.recording.scene == budget.scene]
         for stream, made in decide(own, settings, timing):
             time_s, times = made.available_s.numpy(), stream.times
-            quiet = np.ones(len(time_s), bool)
+            quiet = made.is_valid.numpy().copy()
             firsts = first_releases(times.onsets_s, times.released_s)
             for first_s, (_, end_s) in zip(firsts, times.sliding_s, strict=True):
                 before_s = first_s - EventRules().early_s
@@ -464,53 +471,55 @@ def _budget_scores(
             scores.is_quiet.append(quiet)
             hours = int(quiet.sum()) / _decisions_h(settings, timing)
             scores.amount += len(times.non_slip_s) if budget.is_share else hours
-        scores.allowed = budget.allowed(scores.amount)
         found.append(scores)
     return found
 
 
 def _lowest(
-    scored: Sequence[_Scores],
+    scored: Sequence[BudgetScores],
+    allowed: Sequence[int],
     settings: AlarmSettings,
     timing: Timing,
     name: str,
-    of_allowed: float = 1.0,
 ) -> float:
-    """The lowest threshold of a score that keeps every budget, or so much of each."""
+    """The lowest threshold of a score at which each budget has at most so many alarms."""
     times = settings.latch_times(timing.sample_rate_hz)
     return max(
         lowest_threshold(
             getattr(scores, name),
             scores.is_quiet,
-            int(of_allowed * scores.allowed),
+            most,
             is_raised=scores.raised(settings) if name == "onset_score" else None,
             **times,
         )
-        for scores in scored
+        for scores, most in zip(scored, allowed, strict=True)
     )
 
 
 def _with_counts(
-    settings: AlarmSettings, scored: Sequence[_Scores], timing: Timing
+    settings: AlarmSettings,
+    scored: Sequence[BudgetScores],
+    allowed: Sequence[int],
+    timing: Timing,
 ) -> AlarmSettings:
     """The settings, with what their thresholds gave on the recordings that they were set on."""
     rows = list[dict[str, Any]]()
-    times, onset = settings.latch_times(timing.sample_rate_hz), settings.onset
-    for scores in scored:
-        budget, alarms = scores.budget, scores.alarms(settings, times)
+    rate_hz, onset = timing.sample_rate_hz, settings.onset
+    for scores, most in zip(scored, allowed, strict=True):
+        budget, num = scores.budget, sum(map(len, scores.alarms(settings, rate_hz)))
         rows.append(
             {
                 "scene": budget.scene,
                 "is_share": budget.is_share,
                 "limit": budget.limit,
                 "amount": scores.amount,
-                "allowed": scores.allowed,
-                "alarms": sum(alarms),
-                "bound": budget.bound(sum(alarms), scores.amount),
+                "allowed": most,
+                "alarms": num,
+                "bound": budget.bound(num, scores.amount),
             }
         )
     usual = scored[0]
-    alarms = usual.alarms(settings, times)
+    alarms = list(map(len, usual.alarms(settings, rate_hz)))
     hours = [len(own) / _decisions_h(settings, timing) for own in usual.is_quiet]
     rate = Bootstrap(len(hours), _LEVEL).rate(alarms, hours)
     calibrated = {
@@ -704,7 +713,8 @@ class CalibratedAlarm:
         methods = self.methods(scored["calibrate"], timings, onset)
         amounts = self._amounts({"learn": learn, **roles})
         _, settings = methods[JOINT]
-        quiet = [x for x in scored["calibrate"][OURS] if x.recording.scene == self.slip_free]
+        usual = [budget for budget in self.budgets if budget.scene == self.slip_free]
+        (quiet,) = budget_scores(scored["calibrate"][OURS], settings, timings[OURS], usual[:1])
         curve = threshold_curve(quiet, settings, timings[OURS])
         metadata = {
             **settings.metadata,
@@ -803,10 +813,11 @@ class CalibratedAlarm:
             if name != OURS:
                 settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timings[name].hop_samples)
                 of = timings[name]
-                scored = _budget_scores(streams[name], settings, of, self.budgets)
-                threshold = _lowest(scored, settings, of, "statistic")
+                scored = budget_scores(streams[name], settings, of, self.budgets)
+                most = [each.budget.allowed(each.amount) for each in scored]
+                threshold = _lowest(scored, most, settings, of, "statistic")
                 settings = replace(settings, threshold=threshold)
-                methods[name] = name, _with_counts(settings, scored, of)
+                methods[name] = name, _with_counts(settings, scored, most, of)
         return methods
 
     def calibrated(
