@@ -138,6 +138,7 @@ class Calibrator:
             rate_hz,
             times.non_slip_s,
             times.slip_s,
+            times.unlabelled_s,
         )
         place = laid.starts // self.timing.hop_samples
         is_there = place < len(stream.score)
