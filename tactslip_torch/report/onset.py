@@ -495,7 +495,8 @@ def overview_figure(rows: Sequence[OverviewRow], path: str | Path, *, of_simulat
     for place, row in enumerate(drawn):
         truth = row.entry["truth"]
         onsets = truth["onsets"] if truth else ()
-        bars = [([row.view], -0.35, slip_height, {"facecolor": _QUIET, "gid": "recording"})]
+        bars: list[tuple[Segments, float, float, dict[str, Any]]] = []
+        bars += [([row.view], -0.35, slip_height, {"facecolor": _QUIET, "gid": "recording"})]
         bars += [(row.slips, -0.35, slip_height, {"facecolor": SLIP, "gid": "slip"})]
         bars += [(row.invalid, -0.35, slip_height, _INVALID | _HIDDEN)]
         if truth:
