@@ -18,7 +18,7 @@ from tactslip_torch.data.formats import FORMATS, Samples
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, score_stream
 from tactslip_torch.onset.rules import KOfN
-from tactslip_torch.report.onset import COLUMNS, Traces, overview_figure, overview_row
+from tactslip_torch.report.onset import COLUMNS, OverviewRow, Traces, overview_figure
 
 RATE_HZ = 2000.0
 SETTINGS = AlarmSettings(20, Platt(1.0, 0.0), KOfN(2, 3), 2.0, target_per_hour=1.0, lead_s=0.02)
@@ -310,9 +310,9 @@ def test_the_overview_has_what_each_recording_has(model, tmp_path, drawn):
 def test_an_overview_of_many_shows_those_with_alarms_and_says_how_many(tmp_path, drawn):
     traces = Traces((), RATE_HZ, 0.01, (0.0, 1.0))
     nothing = {"alarms": [], "truth": None, "simulated": False}
-    rows = [overview_row(nothing | {"file": f"{i}.csv"}, traces) for i in range(100)]
+    rows = [OverviewRow.of(nothing | {"file": f"{i}.csv"}, traces) for i in range(100)]
     alarms = [{"alarm_s": 0.5}]
-    rows += [overview_row(nothing | {"file": "last.csv", "alarms": alarms}, traces)]
+    rows += [OverviewRow.of(nothing | {"file": "last.csv", "alarms": alarms}, traces)]
     overview_figure(rows, tmp_path / "overview.png", of_simulated=False)
     assert_png(tmp_path / "overview.png")
     names = [text.get_text() for text in drawn[-1].axes[0].get_yticklabels()]

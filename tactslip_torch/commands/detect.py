@@ -55,7 +55,6 @@ from tactslip_torch.report.onset import (
     onsets_table,
     onsets_title,
     overview_figure,
-    overview_row,
     view_of,
     write_onsets,
 )
@@ -268,7 +267,7 @@ def _detect_in(
         place, onset = context.folder / f"{name}_onsets.png", context.settings.onset
         threshold = None if onset is None else onset.threshold
         onset_figure(traces, entry, place, onset_threshold=threshold, title=title)
-    return entry, known, overview_row(entry, traces)
+    return entry, known, OverviewRow.of(entry, traces)
 
 
 def _cell(value: Any) -> Any:

@@ -459,19 +459,24 @@ class OverviewRow(NamedTuple):
     slips: Segments
     invalid: Segments
 
+    @classmethod
+    def of(cls, entry: Mapping[str, Any], traces: Traces) -> OverviewRow:
+        """From an entry of ``onsets.json`` and what was gathered of its recording."""
+        decided_s, (_, is_slip, is_invalid, _) = traces.decisions()
+        end_s = traces.view[1]
+        return cls(
+            entry,
+            traces.view,
+            slips=_spans(decided_s, is_slip, end_s),
+            invalid=_spans(decided_s, is_invalid, end_s),
+        )
+
     @property
     def is_of_note(self) -> bool:
         """Whether there is an alarm in it, or a slip that none found."""
         onsets = (self.entry["truth"] or {}).get("onsets", ())
         is_missed = any(onset["outcome"] == "missed" for onset in onsets)
         return bool(self.entry["alarms"]) or is_missed
-
-
-def overview_row(entry: Mapping[str, Any], traces: Traces) -> OverviewRow:
-    """The row of a recording, from its entry of ``onsets.json`` and what was gathered of it."""
-    decided_s, (_, is_slip, is_invalid, _) = traces.decisions()
-    slips, invalid = (_spans(decided_s, status, traces.view[1]) for status in (is_slip, is_invalid))
-    return OverviewRow(entry, traces.view, slips, invalid)
 
 
 @style.styled
