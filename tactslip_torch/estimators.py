@@ -220,7 +220,7 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             )
         if num > MOST_BIN_SAMPLES:
             raise ValueError(
-                f"windows have at most {MOST_BIN_SAMPLES} samples beside what the filter takes, got "
+                f"windows have at most {MOST_BIN_SAMPLES} samples without what filters take, got "
                 f"{num}; cut shorter windows, or resample them to a lower rate"
             )
         pool = FeaturePool(
