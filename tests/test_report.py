@@ -1,6 +1,7 @@
 """Tables and figures: what they say, of what, and that files are written whole."""
 
 import csv
+import itertools
 import json
 import math
 from dataclasses import replace
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from drawing import assert_png, rows_of
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 
 from tactslip_torch.data.recording import Recording
@@ -426,6 +428,39 @@ def test_an_onset_classifier_has_a_panel_with_its_threshold(draw):
     times, values = (np.asarray(x) for x in (score.get_xdata(), score.get_ydata()))
     assert np.nanmin(times[np.isfinite(values)]) == pytest.approx(0.2, abs=HOP_S)
     assert (np.nanmax(values), list(threshold.get_ydata())) == (2.0, [1.5, 1.5])
+
+
+KINDS = ("acceleration", "force", "pressure", "torque", "light")
+
+
+@pytest.mark.parametrize(("number", "num_kinds"), [(1, 1), (3, 1), (6, 2), (24, 4), (96, 5)])
+def test_words_stay_in_the_figure_and_apart_for_any_hand(drawn, tmp_path, rng, number, num_kinds):
+    kinds = [KINDS[place % num_kinds] for place in range(number)]
+    names = [f"{kind}_{place}" for place, kind in enumerate(kinds)]
+    traces = Traces(names, RATE_HZ, HOP_S, (0.0, 1.4), "mV", kinds)
+    traces.add_samples(rng.normal(size=(number, 2800)))
+    chosen = [
+        {"kind": kinds[i % number], "channel": names[i % number], "finger": "unknown"}
+        | {"component": "A1", "domain": "time", "descriptor": ("std", "energy")[i % 2]}
+        for i in range(2 * number)
+    ]
+    path = tmp_path / "a.png"
+    entry = {"alarms": ALARMS, "truth": TRUTH}
+    onset_figure(traces, entry, path, title="Recording cup_1.csv of cup, 2 alarms")
+    results.selected_features_figure(chosen, path, simulated=False)
+    for figure in drawn:
+        renderer, space = FigureCanvasAgg(figure).get_renderer(), figure.bbox
+        parts = [*figure.axes, *figure.legends, figure._suptitle]
+        for box in [part.get_tightbbox(renderer) for part in parts]:
+            assert box.x0 >= space.x0 - 1
+            assert box.x1 <= space.x1 + 1
+            assert box.y0 >= space.y0 - 1
+            assert box.y1 <= space.y1 + 1
+        for axes in figure.axes:
+            labels = [text.get_window_extent(renderer) for text in axes.get_yticklabels()]
+            labels.sort(key=lambda box: box.y0)
+            for low, high in itertools.pairwise(labels):
+                assert low.y1 < high.y0 + 1
 
 
 # Tables ----------------------------------------------------------------------------------------

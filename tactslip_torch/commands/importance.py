@@ -56,7 +56,12 @@ def importance(config: DictConfig, folder: Path) -> dict[str, Any]:
     folds: list[Split] = instantiate(training.split, _convert_="all")(source.ids)
     fold = next((fold for fold in folds if fold.name == detector.info.get("split")), None)
     if fold is None:
-        raise ValueError(f"{found} has no fold {detector.info.get('split')!r} of {model.name}")
+        kept = f"; give a detector of a fold, such as {found.parent / folds[0].name / model.name}"
+        raise ValueError(
+            f"{model} was trained on all recordings, so that none is left to evaluate it on{kept}"
+            if detector.info.get("split") == "all"
+            else f"{found} has no fold {detector.info.get('split')!r} of {model.name}"
+        )
     maker = features_of(detector, source, instantiate(training.labels), None)
     masks = _masks(source.hand)
 
@@ -97,14 +102,16 @@ def importance(config: DictConfig, folder: Path) -> dict[str, Any]:
         | {f"{role} %": style.percent(row[role]) for role in _ROLES}
         for row in rows
     ]
-    print(f"\n{style.marked(source.is_simulated, style.table(shown))}\n\nresults in {folder}")
+    table = style.table(shown, kept=1)
+    print(f"\n{style.marked(source.is_simulated, table)}\n\nresults in {folder}")
     return content
 
 
 def _masks(hand: HandLayout) -> dict[tuple[str, str], tuple[str, ...]]:
-    """What is masked: nothing, each channel, each finger, each kind of channel."""
+    """What is masked: nothing, each channel, and of several fingers or kinds each of these."""
     masks: dict[tuple[str, str], tuple[str, ...]] = {("nothing", ""): ()}
-    for unit in ("name", "finger", "kind"):
+    several = [u for u in ("finger", "kind") if len({getattr(c, u) for c in hand.channels}) > 1]
+    for unit in ("name", *several):
         for channel in hand.channels:
             key = ("channel" if unit == "name" else unit, str(getattr(channel, unit)))
             masks[key] = (*masks.get(key, ()), channel.name)
@@ -117,8 +124,10 @@ def _figure(content: Mapping[str, Any], path: Path) -> None:
     whole, *rows = content["rows"]
     title = "Balanced accuracy lost without a sensor"
     figure = style.new_figure(8, 1.5 + 0.2 * len(rows), title, simulated=content["simulated"])
-    panels = figure.subplots(1, 2, sharey=True)
-    for axes, role, colour in zip(panels, _ROLES, (style.BLUE, style.VERMILION), strict=True):
+    roles = [role for role in _ROLES if whole[role] is not None] or [_ROLES[0]]
+    panels = figure.subplots(1, len(roles), sharey=True, squeeze=False)[0]
+    for axes, role in zip(panels, roles, strict=True):
+        colour = style.BLUE if role == _ROLES[0] else style.VERMILION
         for lane, row in enumerate(rows):
             if whole[role] is None or row[role] is None:
                 axes.text(0.0, lane, " -", va="center")

@@ -33,7 +33,7 @@ from tactslip_torch.data.formats import (
     open_file,
     pieces,
 )
-from tactslip_torch.data.formats._inference import bare
+from tactslip_torch.data.formats._inference import bare, is_time
 from tactslip_torch.data.labels import LabelColumn, LabelRule
 from tactslip_torch.data.manifest import Entry, Listing, Problem, manifest_of, read_manifest
 from tactslip_torch.data.recording import (
@@ -846,7 +846,9 @@ def _doubts(recording: _File) -> list[str]:
     if head.left_out:
         doubts.append(
             f"has columns that are taken for no channels, {_some(head.left_out)}; if they are, "
-            "list all channels as data.reading.channels; labels.column=NAME reads labels from one"
+            "list all channels as data.reading.channels"
+            + "; labels.column=NAME reads labels from one"
+            * (not all(map(is_time, head.left_out)))
         )
     if head.clock.gaps:
         doubts.append(_gaps_text(head.clock))

@@ -41,6 +41,7 @@ _WIDTH, _ROOM = 1.2, 40  # of marks, in points, as long as there are no more of 
 _INVALID: dict[str, Any] = {
     "facecolor": "none", "edgecolor": "#999999", "hatch": "////", "linewidth": 0, "zorder": 0.5,
 }  # fmt: skip
+_LANE, _LEAST_LANE, _HIGH = 0.3, 0.15, 7.2  # inches: of a channel, its least, of many together
 _MOST_DELAYS = 12  # reported beside their alarms
 _ONSET: dict[str, Any] = {"color": style.INK, "linestyle": "-."}
 _RELEASE: dict[str, Any] = {"color": style.GREY, "linestyle": ":"}
@@ -390,7 +391,8 @@ def onset_figure(
         onset_threshold: of the onset classifier; ``None``: there is none.
         title: of the figure; says what is simulated.
     """
-    heights = [max(1.2, 0.3 * len(traces.channels)), 0.55, 1.3]
+    lane = min(_LANE, max(_LEAST_LANE, _HIGH / len(traces.channels)))
+    heights = [max(1.2, lane * len(traces.channels)), 0.55, 1.3]
     heights += [] if onset_threshold is None else [1.3]
     figure = style.new_figure(12.0, sum(heights) + 1.3, title)
     panels = figure.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights})
@@ -460,10 +462,11 @@ def _draw_channels(axes: Axes, traces: Traces, slips: Segments) -> None:
     axes.set_yticks(middles, list(traces.channels), fontsize=7)
     axes.set_ylim(middles[-1] - 0.8, 0.8)
     axes.grid(visible=False)
-    heights_shown = ", ".join(
-        f"{kind} {high:.2g} {traces.units}".strip() for kind, high in heights.items()
+    shown = ", ".join(
+        f"{kind} {float(f'{high:.2g}'):g} {traces.units}".strip() for kind, high in heights.items()
     )
-    axes.set_ylabel(f"channels; distance of lanes: {heights_shown}")
+    text = f"distance of channels: {shown}"
+    axes.set_title(text, loc="right", fontsize=7.5, color=style.GREY, pad=14)  # above the delays
 
 
 def _tell_delays(axes: Axes, alarms: Sequence[Mapping[str, Any]]) -> None:

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from tactslip_torch.report import style
+from tactslip_torch.report import published, style
 from tactslip_torch.report.onset import Array, Envelope, Segments, lane_height, median, span
 
 Channels = Sequence[Mapping[str, str]]
@@ -32,6 +32,7 @@ _SLIP: dict[str, Any] = {"facecolor": style.VERMILION, "alpha": 0.14, "linewidth
 _NON_SLIP: dict[str, Any] = {"facecolor": style.BLUE, "alpha": 0.12, "linewidth": 0, "zorder": 0}
 _ONSET: dict[str, Any] = {"color": style.INK, "linestyle": "-.", "linewidth": 1.0, "zorder": 1}
 _NUM_SEGMENTS = 1200  # of each line, of which the least and the greatest sample are drawn
+_COLUMN = 3.8  # least width of one, in inches, for its titles to stand side by side
 _LANE = 0.13  # least height of one, in inches, for its name to be read
 _MOST_LANES = 24
 _NAMES = 6.5  # font size of channels in points
@@ -84,9 +85,14 @@ def trials_table(trials: Rows, *, simulated: bool) -> str:
             "non-slip s": f"{sum(trial['non_slip_s'] for trial in group):.1f}",
         }
 
-    tables = [_grouped("material", trials, cells)]
+    scenes = {published.PAPER_SCENE: style.UNNAMED_SCENE}
+    own = [
+        {**trial, "object": trial["material"], "scene": scenes.get(trial["scene"], trial["scene"])}
+        for trial in trials
+    ]
+    tables = [_grouped("material" if simulated else "object", trials if simulated else own, cells)]
     if len({trial["scene"] for trial in trials}) > 1:
-        tables.append(_grouped("scene", trials, cells))
+        tables.append(_grouped("scene", trials if simulated else own, cells))
     return style.marked(simulated, "\n\n".join(tables))
 
 
@@ -138,6 +144,76 @@ def ranges_table(channels: Channels, ranges: Array, units: str) -> str:
         row |= {f"least, {units}": f"{least:.6g}", f"greatest, {units}": f"{greatest:.6g}"}
         rows.append(row)
     return style.table(rows)
+
+
+_USES = {
+    "slip": style.VERMILION,
+    "slip, left out": "#F2BFA0",
+    "non-slip": style.BLUE,
+    "non-slip, left out": "#A6CBE3",
+    "not labelled": _UNKNOWN,
+    "missing": style.INK,
+}
+"""What training may make of a stretch of a recording, and its colour."""
+
+
+def use_table(rows: Rows, most: int) -> str:
+    """What training would use of each file, and the seconds that are left out, by the reason.
+
+    Args:
+        rows: of each recording its ``file``, ``duration_s``, ``num_slip`` and ``num_rest`` bins,
+            and ``left_s`` by the reason.
+        most: rows to show; the last is the sum of all.
+    """
+
+    def cells(file: str, group: Rows) -> dict[str, object]:
+        left = {reason: sum(row["left_s"][reason] for row in group) for reason in rows[0]["left_s"]}
+        return {
+            "file": file,
+            "seconds": f"{sum(row['duration_s'] for row in group):.2f}",
+            "slip bins": sum(row["num_slip"] for row in group),
+            "non-slip bins": sum(row["num_rest"] for row in group),
+            **{
+                f"{reason} s": f"{seconds:.2f}" if seconds else "-"
+                for reason, seconds in left.items()
+            },
+        }
+
+    table = [cells(row["file"], [row]) for row in rows[:most]]
+    more = f", {len(rows) - most} of them not shown" if len(rows) > most else ""
+    table.append(cells(f"all {len(rows)}{more}", rows))
+    return style.table(table)
+
+
+@style.styled
+def use_figure(rows: Rows, num_all: int, path: str | Path, *, title: str) -> None:
+    """Write a lane for each file: what of it is slip, non-slip, not labelled or missing over time.
+
+    What is labelled and in no bin is paler.
+
+    Args:
+        rows: at least one, as ``use_table`` takes them, and ``spans`` in seconds by what they are.
+        num_all: recordings there are; the title says if more than are drawn.
+        path: the PNG to write, replaced as a whole if it exists.
+        title: of the figure; says what is simulated.
+    """
+    some = f" (the first {len(rows)} of {num_all} files)" if num_all > len(rows) else ""
+    figure = style.new_figure(10.0, 0.19 * len(rows) + 1.6, title + some)
+    axes = figure.subplots()
+    for lane, row in enumerate(rows):
+        for kind, colour in _USES.items():
+            bars = [(start, end - start) for start, end in row["spans"][kind]]
+            axes.broken_barh(bars, (lane - 0.36, 0.72), facecolors=colour, linewidth=0)
+        text = f"  {row['num_slip']} slip, {row['num_rest']} non-slip bins"
+        axes.text(row["duration_s"], lane, text, va="center", fontsize=6.5, color=style.GREY)
+    style.lanes(axes, [row["file"] for row in rows], least=2)
+    axes.tick_params(axis="y", labelsize=6.5)
+    axes.set_xlim(0.0, 1.25 * max(row["duration_s"] for row in rows))
+    axes.set_xlabel("time, s")
+    drawn = {kind for row in rows for kind, spans in row["spans"].items() if spans}
+    handles = [Patch(color=colour, label=kind) for kind, colour in _USES.items() if kind in drawn]
+    style.legend_below(figure, handles, len(handles))
+    style.save(figure, path, dpi=120)
 
 
 @style.styled
@@ -225,7 +301,8 @@ def signals_figure(
     columns = _columns(channels)
     colours = _channel_colours(channels)
     height = max(1.9, *(_LANE * len(places) for _, places, _ in columns))
-    figure = style.new_figure(13.0, height * len(rows) + 1.3, title)
+    width = max(13.0, _COLUMN * len(columns))
+    figure = style.new_figure(width, height * len(rows) + 1.3, title)
     widths = {"width_ratios": [1.0 if in_lanes else 0.75 for _, _, in_lanes in columns]}
     grid = figure.subplots(len(rows), len(columns), squeeze=False, gridspec_kw=widths)
     for panels, (row_title, row), view in zip(grid, rows, views, strict=True):
@@ -327,7 +404,7 @@ def _legend(rows: Sequence[Recording], channels: Channels) -> list[Any]:
     fingers = style.colours_of(channel["finger"] for channel in channels)
     handles: list[Any] = [
         Line2D([], [], color=colour, linewidth=2, label=finger)
-        for finger, colour in fingers.items()
+        for finger, colour in (fingers.items() if len(fingers) > 1 else ())
     ]
     if len({channel["segment"] for channel in channels} & set(_PALER)) > 1:
         handles.append(Line2D([], [], color="#CCCCCC", linewidth=2, label="paler: nearer the palm"))

@@ -23,8 +23,7 @@ from tactslip_torch.runtime import write_json
 
 PAPER_LINE = f"paper: {published.PAPER}; real hand, random split over bins"
 _PAPER_SCENE_LINE = "of several scenes: materials and speeds are of the paper's scene alone"
-_UNNAMED_SCENE = "unnamed"  # of recordings that are not the paper's, whose scene nothing says
-_SCENE_LINE = f"of several scenes: objects and speeds are of the scene {_UNNAMED_SCENE} alone"
+_SCENE_LINE = f"of several scenes: objects and speeds are of the scene {style.UNNAMED_SCENE} alone"
 _NO_SPEED = {"0": "no slide", "nan": "speed not known"}
 BASELINES = {
     "best_pooled_number": "best pooled number",
@@ -38,7 +37,8 @@ _OF_SIMPLE = (
     "it stays ahead, a classifier on mean, std and rms is the better one for this hand"
 )
 _ADVICE = {
-    "best_pooled_number": "try fewer features (recipe.num_features=[10,30]) and more recordings",
+    "best_pooled_number": "try recipe.use=[pooled], few features (recipe.num_features=[10,30]) and "
+    "more recordings",
     "logistic_regression": "try recipe.degree=[1], which is linear as well, and more recordings",
     "logistic_regression_simple": _OF_SIMPLE,
     "random_forest_simple": _OF_SIMPLE,
@@ -190,7 +190,7 @@ def _is_papers_hand(metrics: _Metrics) -> bool:
 def _scene_name(metrics: _Metrics, scene: str) -> str:
     """A scene as it is shown; the paper's is the default where nothing names one."""
     is_default = scene == published.PAPER_SCENE and not _is_papers_hand(metrics)
-    return _UNNAMED_SCENE if is_default else scene
+    return style.UNNAMED_SCENE if is_default else scene
 
 
 def materials_table(metrics: _Metrics) -> str:
@@ -394,11 +394,12 @@ _DOMAIN_WORDS = {"time": "time domain", "freq": "frequency domain"}
 def selected_features_figure(
     selected: Sequence[Mapping[str, str]], path: str | Path, *, simulated: bool
 ) -> None:
-    """Write where the selected features come from: four panels, the paper's counts beside.
+    """Write where the selected features come from, the paper's counts beside.
 
-    By sensor kind, by signal component, by finger, and by descriptor. For components and
-    descriptors the paper prints no counts, so words and the order of its ranking stand in.
-    Features of another hand than the paper's stand alone. What the paper published is hatched.
+    Panels are sensor kinds, signal components, fingers or statistics over channels, and
+    descriptors. For components and descriptors the paper prints no counts, so words and the order
+    of its ranking stand in. Features of another hand than the paper's stand alone, without the
+    panels that would have one bar. What the paper published is hatched.
 
     Args:
         selected: one mapping per feature, at least one, with ``channel``, ``component``,
@@ -409,38 +410,56 @@ def selected_features_figure(
     """
     title = f"Where the {len(selected)} selected features come from"
     figure = style.new_figure(12.0, 8.4, title, simulated=simulated)
-    grid = figure.add_gridspec(3, 2, width_ratios=[1.15, 1], height_ratios=[0.5, 1.1, 1])
-    kind, component, finger = (figure.add_subplot(grid[row, 0]) for row in range(3))
-    descriptor = figure.add_subplot(grid[:, 1])
     is_papers = _is_of_papers_hand(selected)
     by_kind = published.SELECTED_BY_KIND if is_papers else {}
     by_finger = published.SELECTED_BY_FINGER if is_papers else {}
     kinds = [feature["kind"] for feature in selected]
     colours = style.kind_colours([*by_kind, *sorted(set(kinds))])
-
-    of_paper = {name: {name: count} for name, count in by_kind.items()}
-    _counts(kind, "(a) sensor kind", zip(kinds, kinds, strict=True), colours, colours, of_paper)
-
-    pairs = [(_DOMAIN_WORDS[feature["domain"]], feature["component"]) for feature in selected]
     domains = dict(zip(_DOMAIN_WORDS.values(), (style.PURPLE, style.GREEN), strict=True))
-    _counts(component, "(b) signal component", pairs, _COMPONENTS, domains)
-
+    components = [feature["component"] for feature in selected]
+    of_domain = [_DOMAIN_WORDS[feature["domain"]] for feature in selected]
     is_pooled = any(feature.get("statistic") for feature in selected)
-    places = [feature.get("statistic") or feature["finger"] for feature in selected]
-    what = "(c) statistic over channels" if is_pooled else "(c) finger"
-    order = by_finger.get("SG", ())
-    _counts(finger, what, zip(kinds, places, strict=True), order, colours, by_finger)
+    apart = "of each channel" if is_pooled and not is_papers else None
+    places = [feature.get("statistic") or apart or feature["finger"] for feature in selected]
+    where = "statistic over channels" if is_pooled else "finger"
 
+    layers = {"sensor kind": kinds, "signal component": of_domain, where: kinds}
+    names = {"sensor kind": kinds, "signal component": components, where: places}
+    left = [name for name, of in names.items() if is_papers or len(set(of)) > 1]
+    left = left or ["signal component"]
+    orders = {
+        "sensor kind": colours,
+        "signal component": [c for c in _COMPONENTS if is_papers or c in components],
+        where: by_finger.get("SG", {}),
+    }
+    of_paper = {"sensor kind": {name: {name: n} for name, n in by_kind.items()}, where: by_finger}
+    heights = [{"sensor kind": 0.5, "signal component": 1.1}.get(name, 1.0) for name in left]
+    grid = figure.add_gridspec(len(left), 2, width_ratios=[1.15, 1], height_ratios=heights)
+    panels = {name: figure.add_subplot(grid[row, 0]) for row, name in enumerate(left)}
+    titles = [f"({letter}) {name}" for letter, name in zip("abcd", [*left, ""], strict=False)]
+    for (name, axes), panel_title in zip(panels.items(), titles, strict=False):
+        pairs = zip(layers[name], names[name], strict=True)
+        hues = domains if name == "signal component" else colours
+        is_told = is_papers or name == "signal component"  # else in the legend of all panels
+        _counts(
+            axes, panel_title, pairs, orders[name], hues, of_paper.get(name), with_legend=is_told
+        )
+
+    descriptor = figure.add_subplot(grid[:, 1])
     ranks = dict.fromkeys(published.DESCRIPTORS_NEVER, "-") if is_papers else {}
     ranked = published.DESCRIPTORS_RANKED if is_papers else ()
     ranks = {name: str(rank) for rank, name in enumerate(ranked, 1)} | ranks
-    places = [feature["descriptor"] for feature in selected]
-    what = f"(d) descriptor{'  [rank in the paper]' if is_papers else ''}"
-    names = _counts(descriptor, what, zip(kinds, places, strict=True), ranks, colours)
+    described = [feature["descriptor"] for feature in selected]
+    what = f"{titles[-1]}descriptor{'  [rank in the paper]' if is_papers else ''}"
+    pairs = zip(kinds, described, strict=True)
+    shown = _counts(descriptor, what, pairs, ranks, colours, with_legend=is_papers)
+    if not is_papers:
+        handles = [Patch(color=colour, label=kind) for kind, colour in colours.items()]
+        style.legend_below(figure, handles, 6)
     if is_papers:
         said = f"paper: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
-        component.set_xlabel(said)
-        style.lanes(descriptor, [f"{style.words(name)}  [{ranks[name]}]" for name in names])
+        panels["signal component"].set_xlabel(said)
+        style.lanes(descriptor, [f"{style.words(name)}  [{ranks[name]}]" for name in shown])
         descriptor.set_xlabel("features; the paper never selects [-]")
     style.save(figure, path, dpi=180)
 
@@ -452,6 +471,8 @@ def _counts(
     order: Iterable[str],
     colours: Mapping[str, str],
     of_paper: Mapping[str, Mapping[str, int]] | None = None,
+    *,
+    with_legend: bool = True,
 ) -> list[str]:
     """Counts of (layer, name) pairs as stacked bars, the paper's hatched below each; the names."""
     counts = Counter(pairs)
@@ -477,7 +498,8 @@ def _counts(
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
     axes.margins(x=0.1)
     place_of: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
-    axes.legend(ncols=4, borderaxespad=0.3, handlelength=1.4, **place_of)
+    if with_legend:
+        axes.legend(ncols=4, borderaxespad=0.3, handlelength=1.4, **place_of)
     return names
 
 
@@ -628,7 +650,7 @@ def _confound_figure(metrics: _Metrics, path: str | Path) -> None:
     colours = style.colours_of(row["detector"] for row in rows)
     height = 1.7 + len(roles) * (0.8 + 0.28 * len(scenes))
     is_papers = _is_papers_hand(metrics)
-    names = {published.PAPER_SCENE: "paper's protocol" if is_papers else _UNNAMED_SCENE}
+    names = {published.PAPER_SCENE: "paper's protocol" if is_papers else style.UNNAMED_SCENE}
     title = "Does it detect slip, or the motion of the arm?"
     title = title if is_papers else "Scores of each kind of scene"
     figure = style.new_figure(10.5, height, title, simulated=metrics["simulated"])
@@ -842,9 +864,9 @@ def few_events(numbers: Mapping[str, Any]) -> str:
 
 
 def _drawn_events(metrics: _Metrics) -> dict[str, dict[str, Mapping[str, Any]]]:
-    """By role, the rules in words that were evaluated on some recording."""
+    """By role, the rules in words that were evaluated on some slip whose onset is known."""
     drawn = {
-        role: {style.words(rule): own for rule, own in by_rule.items() if own["num_recordings"]}
+        role: {style.words(rule): own for rule, own in by_rule.items() if own["num_onsets"]}
         for role, by_rule in metrics.get("events", {}).items()
     }
     return {role: by_rule for role, by_rule in drawn.items() if by_rule}
@@ -854,12 +876,12 @@ def _drawn_events(metrics: _Metrics) -> dict[str, dict[str, Mapping[str, Any]]]:
 def events_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write slips found by time since the onset, and what became of all, as a PNG.
 
-    A row for each role: to the left the fraction of slips that were found so many ms behind the
-    onset, a line for each rule, of which the latest 5 % may leave the picture; to the right found,
-    early and missed, with the false alarms.
+    A row for each role that has slips: to the left the fraction of slips that were found so many ms
+    behind the onset, a line for each rule, of which the latest 5 % may leave the picture; to the
+    right found, early and missed, with the false alarms.
 
     Args:
-        metrics: the content of ``metrics.json``, with events of some recording.
+        metrics: the content of ``metrics.json``, with events of some slip.
         path: the PNG to write, replaced as a whole if it exists.
     """
     events = _drawn_events(metrics)
@@ -1049,7 +1071,7 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
     title = f"Without slip at most {target:g} false alarms an hour (dashed)"
     height = 2.2 + 0.5 * max(len(alarm["methods"]), len(scenes))
     figure = style.new_figure(12.0, height, title, simulated=metrics["simulated"])
-    left, right = figure.subplots(1, 2)
+    left, *others = figure.subplots(1, 2 if scenes else 1, squeeze=False)[0]
     quiet = {role: _quiet_rates(metrics, role) for role in _STREAMS}
     methods = [name for name in alarm["methods"] if any(name in rates for rates in quiet.values())]
     hours = []
@@ -1060,15 +1082,20 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
         own = [
             by_role[role][alarm["rule"]] if role in by_role else {} for by_role in scenes.values()
         ]
-        _draw_rates(right, [of.get("false_alarms_per_hour") for of in own], aside, colour)
+        for right in others:
+            rates = [of.get("false_alarms_per_hour") for of in own]
+            _draw_rates(right, rates, aside, colour)
     left.set_title(f"Without slip: {' and '.join(hours)}")
     left.axvline(target, color=style.INK, linewidth=1, linestyle="--", zorder=1)
-    right.set_title(f"Confounding scenes, by {style.words(alarm['rule'])} (bars: their budgets)")
     limits = {row["scene"]: row["limit"] for row in alarm["budget"] if not row["is_share"]}
-    for lane, scene in enumerate(scenes):
-        if scene in limits:
-            right.vlines(limits[scene], lane - 0.35, lane + 0.35, color=style.INK, linewidth=1.6)
-    for axes, names in ((left, methods), (right, scenes)):
+    for right in others:
+        title = f"Confounding scenes, by {style.words(alarm['rule'])} (bars: their budgets)"
+        right.set_title(title)
+        for lane, scene in enumerate(scenes):
+            ends = lane - 0.35, lane + 0.35
+            if scene in limits:
+                right.vlines(limits[scene], *ends, color=style.INK, linewidth=1.6)
+    for axes, names in zip([left, *others], [methods, scenes], strict=False):
         style.lanes(axes, list(map(style.words, names)))
         axes.set(
             xscale="log", xlabel="false alarms an hour, with interval (none: at the left edge)"

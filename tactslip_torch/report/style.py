@@ -23,6 +23,9 @@ from tactslip_torch.runtime import whole_file
 
 SIMULATED_LINE = "SIMULATED data: numbers of a simulated hand, not of the paper's"
 
+UNNAMED_SCENE = "unnamed"
+"""The scene of recordings of another hand than the paper's that nothing names."""
+
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 PALETTE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)

@@ -39,9 +39,9 @@ from tactslip_torch.data.formats._reading import (
     Opened,
     Reading,
     Samples,
+    _label_numbers,
     check_plausible,
     header_in,
-    label_numbers,
     needs,
     opened_columns,
     opened_from,
@@ -194,7 +194,7 @@ def _choose(
         if len(words) != length:
             raise Refused(f"has {len(words)} labels for {length} samples; say labels.column")
         assert label is not None  # there are words of it
-        opened = opened._replace(labels=Samples(path, [label_numbers(label, words)]))
+        opened = opened._replace(labels=Samples(path, [_label_numbers(label, words)]))
     rate = near.sample_rate_hz or _single_rate(arrays, near.name)
     beside = tuple(array.name for array in passed if array.length == length)
     return opened._replace(sample_rate_hz=rate, left_out=(*opened.left_out, *beside))

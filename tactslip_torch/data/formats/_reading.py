@@ -568,7 +568,7 @@ def opened_columns(
     return opened._replace(stamps=samples([time]), time_unit=stamps.get(time, unit))
 
 
-def label_numbers(label: LabelColumn, words: Sequence[str | None]) -> NDArray[np.float64]:
+def _label_numbers(label: LabelColumn, words: Sequence[str | None]) -> NDArray[np.float64]:
     """What stands for words of a column of labels, ``[T]``; NaN of empty ones.
 
     Raises:
