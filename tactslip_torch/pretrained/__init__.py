@@ -1,8 +1,8 @@
 """What comes with the package: two small detectors, each with recordings to try it on.
 
 ``paper24-sim`` and its recording are simulated. ``xela-real`` was trained on real recordings of two
-XELA uSkin fingers that pick up and move a box. Their source: github.com/imanlab/proactive-slip-control
-(MIT, ``xela-real.LICENSE``). ``python -m tactslip_torch.pretrained.make`` makes the detectors anew.
+XELA uSkin fingers that pick up and move a box; source: github.com/imanlab/proactive-slip-control,
+MIT (``xela-real.LICENSE``). ``python -m tactslip_torch.pretrained.make`` makes both anew.
 """
 
 from pathlib import Path
