@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 
 import numpy as np
 import pywt
 import torch
 
-from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
 from tactslip_torch.hand import Channel, HandLayout
@@ -190,49 +188,3 @@ def detector_of(name: str, backend: BackendName = "auto") -> SlipDetector:
     )
     info = {"simulated": False, KEY: settings.to_dict()}
     return SlipDetector(pool, channel_filter, selected, scaler, machine, info, backend=backend)
-
-
-class AnyRecordings:
-    """A ``RecordingSource`` of one of ``HANDS``: two slips a recording, louder and smoother.
-
-    Args:
-        hand: which, by name.
-        cycles: recordings of each material.
-        materials: of the recordings.
-        units: of the samples.
-    """
-
-    is_simulated = False
-
-    def __init__(self, hand: str, cycles: int, materials: list[str], units: str = "V", **_: object):
-        self._name, self._hand = hand, HANDS[hand]
-        self.hand, self.sample_rate_hz, self.units = self._hand.layout(), self._hand.rate_hz, units
-        self.ids = tuple(RecordingId(m, c) for m in materials for c in range(cycles))
-
-    def timeline(self, recording: RecordingId) -> SimpleNamespace:
-        bin_s = max(0.3, self._hand.bin_samples / self.sample_rate_hz)
-        onsets = (6 * bin_s, 18 * bin_s)
-        return SimpleNamespace(
-            duration_s=30 * bin_s,
-            onsets_s=onsets,
-            annotated_onsets_s=onsets,
-            sliding_s=tuple((onset, onset + 6 * bin_s) for onset in onsets),
-            speeds_mm_s=(20.0, 40.0),
-            non_slip_s=((bin_s, 5 * bin_s), (14 * bin_s, 17 * bin_s)),
-            slip_s=(),
-            missing_s=(),
-            released_s=(),
-        )
-
-    def key(self, recording: RecordingId) -> dict[str, str]:
-        return {"any hand": self._name, "recording": str(recording)}
-
-    def load(self, recording: RecordingId, windows: object = None) -> Recording:
-        times = self.timeline(recording)
-        num_samples = round(times.duration_s * self.sample_rate_hz)
-        quiet, loud = self._hand.noise(2, num_samples, seed=sum(str(recording).encode()))[0]
-        time_s = torch.arange(num_samples) / self.sample_rate_hz
-        for start, end in times.sliding_s:
-            quiet = torch.where((time_s >= start) & (time_s < end), loud, quiet)
-        truth = times.speeds_mm_s, times.onsets_s, times.sliding_s
-        return Recording(quiet, self.sample_rate_hz, recording.material, *truth, units=self.units)

@@ -21,7 +21,7 @@ OBJECTS = {  # strength of its vibration and the centre of the band, Hz
     "sponge": (0.5, 60.0),
     "can": (1.3, 200.0),
 }
-STATES = ("no slip", "slip")
+STATES = ("stick", "slip")
 _KNOCK = 40  # samples
 _NOISE = 0.25  # of acceleration where nothing happens, beside a band of strength 1
 

@@ -1,6 +1,5 @@
 """Hands of other channels, kinds, rates, bins and wavelets: from noise to an exported detector."""
 
-import json
 from types import SimpleNamespace
 
 import pytest
@@ -9,7 +8,6 @@ from any_hands import HANDS, detector_of
 from oracles import assert_columns_close
 from test_commands import composed
 
-from tactslip_torch.commands.train import train
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.features.pool import is_rounding
 from tactslip_torch.model.detector import SlipDetector
@@ -43,25 +41,6 @@ def test_a_detector_tells_slip_and_comes_back_from_its_file(name, tmp_path):
     assert torch.equal(loaded.score_raw(samples), score)
     loaded.save(again)
     assert again.read_bytes() == one.read_bytes()
-
-
-def test_train_takes_a_hand_from_its_configuration(tmp_path):
-    hand, run = HANDS["five slow"], tmp_path / "run"
-    config = composed(
-        *("data._target_=any_hands.AnyRecordings", "+data.hand=five slow", "+data.units=counts"),
-        *("data.materials=[A,B,C]", "data.cycles=3", "split.seen=[A,B]", "split.unseen=[C]"),
-        *("labels.bin_ms=100", "features.level=null"),
-        *("features.frames.SG=7", "+features.frames.force=null"),
-        *("recipe.num_features=10", "recipe.penalties=[0.1,1.0]"),
-        *("num_workers=0", "cache=off"),
-    )
-    assert train(config, run)["unseen/balanced_accuracy"] > 0.6
-    detector = SlipDetector.load(run / "detector.pt")
-    assert detector.pool.hand == hand.layout()
-    assert detector.pool.config() == hand.pool().config()
-    assert detector.channel_filter.window_lengths == hand.channel_filter().window_lengths
-    assert json.loads((run / "model.onnx.json").read_text())["unit"] == "counts"
-    assert not json.loads((run / "metrics.json").read_text())["is_papers_hand"]
 
 
 # From the configuration ----------------------------------------------------------------------

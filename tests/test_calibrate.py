@@ -59,7 +59,7 @@ def bunched_scores(rng, hours, bunches_per_hour=30.0, mean_size=2.5, spacing_s=8
 # The rate ----------------------------------------------------------------------------------------
 
 
-def broken_promises(*, sees_bunches, per_hour=10.0, num_sets=40):
+def broken_rates(*, sees_bunches, per_hour=10.0, num_sets=40):
     """How often the rate stated on 5 h is exceeded in the other 25 h of the same use."""
     rng, made = np.random.default_rng(3), calibrator(per_hour=per_hour)
     pieces = in_stretches(stream_of(bunched_scores(rng, 30.0)), TIMING, 300)
@@ -76,8 +76,8 @@ def broken_promises(*, sees_bunches, per_hour=10.0, num_sets=40):
 
 
 def test_a_stated_rate_holds_although_false_alarms_come_in_bunches():
-    assert broken_promises(sees_bunches=True) <= 0.05
-    assert broken_promises(sees_bunches=False) > 0.1  # the bunches matter
+    assert broken_rates(sees_bunches=True) <= 0.05
+    assert broken_rates(sees_bunches=False) > 0.1  # the bunches matter
 
 
 @pytest.mark.parametrize("size", [1, 3, 8])
@@ -105,7 +105,11 @@ def test_lost_samples_and_what_has_no_label_are_no_hours_without_slip():
     assert made.hours == pytest.approx(0.5, abs=0.001)
 
 
-@pytest.mark.parametrize(("rule", "offset"), [(KOfN(2, 3), 5.0), (Cusum(0.5, 0.5), 2.0)], ids=str)
+@pytest.mark.parametrize(
+    ("rule", "offset"),
+    [(KOfN(2, 3), 5.0), (Cusum(0.5, 0.5), 2.0), (Cusum(0.5, 0.5, 0.1), 2.0)],  # one set before
+    ids=str,
+)
 def test_every_rule_keeps_the_rate_on_what_it_was_set_on(rule, offset):
     settings = AlarmSettings(
         500, Platt(1.0, offset), rule, 0.0, None, rearm_s=1.0, refractory_s=1.0
@@ -296,10 +300,19 @@ def test_a_mistake_is_one_line_and_nothing_is_written(command, general, tmp_path
     assert not (tmp_path / "run" / names.DETECTOR).exists()
 
 
-def test_recordings_of_the_training_promise_nothing(command, general, recordings, tmp_path):
-    ran = command(tmp_path, "calibrate", *told(general.file, recordings, "data.materials=[A]"))
-    is_left = "use_trained=true" in ran.err or "left out, as the detector was trained" in ran.out
-    assert is_left
+def test_recordings_of_the_training_are_left_out(command, general, recordings, tmp_path):
+    known = set(general.detector.info[names.TRAINING_RECORDINGS].values())
+    printed = command.well(tmp_path, "calibrate", *told(general.file, recordings))
+    report = json.loads((tmp_path / "run" / "calibration.json").read_text())
+    assert f"{len(known)} recordings are left out" in printed
+    used = set(report["recordings"].values())
+    assert used
+    assert not known & used
+    everything = told(general.file, recordings, "use_trained=true")
+    command.well(tmp_path, "calibrate", *everything)
+    report = json.loads((tmp_path / "run" / "calibration.json").read_text())
+    assert report["trained_on"]
+    assert known <= set(report["recordings"].values())
 
 
 def test_a_user_may_say_that_nothing_slips(command, general, tmp_path):

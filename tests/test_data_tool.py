@@ -13,10 +13,17 @@ from test_datasets import HAND, broken, manifest, ours, samples, table
 from tactslip_torch.commands import data
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.folder import guessed, write_template
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.report import style
+from tactslip_torch.signals.filtering import ChannelFilter, frame_lengths
+from tactslip_torch.training.datamodule import FeatureMaker
 
 
 def run(action, root, *overrides):
     """What an action returns."""
+    if action == "check" and not any(one.startswith("output=") for one in overrides):
+        overrides = (*overrides, f"output={root / 'check.png'}")
     config = composed(f"action={action}", f"root={root}", "num_workers=0", *overrides, name="data")
     return data.ACTIONS[action](config)
 
@@ -61,11 +68,10 @@ def test_check_lists_every_problem_and_warning(tmp_path, capsys):
     for line, (place, what) in zip(lines, expected, strict=False):
         assert line.startswith(f"problem: {place}: ")
         assert what in line
-    assert lines[len(expected) :] == [
-        "warning: manifest.csv:2: 0.csv: b never changes, it is 2.5 throughout",
-        "channels: a, b, c",
-        "3 recordings of 2 materials, 9.0 s, 3 channels at 200 Hz in V: 6 problems, 1 warning",
-    ]
+    said = "warning: manifest.csv:2: 0.csv: b never changes, it is 2.5 throughout"
+    assert lines[len(expected) : len(expected) + 2] == [said, "channels: a, b, c"]
+    counts = "6 problems, 1 warning"
+    assert lines[-1] == f"3 recordings of 2 materials, 9.0 s, 3 channels at 200 Hz in V: {counts}"
 
 
 @pytest.mark.parametrize("gaps", ["refuse", "missing"])
@@ -81,6 +87,74 @@ def test_check_and_train_say_the_same_of_samples_that_are_not_finite(tmp_path, c
         with pytest.raises(ValueError, match=r"data\.reading\.gaps=missing") as said:
             FileRecordings(tmp_path)  # as train makes it
         assert line.removeprefix("problem: ") in str(said.value)
+
+
+USES = "file,material,slip_s,non_slip_s,missing_s"
+
+
+def colours(path):
+    """How many pixels of a picture have each of the colours of stretches."""
+    with Image.open(path) as image:
+        counts = {colour: num for num, colour in image.convert("RGB").getcolors(1 << 24)}
+    drawn = [style.VERMILION, style.BLUE, "#D9D9D9", style.INK]
+    return [counts.get(tuple(bytes.fromhex(one[1:])), 0) for one in drawn]
+
+
+def test_check_tells_and_draws_what_training_would_use_of_each_file(tmp_path, capsys):
+    """Bins of 10 samples; 2.00 to 2.01 s is slip in a bin that needs missing samples."""
+    for place in range(3):
+        table(tmp_path / f"{place}.csv", samples(place))
+    lines = "0.csv,wood,1.5-2.5,0-1.02,2.01-2.1", "1.csv,wood,0-end,,", "2.csv,wood,,,"
+    manifest(tmp_path, *lines, columns=USES)
+    assert run("check", tmp_path) == 0
+    out = capsys.readouterr().out
+    rows = {line.split()[0]: line.split()[1:] for line in out.splitlines() if line}
+    assert rows["0.csv"] == ["3.00", "18", "20", "0.98", "0.09", "0.01", "0.02"]
+    assert rows["1.csv"] == ["3.00", "60", "0", "-", "-", "-", "-"]
+    assert rows["2.csv"] == ["3.00", "0", "0", "3.00", "-", "-", "-"]
+    assert rows["all"] == ["3", "9.00", "78", "20", "3.98", "0.09", "0.01", "0.02"]
+    slip, rest, no_label, missing = colours(tmp_path / "check.png")
+    assert slip > 3 * rest > 0  # 3.9 s and 1 s
+    assert no_label > 3 * rest
+    assert 0 < missing < rest
+
+
+def test_check_lays_the_bins_that_training_lays(tmp_path, capsys):
+    """By the same labels and filters: a frame of 21 samples needs 10 more on either side."""
+    names = ("t", *HAND.names)
+    table(tmp_path / "a.csv", samples(0), names=names)
+    manifest(tmp_path, "a.csv,wood,,0-end,1-1.05", columns=USES)
+    frames = "features.frames={SG: 21, PVDF: null}"
+    assert run("check", tmp_path, ROWS, frames, "labels.bin_ms=100", "labels.hop_ms=50") == 0
+    source = FileRecordings(tmp_path, channels=HAND.to_rows())
+    smooth = ChannelFilter(frame_lengths(HAND, {"SG": 21, "PVDF": None}), 1, "centred")
+    rule = LabelRule(bin_ms=100.0, hop_ms=50.0)
+    pool = FeaturePool(HAND, sample_rate_hz=200.0, bin_samples=20, level=1)
+    bins = FeatureMaker(source, pool, smooth, rule).lay_bins(source.timeline(source.ids[0]))
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("a.csv"))
+    assert row.split()[2:4] == ["0", str(len(bins.starts))]
+    assert 50 < len(bins.starts) < 59
+
+
+def test_a_table_and_a_picture_of_many_files_show_the_first(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(data, "_MOST_ROWS", 2)
+    for place in range(4):
+        table(tmp_path / f"{place}.csv", samples(place))
+    whole = [f"{place}.csv,wood,0-end,," for place in (0, 1)]
+    manifest(tmp_path, *whole, "2.csv,wood,,0-end,", "3.csv,wood,,0-end,", columns=USES)
+    assert run("check", tmp_path) == 0
+    out = capsys.readouterr().out
+    assert "all 4, 2 of them not shown" in out
+    assert "1.csv" in out
+    assert "2.csv" not in out
+    assert colours(tmp_path / "check.png")[1] == 0  # no file of non-slip is drawn
+
+
+def test_bins_that_cannot_be_are_told_by_check(tmp_path, capsys):
+    table(tmp_path / "a.csv", samples(0))
+    manifest(tmp_path, "a.csv,wood,0,,,slip")
+    assert run("check", tmp_path, "labels.bin_ms=51") == 0
+    assert "bins: labels.bin_ms=51 is 10.2 samples at 200 Hz; choose" in capsys.readouterr().out
 
 
 def test_a_file_that_is_damaged_in_its_samples_is_a_problem(root, capsys, monkeypatch):

@@ -516,6 +516,7 @@ def kernel_ridge(columns, kinds):
     return lambda hops: torch.from_numpy((0.5 + scaler(hops).numpy() @ z.T) ** 2 @ beta)
 
 
+@pytest.mark.slow
 def test_the_machine_is_kernel_ridge_on_hops_that_a_first_machine_finds_most_like_a_slip():
     source = Bursts(burst=2.0)
     classifier, left_out, counts = fitted(source)

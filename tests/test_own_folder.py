@@ -107,7 +107,7 @@ def test_the_detector_of_a_folder_is_trained_on_all_and_reads_as_in_training(
     ran = command(tmp_path, "detect", str(new), "model=run/detector.pt", "threshold=0")
     assert ran.status == 2  # its column of times is called otherwise than in training
     assert "time" in ran.err
-    words = ["reading.time=seconds", "threshold=0", "figure=false"]
+    words = ["reading.time=seconds", "threshold=0", "figure=none"]
     ran = command(tmp_path, "detect", str(new), "model=run/detector.pt", *words)
     assert "note: reading.time=seconds; in training it was time" in ran.err
 

@@ -213,6 +213,17 @@ def test_a_table_of_intervals_becomes_a_manifest(tmp_path):
     assert propose(look(tmp_path)).manifest == ()  # one that is there is kept
 
 
+def test_files_that_are_no_recordings_are_told_and_do_not_change_how_names_are_read(tmp_path):
+    for name in ("cup_1", "cup_2", "box_1", "box_2"):
+        write(tmp_path / f"{name}.csv", ["a", "b"], slip=[0] * 200 + [1] * 200)
+    (tmp_path / "notes.csv").write_text("who,what\nme,nothing\n")
+    write(tmp_path / "temperature_of_the_day.csv", ["t1"])
+    proposal = propose(look(tmp_path))
+    assert proposal.settings["data"]["pattern"] == "{material}_{trial}"
+    told = [finding.value for finding in proposal.findings if finding.what == "look"]
+    assert [text.split()[0] for text in told] == ["notes.csv", "temperature_of_the_day.csv"]
+
+
 def test_columns_that_are_no_channels_are_told_with_the_reason(tmp_path):
     words = np.repeat(["no slip", "slip"], 200).tolist()
     counts = range(400)
@@ -281,7 +292,7 @@ def test_hand_yaml_says_what_was_proposed_and_why(typed, gripper, drawn):
         "acc: 3 channels, fast",
     ]
     legend = {text.get_text() for text in figure.legends[0].get_texts()}
-    assert "missing" in " ".join(legend)
+    assert {"slip", "non-slip"} < legend
     status, _, err = typed(setup, gripper, "--yes")
     assert status == 2
     assert "hand.yaml is there already; --force replaces it" in err

@@ -161,7 +161,7 @@ def _labelled(
     if not found:
         remedy = "label them, or say slip_free=true"
         if trained:
-            remedy = "record others, or say use_trained=true, with which no rate is promised"
+            remedy = "record others, or say use_trained=true, with which the stated rate is too low"
         raise ValueError(f"no recording is left to calibrate on: {remedy}")
     return found
 
@@ -313,7 +313,8 @@ def _histogram(recordings: Sequence[ScoredRecording]) -> dict[str, Any]:
     """Counts of the scores of bins by kind."""
     scores = np.concatenate([one.bins.numpy() for one in recordings])
     is_slip = np.concatenate([one.is_slip.numpy() for one in recordings])
-    edges = np.histogram_bin_edges(scores, _NUM_CELLS, np.quantile(scores, (0.002, 0.998)))
+    ends = [np.quantile(scores[of], (0.005, 0.995)) for of in (is_slip, ~is_slip)]
+    edges = np.linspace(np.min(ends), np.max(ends), _NUM_CELLS + 1)
     counts = {
         name: np.histogram(np.clip(scores[of], edges[0], edges[-1]), edges)[0].tolist()
         for name, of in (("slip", is_slip), ("other", ~is_slip))

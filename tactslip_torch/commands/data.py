@@ -1,9 +1,10 @@
 """Sets of recordings in files: ``python -m tactslip_torch data action=check root=FOLDER``.
 
-``check`` lists every problem and everything worth a look, with file and line; exit status 2 where
-there is a problem. ``summary`` prints what there is and draws it. ``convert to=h5 output=FOLDER``
-writes the set in another format; what was finished before is kept. ``label_template`` writes a
-manifest to fill in. ``data=authors_raw`` does the first three for the authors' own files.
+``check`` lists every problem and everything worth a look, with file and line, and shows what
+training would use of each file, and for what; exit status 2 where there is a problem. ``summary``
+prints what there is and draws it. ``convert to=h5 output=FOLDER`` writes the set in another format;
+what was finished before is kept. ``label_template`` writes a manifest to fill in.
+``data=authors_raw`` does the first three for the authors' own files.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from hydra.utils import get_object, instantiate
 from numpy.typing import NDArray
 from omegaconf import DictConfig
@@ -24,8 +25,9 @@ from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.commands.stopping import fail, one_line
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest, write_template
+from tactslip_torch.data.labels import LabelledBins, LabelRule, bins_of, whole_samples
 from tactslip_torch.data.manifest import Problem
-from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.data.recording import Recording, RecordingId, Timeline
 from tactslip_torch.features.sensing import level_message, level_ratio
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import score_stream
@@ -33,21 +35,24 @@ from tactslip_torch.report.recordings import (
     dataset_figure,
     ranges_table,
     trials_table,
+    use_figure,
+    use_table,
     written_table,
 )
 from tactslip_torch.report.style import SIMULATED_LINE
 from tactslip_torch.runtime import __version__, in_processes
+from tactslip_torch.signals.filtering import ChannelFilter, frame_lengths
 
 _FIGURE = Path("outputs/data.png")
 _SHOWN = 5  # rows of a template
 _LEVELS_S = 30.0  # of a recording, from which levels are taken
-_BEFORE_ONSET_S = 1.01  # that the labels of train take as non-slip, by default
-_CONTEXT = 25  # samples that the longest filter reads on either side of a bin
-_BIN_MS, _FEWEST = 50.0, 8  # the bin that train takes by default, and samples it should have
+_FEWEST = 8  # samples that a bin should have
+_CHECK = Path("outputs/check.png")
+_MOST_ROWS = 60  # of a table or picture of recordings
 
 
 def check(config: DictConfig) -> int:
-    """Print every problem and warning of a set; how many problems there are.
+    """Print every problem and warning, and what training would use; how many problems there are.
 
     Raises:
         ValueError: if the set cannot be looked at at all.
@@ -61,7 +66,6 @@ def check(config: DictConfig) -> int:
             if isinstance(found, str):
                 problems.append(entry.problem(found))
             else:
-                problems += map(entry.problem, found.problems)
                 warnings += map(entry.problem, found.warnings)
     if config.model is not None and source.ids:
         warnings += _levels(config, source)
@@ -69,12 +73,7 @@ def check(config: DictConfig) -> int:
         print(line)
     if source.ids:
         print(f"channels: {', '.join(source.hand.names)}")
-        if (num := source.sample_rate_hz * _BIN_MS / 1000) < _FEWEST:
-            least_ms = math.ceil(1000 * _FEWEST / source.sample_rate_hz)
-            print(
-                f"bins: {_BIN_MS:g} ms are {num:g} samples at {source.sample_rate_hz:g} Hz, fewer "
-                f"than {_FEWEST}; train with labels.bin_ms={least_ms} or more"
-            )
+        _show_use(config, source)
     print(_headline(source, problems, warnings))
     return len(problems)
 
@@ -190,36 +189,17 @@ class _Inspected(NamedTuple):
 
     Args:
         ranges: ``[C, 2]``, least and greatest of each channel; NaN if none is finite.
-        problems: why ``train`` refuses it.
         warnings: what is worth a look.
     """
 
     ranges: NDArray[np.float64]
-    problems: list[str]
     warnings: list[str]
 
 
 def _inspected(source: FileRecordings, recording: RecordingId) -> _Inspected:
-    samples, times = source.load(recording).samples.double(), source.timeline(recording)
-    rate_hz = source.sample_rate_hz
-    is_there = torch.ones(samples.shape[-1], dtype=torch.bool)
-    is_needed = ~is_there  # by bins
-    for start_s, end_s in times.missing_s:
-        is_there[round(start_s * rate_hz) : round(end_s * rate_hz)] = False
-    before = [(onset - _BEFORE_ONSET_S, onset) for onset in times.annotated_onsets_s]
-    for start_s, end_s in (*before, *times.sliding_s, *times.slip_s, *times.non_slip_s):
-        first = max(round(start_s * rate_hz) - _CONTEXT, 0)
-        is_needed[first : round(end_s * rate_hz) + _CONTEXT] = True
-    found = _Inspected(np.full((len(samples), 2), np.nan), [], [])
+    samples = source.load(recording).samples.double()
+    found = _Inspected(np.full((len(samples), 2), np.nan), [])
     for row, name, ends in zip(samples, source.hand.names, found.ranges, strict=True):
-        is_broken = ~row.isfinite() & is_there
-        if is_broken.any():
-            first_s = int(is_broken.int().argmax()) / rate_hz
-            is_refused = bool((is_broken & is_needed).any())
-            (found.problems if is_refused else found.warnings).append(
-                f"{name} is not finite in {int(is_broken.sum())} samples, first at {first_s:.4f} "
-                "s; leave the stretch out as missing_s, or repair it"
-            )
         if len(finite := row[row.isfinite()]):
             ends[:] = finite.min(), finite.max()
             if ends[0] == ends[1]:
@@ -240,6 +220,114 @@ def _inspect_all(
 
     found = in_processes(one, source.ids, "reading samples", "recording", config.num_workers)
     return list(zip(source.ids, found, strict=True))
+
+
+# What training would use -------------------------------------------------------------------------
+
+
+class _Use(NamedTuple):
+    """What of a recording training would use.
+
+    Args:
+        num_slip: bins.
+        num_rest: bins of non-slip.
+        left_s: seconds in no bin, by the reason.
+        spans: start and end in seconds of the stretches of each kind, ``SPAN_KINDS`` of the report.
+    """
+
+    num_slip: int
+    num_rest: int
+    left_s: dict[str, float]
+    spans: dict[str, list[tuple[float, float]]]
+
+
+def _show_use(config: DictConfig, source: FileRecordings) -> None:
+    """Print what of each file training would use, and draw it."""
+    rule: LabelRule = instantiate(config.labels, _convert_="all")
+    rate_hz = source.sample_rate_hz
+    try:
+        num = whole_samples(rule.bin_ms, rate_hz, "labels.bin_ms")
+        if rule.hop_ms is not None:
+            whole_samples(rule.hop_ms, rate_hz, "labels.hop_ms")
+    except ValueError as error:
+        print(f"bins: {error}")
+        return
+    if num < _FEWEST:
+        least_ms = math.ceil(1000 * _FEWEST / rate_hz)
+        print(
+            f"bins: {rule.bin_ms:g} ms are {num:g} samples at {rate_hz:g} Hz, fewer than "
+            f"{_FEWEST}; train with labels.bin_ms={least_ms} or more"
+        )
+    frames = {kind: config.features.frames.get(kind) for kind in source.hand.kinds}
+    smooth = ChannelFilter(
+        frame_lengths(source.hand, frames), config.features.polyorder, config.features.align
+    )
+    before, after = (max(reach) for reach in zip(*smooth.reaches, strict=True))
+    rows: list[dict[str, Any]] = []
+    for recording in source.ids:
+        times = source.timeline(recording)
+        try:
+            use = _use_of(rule, times, rate_hz, before, after)
+        except ValueError as error:
+            print(f"bins: {source.entry(recording).problem(one_line(error))}")
+            return
+        file = source.entry(recording).file
+        rows.append({"file": file, "duration_s": times.duration_s, **use._asdict()})
+    print("\n" + use_table(rows, _MOST_ROWS))
+    path = _CHECK if config.output is None else Path(str(config.output))
+    what = "SIMULATED recordings" if source.is_simulated else "Recordings"
+    title = f"{what} in {source.root.resolve().name}: what training would use"
+    use_figure(rows[:_MOST_ROWS], len(rows), path, title=title)
+    print(f"\npicture in {path}")
+
+
+def _use_of(rule: LabelRule, times: Timeline, rate_hz: float, before: int, after: int) -> _Use:
+    """What training would use of a recording, by its labels and what is missing."""
+    num_samples = round(times.duration_s * rate_hz)
+    whole = replace(times, missing_s=())
+    one = replace(rule, assign="last", bin_ms=1000 / rate_hz, hop_ms=None)  # sample by sample
+    labelled = bins_of(one, whole, rate_hz, 0, 0)
+    state = np.full(num_samples, -1)
+    state[labelled.starts.numpy()] = labelled.is_slip.numpy()
+    is_missing = np.zeros(num_samples, dtype=bool)
+    for start_s, end_s in times.missing_s:
+        is_missing[round(start_s * rate_hz) : round(end_s * rate_hz)] = True
+
+    def covered(bins: LabelledBins) -> NDArray[np.bool_]:
+        is_in = np.zeros(num_samples, dtype=bool)
+        is_in[bins.starts.numpy()[:, None] + np.arange(bins.bin_samples)] = True
+        return is_in
+
+    bins = bins_of(rule, times, rate_hz, before, after)
+    is_used, would_be = covered(bins), covered(bins_of(rule, whole, rate_hz, before, after))
+    is_left, is_labelled = ~is_used & ~is_missing, state >= 0
+    reasons = {
+        "not labelled": is_left & ~is_labelled,
+        "missing": is_missing,
+        "next to missing": is_left & is_labelled & would_be,
+        "no whole bin": is_left & is_labelled & ~would_be,
+    }
+    kinds = {
+        "slip": is_used & (state == 1),
+        "slip, left out": is_left & (state == 1),
+        "non-slip": is_used & (state == 0),
+        "non-slip, left out": is_left & (state == 0),
+        "not labelled": ~is_missing & ~is_labelled,
+        "missing": is_missing,
+    }
+    num_slip = int(bins.is_slip.sum())
+    return _Use(
+        num_slip,
+        len(bins.starts) - num_slip,
+        {reason: int(mask.sum()) / rate_hz for reason, mask in reasons.items()},
+        {kind: _spans(mask, rate_hz) for kind, mask in kinds.items()},
+    )
+
+
+def _spans(mask: NDArray[np.bool_], rate_hz: float) -> list[tuple[float, float]]:
+    """Start and end of the true stretches, in seconds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]))) / rate_hz
+    return [(float(start), float(end)) for start, end in edges.reshape(-1, 2)]
 
 
 def _levels(config: DictConfig, source: FileRecordings) -> list[Problem]:

@@ -25,7 +25,7 @@ _SECTIONS = {
     "pareto": OF_HAND,
     "evaluate": ("data", "labels"),
     "calibrate": ("data", "labels"),
-    "data": ("data", "labels"),
+    "data": ("data", "labels", "features"),
 }
 """Of each command that takes a folder, the sections of ``hand.yaml`` that it has."""
 _PLACES = {"detect": "input", "stream": "source"}

@@ -81,6 +81,8 @@ def _answered(answers: Answers, question: Question, answer: str) -> Answers:
         return replace(answers, words={**answers.words, **words})
     if question.name == "pattern":
         return replace(answers, pattern=answer)
+    if question.name == "column":
+        return replace(answers, column=answer)
     number = _number(answer, question.flag)
     return (
         replace(answers, rate_hz=number)
@@ -122,12 +124,12 @@ def _lines(settings: Mapping[str, Any], place: str, reasons: Mapping[str, str]) 
             found += [f"{indent}{name}:", *_lines(value, key, reasons)]
         elif key == "data.channels":
             found.append(f"{indent}{name}:   # {reason}")
-            last = ""
+            told: set[str] = set()
             for row in value:
                 kind = row["kind"]
-                why = f"   # {reasons[f'kind.{kind}']}" if kind != last else ""
+                why = "" if kind in told else f"   # {reasons[f'kind.{kind}']}"
                 found.append(f"{indent}  - {_flow(row)}{why}")
-                last = kind
+                told.add(kind)
         else:
             line = f"{indent}{name}: {_flow(value)}"
             if len(line) + len(reason) + 5 <= _WIDTH:
@@ -188,7 +190,7 @@ def _source(folder: Path, proposal: Proposal) -> FileRecordings:
     """
     from tactslip_torch.data.file_recordings import FileRecordings
     from tactslip_torch.data.folder import guessed
-    from tactslip_torch.data.labels import label_of
+    from tactslip_torch.data.labels import LabelRule, label_of
     from tactslip_torch.data.manifest import MANIFEST, Entry, Listing, read_manifest
     from tactslip_torch.data.recording import RecordingId, Timeline
 
@@ -201,7 +203,8 @@ def _source(folder: Path, proposal: Proposal) -> FileRecordings:
         label = label_of(words.get(guessed(file, pattern).get("label", ""), ""))
         truth = Timeline(label=label) if label else None
         entries = (Entry(file, file, RecordingId(file, 0), truth),)
-    return FileRecordings(folder, manifest=Listing(entries), **data)
+    rule = LabelRule(**proposal.settings["labels"])
+    return FileRecordings(folder, manifest=Listing(entries), label_rule=rule, **data)
 
 
 def main() -> None:

@@ -92,7 +92,7 @@ def name_pattern(files: Sequence[str], label_words: Sequence[str] = ()) -> NameP
             is the label.
 
     Example:
-        >>> objects = ("soup_can", "tea_can")
+        >>> objects = ("soup_can", "cup")
         >>> files = [f"{name}_{side}_{n}.csv" for name in objects for side in "AB" for n in "12"]
         >>> name_pattern(files).pattern
         '{material}_{scene:A|B}_{trial}'
@@ -226,7 +226,8 @@ def _fields(parts: Sequence[_Part], label_words: set[str]) -> dict[int, str]:
         [p for p in repeated if parts[p].kind == "date" or before(p) in _SESSIONS],
     )
     words = [p for p in free() if parts[p].is_repeated and parts[p].kind in ("word", "text")]
-    take("material", sorted(words, key=lambda place: -len(parts[place].counts)))
+    most = sorted(words, key=lambda p: (-len(parts[p].counts), -parts[p].segment))  # names first
+    take("material", most)
     take("material", [p for p in free() if parts[p].is_repeated and before(p) in _OBJECTS])
     take("scene", [p for p in free() if p in words and len(parts[p].counts) <= _MOST_SCENES])
     take("trial", [p for p in reversed(free()) if parts[p].kind == "number"])

@@ -31,17 +31,19 @@ from tactslip_torch.data.formats._inference import (
     cells_of,
     is_time,
     no_channels,
+    seconds_and_nanoseconds,
     text_layout,
     time_unit_in,
     without_comment,
 )
+from tactslip_torch.data.formats._reading import FORM
 from tactslip_torch.data.formats._text import _opened_text
 from tactslip_torch.data.labels import label_of
 from tactslip_torch.data.manifest import MANIFEST, Entry, read_manifest
 from tactslip_torch.signals.wavelet import highest_level
 
 _Numbers = NDArray[np.float64]
-_MOST_FILES = 40  # that are read
+_MOST_FILES = 24  # that are read
 _MOST_BYTES = 200e6  # of files that are read, beside the first three
 _HEAD = 2**16  # characters that show the layout of a text
 _SAME_RATE = 0.01  # rates of files that differ by less are one
@@ -51,6 +53,7 @@ _BIN_S, _LEAST_BIN, _MOST_BIN = 0.05, 32, 1024
 _FRAMES_S: Mapping[str, float] = {"slow": 0.0255, "fast": 0.0055}
 _LEAST_FRAME = 5
 _MOST_STATES = 12  # different numbers of a column of labels; more are a speed or the like
+_MOST_TOLD = 5
 _FOLDS, _FEWEST_GROUPS = 10, 3
 _SLIP_NAMES = re.compile(r"slip|slid", re.IGNORECASE)
 _LABEL_NAMES = re.compile(
@@ -177,21 +180,21 @@ class Look:
 
     Args:
         folder: the set.
-        files: all of them, relative to it.
+        files: all of them, relative to it, but for those that were read and are not like others.
         tables: those that were read.
         intervals: a table of when slip is, if there is one, with its rows.
-        problems: why files could not be read, each a line.
+        problems: by file, why it is not like the others.
     """
 
     folder: Path
     files: tuple[str, ...]
     tables: tuple[_Table, ...]
     intervals: tuple[str, tuple[Mapping[str, str], ...]] | None = None
-    problems: tuple[str, ...] = ()
+    problems: Mapping[str, str] = field(default_factory=dict)
 
 
 def look(folder: Path, answers: Answers | None = None) -> Look:
-    """Read some of the recordings of a folder and of its folders, evenly chosen, at most 40.
+    """Read some of the recordings of a folder and of its folders, evenly chosen, at most 24.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -204,7 +207,7 @@ def look(folder: Path, answers: Answers | None = None) -> Look:
     if intervals is not None:
         paths = [path for path in paths if path.relative_to(folder).as_posix() != intervals[0]]
     tables: list[_Table] = []
-    problems: list[str] = []
+    problems: dict[str, str] = {}
     num_bytes = 0
     places = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _MOST_FILES)).astype(int))
     for place in places:
@@ -215,14 +218,17 @@ def look(folder: Path, answers: Answers | None = None) -> Look:
         try:
             tables.append(_table_of(folder, path, answers or Answers()))
         except (ValueError, OSError) as error:
-            problems.append(str(error).replace(f"{folder}/", ""))
+            file = path.relative_to(folder).as_posix()
+            problems[file] = str(error).removeprefix(str(path)).lstrip(": ")
     if not tables:
-        raise ValueError(problems[0])
+        raise ValueError(f"{paths[0]} {next(iter(problems.values()))}")
     common = Counter(table.names for table in tables).most_common(1)[0][0]
     alike = tuple(table for table in tables if table.names == common)
-    problems += [f"{t.file} has other columns" for t in tables if t.names != common]
-    files = tuple(path.relative_to(folder).as_posix() for path in paths)
-    return Look(folder, files, alike, intervals, tuple(problems))
+    problems |= {t.file: "has other columns" for t in tables if t.names != common}
+    files = (path.relative_to(folder).as_posix() for path in paths)
+    return Look(
+        folder, tuple(file for file in files if file not in problems), alike, intervals, problems
+    )
 
 
 def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
@@ -232,14 +238,18 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
     how = Reading(time=answers.time or "auto", time_unit=answers.time_unit)
     form = find_format(path)
     is_text = form is not None and form.name == "text"
-    if is_text and form is not None and not form.is_native(path):
+    if is_text and not _is_of_package(path):
         names, cells, delimiter = _cells(path)
         words = {
             name: column
             for name, column in zip(names, cells, strict=True)
             if any(cell and not NUMBER.fullmatch(cell.replace(",", ".")) for cell in set(column))
         }
-        numbers = [name for name in names if name not in words]
+        texts = list(map(str, names))
+        of_time = {names[place] for place in seconds_and_nanoseconds(texts) or ()}
+        of_time |= {name for name in words if is_time(str(name))}  # dates
+        numbers = [name for name in names if name not in {*words, *of_time}]
+        words = {name: column for name, column in words.items() if name not in of_time}
         how = replace(how, channels=numbers)
         if names[0] == 0:  # without names
             how = replace(how, time=answers.time)
@@ -247,8 +257,8 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
         if opened.archived is None and not is_text and opened.left_out and opened.names:
             labels = [n for n in opened.left_out if _SLIP_NAMES.search(n) or _LABEL_NAMES.search(n)]
             with open_file(path, replace(how, channels=(*opened.names, *labels))) as wider:
-                return _read(folder, path, wider, words, delimiter)
-        return _read(folder, path, opened, words, delimiter)
+                return _read(folder, path, wider, words, delimiter, answers.time)
+        return _read(folder, path, opened, words, delimiter, answers.time)
 
 
 def _read(
@@ -257,7 +267,9 @@ def _read(
     opened: Opened,
     words: Mapping[str | int, Sequence[str]],
     delimiter: str | None,
+    time: str | int | None,
 ) -> _Table:
+    """What an open file holds; ``time`` is the column of times, if it is stated."""
     file = path.relative_to(folder).as_posix()
     own = opened.archived
     values = opened.samples.read(0, opened.samples.num_samples).double().numpy()
@@ -266,8 +278,8 @@ def _read(
     else:
         names = opened.names or range(len(values))
     samples = dict(zip(names, values, strict=True))
-    time: str | int | None = None
-    time = next((name for name in names if isinstance(name, str) and is_time(name)), None)
+    if time not in names:
+        time = next((name for name in names if isinstance(name, str) and is_time(name)), None)
     times = opened.times()
     rate_hz = own.recording.sample_rate_hz if own else opened.sample_rate_hz
     unit = opened.time_unit
@@ -281,6 +293,13 @@ def _read(
     return _Table(
         file, kept, samples, words, times, time, unit, rate_hz, delimiter, own is not None
     )
+
+
+def _is_of_package(path: Path) -> bool:
+    """Whether a text begins as those that this package writes."""
+    mark = f"# {FORM[:-1]}".encode()
+    with path.open("rb") as file:
+        return file.read(len(mark)) == mark
 
 
 def _cells(path: Path) -> tuple[list[str | int], list[list[str]], str]:
@@ -430,9 +449,9 @@ def propose(found: Look, answers: Answers | None = None) -> Proposal:
     first = found.tables[0]
     endings = Counter(Path(file).suffix for file in found.files)
     reason = f"{len(found.tables)} of them were read"
-    if found.problems:
-        reason += f"; not like the others: {'; '.join(found.problems[:3])}"
     draft.tell("recordings", f"{len(found.files)} ({', '.join(endings)})", reason)
+    for file, problem in list(found.problems.items())[:_MOST_TOLD]:
+        draft.tell("look", f"{file} {problem}", "move it away if it is no recording")
     rate_hz = _propose_rate(found, given, draft)
     label = _label_column(found, given)
     channels = _channels(found, label, draft)
@@ -483,10 +502,12 @@ def _propose_rate(found: Look, given: Answers, draft: _Draft) -> float:
     has_times = table.times_s is not None and not wrong
     if has_times and table.time is not None:
         name = table.time
-        draft.set(f"{reading}.time", name, "the column of times, by its name")
+        draft.set(f"{reading}.time", name, "the column of times")
         if table.time_unit is not None:
             draft.set(f"{reading}.time_unit", table.time_unit, "of the times")
-            draft.tell("time", f"column {name} in {table.time_unit}", "by its name")
+        unit = f" in {table.time_unit}" if table.time_unit else ""
+        how = "stated" if given.time else "by its name" if is_time(str(name)) else "it rises evenly"
+        draft.tell("time", f"column {name}{unit}", how)
     elif table.times_s is None and not table.rate_hz:
         draft.set(f"{reading}.time", None, "the files have no times")
     if not has_times:
@@ -506,6 +527,8 @@ def _propose_rate(found: Look, given: Answers, draft: _Draft) -> float:
         return rate_hz
     common = float(np.median(rates))
     off = max(abs(rate / common - 1) for rate in rates)
+    if given.rate_hz:
+        off = max(off, abs(given.rate_hz / common - 1))
     if off > _SAME_RATE:
         each = sorted({nominal_rate(rate, _SAME_RATE) for rate in rates})
         rate_hz = given.rate_hz or each[-1]
@@ -683,10 +706,6 @@ def _propose_kinds(
     ]
     reason = "kinds by the names" if stems else "kinds by the spectrum; names do not tell any"
     draft.set("data.channels", rows, f"{reason}. Fast: more than half of the variance above 5 Hz")
-    if isinstance(channels[0], int):
-        draft.set(
-            "data.reading.channels", list(channels), "columns have no names; by number from 0"
-        )
     return adapting
 
 
@@ -833,7 +852,7 @@ def _propose_label_column(
         slips = [word for word, is_slip in known.items() if is_slip]
         if given.words and not unknown:
             draft.set("labels.slip", slips, "words of that column that mean slip; others do not")
-        value = f"column {label.name}: {', '.join(slips) or '?'} is slip"
+        value = f"column {label.name}, slip where it says {' or '.join(slips) or '?'}"
         draft.tell("labels", value, label.reason)
         for table in found.tables:
             words = set(filter(None, table.words.get(label.name, ())))
@@ -859,7 +878,7 @@ def _propose_label_column(
     unit = next((unit for end, unit in _SPEED_UNITS.items() if lower.endswith(end)), None)
     if unit is not None and len(numbers) > _MOST_STATES:
         draft.set("labels.unit", unit, "of that column, a speed")
-    draft.tell("labels", f"column {label.name} above {over:g} is slip", label.reason)
+    draft.tell("labels", f"column {label.name}, slip above {over:g}", label.reason)
     for table in found.tables:
         values_of = table.samples[label.name]
         states = np.unique(np.abs(values_of[np.isfinite(values_of)]) > over)
@@ -902,11 +921,17 @@ def _words_of_names(files: Sequence[str], given: Answers, draft: _Draft) -> dict
             f"no part of all names holds the words {', '.join(given.words)}; names tell apart "
             f"{' or '.join('|'.join(words) for words in choices) or 'nothing'}"
         )
+    if not choices:
+        text = (
+            "Nothing tells where slip is: no column, no table of intervals (a CSV with the columns "
+            "file, start and end), no words in names. Which column says it?"
+        )
+        draft.questions.append(Question("column", text, "--column NAME"))
+        return {}
     listed = "; or ".join(", ".join(words[:12]) for words in choices)
     text = (
         "Nothing tells which recordings slip. Which word in the names of files or folders, or "
-        "which words with commas between, mean that nothing slips?"
-        + (f" They have {listed}" if listed else "")
+        f"which words with commas between, mean that nothing slips? They have {listed}"
     )
     draft.questions.append(Question("non_slip", text, "--non-slip WORD, or --column NAME"))
     return {}
@@ -964,7 +989,7 @@ def _propose_split(
             if (value := fields.get(file, {}).get(name)) is not None:
                 groups[value] |= known
         num = sum(states == {True, False} for states in groups.values())
-        is_grouped = len(groups) < len(fields)
+        is_grouped = len({known.get(name) for known in fields.values()}) < len(fields)
         if num >= _FEWEST_GROUPS and is_grouped:
             by = name
             break

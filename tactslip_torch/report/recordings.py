@@ -146,6 +146,76 @@ def ranges_table(channels: Channels, ranges: Array, units: str) -> str:
     return style.table(rows)
 
 
+_USES = {
+    "slip": style.VERMILION,
+    "slip, left out": "#F2BFA0",
+    "non-slip": style.BLUE,
+    "non-slip, left out": "#A6CBE3",
+    "not labelled": _UNKNOWN,
+    "missing": style.INK,
+}
+"""What training may make of a stretch of a recording, and its colour."""
+
+
+def use_table(rows: Rows, most: int) -> str:
+    """What training would use of each file, and the seconds that are left out, by the reason.
+
+    Args:
+        rows: of each recording its ``file``, ``duration_s``, ``num_slip`` and ``num_rest`` bins,
+            and ``left_s`` by the reason.
+        most: rows to show; the last is the sum of all.
+    """
+
+    def cells(file: str, group: Rows) -> dict[str, object]:
+        left = {reason: sum(row["left_s"][reason] for row in group) for reason in rows[0]["left_s"]}
+        return {
+            "file": file,
+            "seconds": f"{sum(row['duration_s'] for row in group):.2f}",
+            "slip bins": sum(row["num_slip"] for row in group),
+            "non-slip bins": sum(row["num_rest"] for row in group),
+            **{
+                f"{reason} s": f"{seconds:.2f}" if seconds else "-"
+                for reason, seconds in left.items()
+            },
+        }
+
+    table = [cells(row["file"], [row]) for row in rows[:most]]
+    more = f", {len(rows) - most} of them not shown" if len(rows) > most else ""
+    table.append(cells(f"all {len(rows)}{more}", rows))
+    return style.table(table)
+
+
+@style.styled
+def use_figure(rows: Rows, num_all: int, path: str | Path, *, title: str) -> None:
+    """Write a lane for each file: what of it is slip, non-slip, not labelled or missing over time.
+
+    What is labelled and in no bin is paler.
+
+    Args:
+        rows: at least one, as ``use_table`` takes them, and ``spans`` in seconds by what they are.
+        num_all: recordings there are; the title says if more than are drawn.
+        path: the PNG to write, replaced as a whole if it exists.
+        title: of the figure; says what is simulated.
+    """
+    some = f" (the first {len(rows)} of {num_all} files)" if num_all > len(rows) else ""
+    figure = style.new_figure(10.0, 0.19 * len(rows) + 1.6, title + some)
+    axes = figure.subplots()
+    for lane, row in enumerate(rows):
+        for kind, colour in _USES.items():
+            bars = [(start, end - start) for start, end in row["spans"][kind]]
+            axes.broken_barh(bars, (lane - 0.36, 0.72), facecolors=colour, linewidth=0)
+        text = f"  {row['num_slip']} slip, {row['num_rest']} non-slip bins"
+        axes.text(row["duration_s"], lane, text, va="center", fontsize=6.5, color=style.GREY)
+    style.lanes(axes, [row["file"] for row in rows], least=2)
+    axes.tick_params(axis="y", labelsize=6.5)
+    axes.set_xlim(0.0, 1.25 * max(row["duration_s"] for row in rows))
+    axes.set_xlabel("time, s")
+    drawn = {kind for row in rows for kind, spans in row["spans"].items() if spans}
+    handles = [Patch(color=colour, label=kind) for kind, colour in _USES.items() if kind in drawn]
+    style.legend_below(figure, handles, len(handles))
+    style.save(figure, path, dpi=120)
+
+
 @style.styled
 def dataset_figure(
     trials: Rows,

@@ -44,7 +44,7 @@ SLIP_FREE = "without slip"
 _FEWEST_ALARMS = 20  # by which bunches are seen
 _LEVELS = (1, 2, 4, 8)  # times as many: lower thresholds
 _BLOCKS = (12, 24, 48)  # of equal time
-_MARGIN = 1.25  # by which stated rates hold in 95 % of the sets of benchmarks.promises
+_MARGIN = 1.25  # by which stated rates hold in 95 % of the sets of benchmarks.stated_rates
 _NUM_FOLDS = 10
 _FEWEST_GROUPS = 3
 
@@ -138,6 +138,7 @@ class Calibrator:
             rate_hz,
             times.non_slip_s,
             times.slip_s,
+            times.unlabelled_s,
         )
         place = laid.starts // self.timing.hop_samples
         is_there = place < len(stream.score)

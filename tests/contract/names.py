@@ -28,7 +28,6 @@ BACKENDS = ("torch", "auto")
 BATCH_FIT = "examples/batch_fit.py"
 """In the place of the command ``stats`` of 0.1.0."""
 BAD_INPUT_STATUS = 2
-TRACEBACK_VARIABLE = "TACTSLIP_TRACEBACK"
 
 # Configuration ---------------------------------------------------------------------------------
 
@@ -87,7 +86,6 @@ TRAIN, TEST, HELD_OUT = "train", "test", "unseen"
 SPLITS = "splits"
 CONFUSION = "confusion"
 FIT_FACTS = ("selected", "penalty", "kernel", "solve", "validation", "num_bins")
-ALARM_INFO = "alarm"  # in the detector's info
 TRAINING_RECORDINGS = "train_recordings"  # in the detector's info
 
 STREAM_OUTPUTS = {

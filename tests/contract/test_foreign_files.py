@@ -274,3 +274,73 @@ def test_a_header_that_lacks_a_part_is_damaged(tmp_path):
         changed = json.dumps({key: value for key, value in header.items() if key != name})
         path.write_text(f"# {FORM} {changed}\n{rest}")
         assert is_read(path) == (name in later), name
+
+
+# How people call and write times: header, the time at sample n, and the rate
+
+MS = 1_700_000_000_000  # since 1970
+STAMPS = {
+    "Time (sec),a": (lambda n: f"{n * 0.01:.2f}", 100.0),
+    "time [s],a": (lambda n: f"{n * 0.01:.2f}", 100.0),
+    "Timestamp (\N{MICRO SIGN}s),a": (lambda n: f"{n * 500}", 2000.0),
+    "Timestamp (\N{GREEK SMALL LETTER MU}s),a": (lambda n: f"{n * 500}", 2000.0),
+    "millis,a": (lambda n: f"{n * 4}", 250.0),
+    "t_us,a": (lambda n: f"{n * 1000}", 1000.0),
+    "timestamp,a": (lambda n: f"{MS + 10 * n}", 100.0),  # the size tells the unit
+    "%time,a": (lambda n: f"{(MS + 10 * n) * 10**6}", 100.0),
+    "Time,a\n(ms),(mV)": (lambda n: f"{n * 0.5}", 2000.0),
+    "Datum,a": (lambda n: f"2024-05-01T12:00:{n // 100:02d}.{n % 100:02d}", 100.0),
+    "zeit;a": (lambda n: f"2024-05-01 12:00:00,{n * 10:03d}+02:00", 100.0),
+    "utc,a": (lambda n: f"2024/12/31 23:59:{50 + n // 10}.{n % 10}00000Z", 10.0),
+    "secs,nsecs,a": (lambda n: f"{MS // 1000 + n // 8},{n % 8 * 125_000_000}", 8.0),
+    "stamp.sec,stamp.nanosec,a": (lambda n: f"{n // 8},{n % 8 * 125_000_000}", 8.0),
+    "header.stamp.sec,header.stamp.nanosec,a": (lambda n: f"{n // 8},{n % 8 * 125_000_000}", 8.0),
+}
+
+
+@pytest.mark.parametrize("header", STAMPS)
+def test_times_are_found_as_people_call_and_write_them(header, tmp_path):
+    at, rate_hz = STAMPS[header]
+    mark = ";" if ";" in header else ","
+    lines = [header, *(f"{at(n)}{mark}{n}" for n in range(40))]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with format_of(path).open(path) as opened:
+        assert opened.names == ("a",)
+        assert opened.samples.read(0, 40)[0].tolist() == list(range(40))
+        since = np.arange(40) / rate_hz
+        np.testing.assert_allclose(opened.times(), since, rtol=0, atol=2e-6)
+
+
+def test_a_stamp_beside_times_is_no_channel_and_a_day_that_is_none_no_stamp(tmp_path):
+    path = tmp_path / "a.csv"
+    rows = [f"{n / 100},{n},2024-02-01 00:00:{n}" for n in range(10, 50)]
+    path.write_text("\n".join(["time,a,when", *rows]) + "\n")
+    with format_of(path).open(path) as opened:
+        assert opened.names == ("a",)
+        np.testing.assert_allclose(opened.times(), np.arange(40) / 100, atol=1e-12)
+    path.write_text(
+        path.read_text().replace("time,a,when", "b,a,timestamp").replace("-01 ", "-31 ")
+    )
+    with (
+        pytest.raises(
+            ValueError, match=r"in line 2: '2024-02-31 00:00:10' is no number, in column"
+        ),
+        format_of(path).open(path),
+    ):
+        pass
+
+
+def test_an_array_or_a_message_may_have_its_time_in_two_numbers(tmp_path):
+    seconds, rest = np.arange(40) // 8 + 1_700_000_000, np.arange(40) % 8 * 125_000_000
+    values = [
+        {"stamp": {"sec": int(s), "nanosec": int(n)}, "x": 1.0}
+        for s, n in zip(seconds, rest, strict=True)
+    ]
+    messages = [(n * 10**9, json_message(value)) for n, value in enumerate(values)]
+    write_mcap(tmp_path / "a.mcap", [Sent("/f", "F", messages, "json", "jsonschema", "{}")])
+    np.savez(tmp_path / "a.npz", secs=seconds, nsecs=rest, x=np.ones(40))
+    for name in ("a.mcap", "a.npz"):
+        with format_of(tmp_path / name).open(tmp_path / name) as opened:
+            assert opened.names == ("x",), name
+            np.testing.assert_allclose(opened.times(), np.arange(40) / 8, atol=1e-9)

@@ -615,20 +615,6 @@ def test_mat_files_hold_more_than_numbers(tmp_path):
     assert read(path)[1] == ("x",)
 
 
-@of_arrays("a.npz", "a.h5", "a.mat")
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        (np.zeros((9, 2), dtype=complex), "complex"),
-        (np.zeros((9, 2), dtype=bool), "true or false"),
-        (np.zeros((2, 3, 4)), "3 dimensions"),
-        (3.0, "no samples"),
-    ],
-)
-def test_what_is_no_samples_is_named(tmp_path, values, said, name):
-    assert said in refused(stored(tmp_path / name, it=values))
-
-
 @pytest.mark.parametrize("rows", [4, 1000])
 def test_parquet_tables(tmp_path, rows):
     path = tmp_path / "a.parquet"

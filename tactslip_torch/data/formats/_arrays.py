@@ -29,6 +29,7 @@ from tactslip_torch.data.formats._inference import (
     is_time,
     no_channels,
     rate_in,
+    seconds_and_nanoseconds,
     time_unit_in,
 )
 from tactslip_torch.data.formats._reading import (
@@ -39,9 +40,10 @@ from tactslip_torch.data.formats._reading import (
     Opened,
     Reading,
     Samples,
+    _label_numbers,
+    _nanoseconds,
     check_plausible,
     header_in,
-    label_numbers,
     needs,
     opened_columns,
     opened_from,
@@ -141,8 +143,13 @@ def _choose(
             return []
         return _named(wanted, several, refused)
 
-    if how.time == "auto":
-        times: Sequence[_Array] = [array for array in columns if is_time(array.leaf)]
+    pair = [columns[n] for n in seconds_and_nanoseconds([array.leaf for array in columns])]
+    if how.time == "auto" and pair and pair[0].length == pair[1].length:
+        both = _nanoseconds(*(np.ravel(array.values[()]) for array in pair))
+        times: Sequence[_Array] = [_Array(pair[0].name, both, "time_ns", [])]
+        columns = [array for array in columns if array not in pair]
+    elif how.time == "auto":
+        times = [array for array in columns if is_time(array.leaf)]
     else:
         times = apart(how.time, setting("reading.time"))
     label = how.label
@@ -194,7 +201,7 @@ def _choose(
         if len(words) != length:
             raise Refused(f"has {len(words)} labels for {length} samples; say labels.column")
         assert label is not None  # there are words of it
-        opened = opened._replace(labels=Samples(path, [label_numbers(label, words)]))
+        opened = opened._replace(labels=Samples(path, [_label_numbers(label, words)]))
     rate = near.sample_rate_hz or _single_rate(arrays, near.name)
     beside = tuple(array.name for array in passed if array.length == length)
     return opened._replace(sample_rate_hz=rate, left_out=(*opened.left_out, *beside))

@@ -31,9 +31,9 @@ from tactslip_torch.data.formats._reading import (
     Opened,
     Reading,
     Samples,
+    _label_numbers,
     check_plausible,
     header_in,
-    label_numbers,
     needs,
     opened_columns,
     opened_from,
@@ -97,7 +97,7 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         if how.label is not None and len(places) == 1 and places[0] in refused:
             values = file.read(columns=[names[places[0]]], use_threads=False).column(0).to_pylist()
             words = [None if value is None else str(value) for value in values]
-            return Samples(path, [label_numbers(how.label, words)])
+            return Samples(path, [_label_numbers(how.label, words)])
         if wrong := [place for place in places if place in refused]:
             kind = str(kinds[wrong[0]])[:40]
             raise Refused(f"holds {kind!r} in column {names[wrong[0]]!r}")

@@ -557,18 +557,27 @@ def opened_columns(
         return opened
     if chosen.nanoseconds is not None:
         both = samples([time, chosen.nanoseconds])
-        seconds, rest = both.stored(0, both.num_samples).astype(np.float64)
-        if not (np.isfinite(seconds).all() and np.isfinite(rest).all()):
-            raise Refused(f"has a time without a number, in column {time} or {chosen.nanoseconds}")
-        whole = rest.astype(np.int64)
-        if (whole < 10**9).all():  # others are the whole time in another unit
-            whole += seconds.astype(np.int64) * 10**9
+        whole = _nanoseconds(*both.stored(0, both.num_samples))
         return opened._replace(stamps=Samples(both.path, [whole]), time_unit="ns")
     unit = how.time_unit or time_unit_in(names[time] if names else None) or units.get(time)
     return opened._replace(stamps=samples([time]), time_unit=stamps.get(time, unit))
 
 
-def label_numbers(label: LabelColumn, words: Sequence[str | None]) -> NDArray[np.float64]:
+def _nanoseconds(seconds: NDArray[Any], rest: NDArray[Any]) -> NDArray[np.int64]:
+    """One time of whole seconds and the nanoseconds beyond, which may be the whole time as well.
+
+    Raises:
+        Refused: if a number is missing.
+    """
+    if not (np.isfinite(seconds).all() and np.isfinite(rest).all()):
+        raise Refused("has a time without a number, in seconds or nanoseconds")
+    whole = rest.astype(np.int64)
+    if (whole < 10**9).all():
+        whole += seconds.astype(np.int64) * 10**9
+    return np.asarray(whole)
+
+
+def _label_numbers(label: LabelColumn, words: Sequence[str | None]) -> NDArray[np.float64]:
     """What stands for words of a column of labels, ``[T]``; NaN of empty ones.
 
     Raises:
