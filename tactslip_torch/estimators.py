@@ -26,7 +26,7 @@ from sklearn.utils.validation import (
 from torch import Tensor
 
 from tactslip_torch.deploy.export import export_detector, wanted_graphs
-from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pool import MOST_BIN_SAMPLES, FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, most_stuck_samples
 from tactslip_torch.hand import Channel, HandLayout
@@ -217,6 +217,11 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
                 f"windows of {windows.shape[-1]} samples leave nothing, as the filter takes "
                 f"{before} before and {after} behind; give longer ones, filtered ones with "
                 "filtered=True, or frames={} for no filter"
+            )
+        if num > MOST_BIN_SAMPLES:
+            raise ValueError(
+                f"windows have at most {MOST_BIN_SAMPLES} samples without what filters take, got "
+                f"{num}; cut shorter windows, or resample them to a lower rate"
             )
         pool = FeaturePool(
             hand,

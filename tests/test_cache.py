@@ -16,7 +16,6 @@ from tactslip_torch.features.cache import (
     cache_key,
     default_cache_folder,
     features_digest,
-    source_digest,
 )
 from tactslip_torch.runtime import PACKAGE
 from tactslip_torch.training.experiment import feature_cache
@@ -170,26 +169,6 @@ def test_prune_drops_what_was_used_longest_ago_and_nothing_else(
     cache.prune()
     assert [i for i, key in enumerate(keys) if kept(cache, key) is not None] == left
     assert all(path.exists() for path in others)
-
-
-def test_the_digest_follows_names_and_content_wherever_the_package_lies(tmp_path):
-    one, two = tmp_path / "one", tmp_path / "two"
-    for package in (one, two):
-        (package / "b").mkdir(parents=True)
-        (package / "a.py").write_text("x = 1\n")
-        (package / "b" / "c.py").write_text("y = 2\n")
-        (package / "notes.txt").write_text(package.name)  # no code
-    digests = [source_digest(one)]
-    assert digests == [source_digest(two)]
-    for change in (
-        lambda: (one / "b" / "c.py").write_text("y = 3\n"),
-        lambda: (one / "b" / "c.py").rename(one / "b" / "d.py"),
-        lambda: (one / "b" / "e.py").touch(),
-        lambda: (one / "engine.cpp").touch(),  # makes features too
-    ):
-        change()
-        digests.append(source_digest(one))
-    assert len(set(digests)) == 5
 
 
 def test_only_what_makes_features_changes_their_digest(tmp_path):

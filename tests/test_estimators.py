@@ -164,6 +164,13 @@ def test_parameters_are_checked_in_the_fit(data: Any, options: Any, message: str
         SlipClassifier(features_of(**options)).fit(*data)
 
 
+def test_windows_that_are_too_long_are_told_without_keys_of_the_commands() -> None:
+    long = np.zeros((8, 2, 1025))
+    with pytest.raises(ValueError, match=r"at most 1024 .*, got 1025; cut shorter windows") as said:
+        SlipClassifier(TactileFeatures(2000.0)).fit(long, np.arange(8) % 2)
+    assert "labels." not in str(said.value)
+
+
 def test_what_the_fit_is_given_is_checked(data: Any) -> None:
     X, y, groups = data
     model = SlipClassifier(features_of())

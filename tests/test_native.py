@@ -1,9 +1,7 @@
 """The native engine: values of the reference, limits, manners; built, found, and done without."""
 
-import copy
 import multiprocessing
 import os
-import pickle
 import shlex
 import stat
 import subprocess
@@ -93,24 +91,6 @@ def test_detectors_in_threads_and_processes_score_alike(how):
     with pool:
         for found, one in zip(pool.map(scores_of, range(4)), expected, strict=True):
             np.testing.assert_allclose(found, one, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("backend", ["auto", "torch"])
-def test_leading_axes_strides_copies_and_modes(backend):
-    extractor, bins = made(POOL, [5, 90, 17], backend), noise(6, dtype=torch.float32)
-    flat = extractor(bins)
-    assert flat.dtype == torch.float32
-    torch.testing.assert_close(extractor(bins.reshape(2, 3, *bins.shape[1:])).flatten(0, 1), flat)
-    torch.testing.assert_close(extractor(bins[0]), flat[0])
-    strided = bins.transpose(1, 2).contiguous().transpose(1, 2)
-    for other in (extractor, copy.deepcopy(extractor), pickle.loads(pickle.dumps(extractor))):
-        assert torch.equal(other(strided), flat)
-    with torch.inference_mode():
-        inside = made(POOL, [5, 90, 17], backend)
-        assert torch.equal(inside(bins), flat)
-    assert torch.equal(inside(bins), flat)
-    with torch.device("meta"):
-        assert torch.equal(made(POOL, [5, 90, 17])(bins), flat)
 
 
 # Built and found ---------------------------------------------------------------------------------

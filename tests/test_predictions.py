@@ -45,11 +45,6 @@ def used_channel(detector):
     return detector.pool.hand.names.index(detector.selected_names[0].channel)
 
 
-def unused_channel(detector):
-    used = {name.channel for name in detector.selected_names}
-    return next(i for i, name in enumerate(detector.pool.hand.names) if name not in used)
-
-
 # NaN and Inf -----------------------------------------------------------------------------------
 
 
@@ -68,23 +63,6 @@ def test_a_missing_channel_gets_its_imputation_values(bad, detector):
     assert found.span[2, channel].isnan()
     torch.testing.assert_close(found.score[2], detector.head(z), rtol=1e-12, atol=0)
     assert torch.equal(detector(bins), found.score)
-
-
-@pytest.mark.parametrize("num", [3, 30])
-@pytest.mark.parametrize("bad", [*BAD, "masked"])
-def test_a_channel_no_feature_needs_changes_nothing(bad, num, detector):
-    samples, unused = noise(num), unused_channel(detector)
-    expected = detector.predict_raw(samples)
-    if bad == "masked":
-        name = detector.pool.hand.names[unused]
-        found = detector.predict_raw(samples, masked_channels=[name])
-    else:
-        samples[:, unused] = bad
-        found = detector.predict_raw(samples)
-    assert torch.equal(found.score, expected.score)
-    assert found.is_valid.all()
-    assert not found.channels_lost.any()
-    assert found.span[:, unused].isnan().all()
 
 
 def test_a_broken_sample_is_refused_by_its_place_on_request(detector):

@@ -90,16 +90,6 @@ def filters_of(name):
     return WaveletFilters(f"as {name}", *(tuple(taps) for taps in pywt.Wavelet(name).filter_bank))
 
 
-@pytest.mark.parametrize("name", ["rbio2.2", "db3"])
-def test_the_filters_of_a_named_wavelet_are_that_wavelet(name, rng):
-    filters = filters_of(name)
-    level = highest_level(100, filters)
-    assert level == highest_level(100, name)
-    assert torch.equal(branch_matrix(100, filters, level), branch_matrix(100, name, level))
-    with pytest.raises(ValueError, match=rf"level must lie in 1\.\.{level} .* as {name}, got 9"):
-        branch_matrix(100, filters, 9)
-
-
 def test_filters_come_back_exactly(rng):
     bank, scale = pywt.Wavelet("rbio2.2").filter_bank, float(rng.uniform(0.3, 3))
     scales = (scale, scale, 1 / scale, 1 / scale)  # of no short decimal
