@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactslip_torch.training.bins import BinSample, RecordingBins
+from tactslip_torch.training.bins import MOST_GROUPS, BinSample, RecordingBins
 
 NUM = 3
 
@@ -19,14 +19,17 @@ def key_of(recording, index):
     return int(hashlib.blake2b(text, digest_size=8).hexdigest(), 16)
 
 
-def make_recordings(sizes, seed=0):
-    """Recordings of three groups and two scenes; a feature tells recording and bin apart."""
+def make_recordings(sizes, seed=0, groups="abc"):
+    """Recordings of some groups and two scenes; a feature tells recording and bin apart."""
     rng = np.random.default_rng(seed)
     recordings = []
     for number, size in enumerate(sizes):
         features = torch.from_numpy(rng.standard_normal((size, NUM)).astype(np.float32))
         is_slip = torch.from_numpy(rng.uniform(size=size) < 0.6)
-        group, scene = "abc"[int(rng.integers(3))], ("paper", "taps")[int(rng.integers(2))]
+        group, scene = (
+            groups[int(rng.integers(len(groups)))],
+            ("paper", "taps")[int(rng.integers(2))],
+        )
         name = f"{group}/{number}"  # in another order as text than as numbers
         recordings.append(RecordingBins(name, group, features, is_slip, scene))
     return recordings
@@ -75,6 +78,63 @@ def test_any_order_and_sharding_gives_the_bins_of_smallest_key(recordings, most,
     assert rows_of(bins) == wanted
     assert bins.group_names == tuple(sorted(set(bins.group_names)))
     assert bins.features.dtype == torch.float32
+
+
+@pytest.mark.parametrize("num_shards", [1, 3])
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_of_many_groups_each_gives_fewer_bins_in_any_order(num_shards, is_reversed):
+    """20 groups: half of what each of ten would give, whoever came first."""
+    recordings = make_recordings([30] * 200, groups="abcdefghijklmnopqrst")
+    assert len({of.group for of in recordings}) == 20
+    wanted = sorted_at_once(recordings, 4)
+    merged = BinSample(8)
+    for shard in range(num_shards):
+        sample = BinSample(8)
+        for of in recordings[shard::num_shards][:: -1 if is_reversed else 1]:
+            sample.update(of)
+        merged.merge(sample)
+    assert rows_of(merged.bins()) == wanted
+
+
+def sample_of(sizes):
+    """A sample of groups ``g000`` and on, of so many bins of non-slip and of slip."""
+    sample = BinSample(100)
+    for number, (quiet, slip) in enumerate(sizes):
+        is_slip = torch.arange(quiet + slip) >= quiet
+        features = torch.full((len(is_slip), 1), float(number))
+        sample.update(RecordingBins(f"r{number}", f"g{number:03}", features, is_slip))
+    return sample.bins()
+
+
+def test_joined_groups_hold_every_group_once_and_are_of_about_one_size():
+    sizes = [(3 + number % 5, 2 + number % 3) for number in range(47)]
+    bins = sample_of(sizes)
+    joined = bins.joined()
+    assert len(joined.group_names) == MOST_GROUPS
+    of_group = defaultdict(set)
+    for number, place in zip(bins.features[:, 0].tolist(), joined.group.tolist(), strict=True):
+        of_group[number].add(place)
+    assert len(of_group) == 47
+    assert all(len(places) == 1 for places in of_group.values())  # a group is never in two
+    members = [[n for n, places in of_group.items() if places == {p}] for p in range(MOST_GROUPS)]
+    names = [f"g{int(min(own)):03} and {len(own) - 1} more" for own in members]
+    assert list(joined.group_names) == names
+    counts = [sum(sum(sizes[int(number)]) for number in own) for own in members]
+    assert max(counts) - min(counts) <= max(map(sum, sizes))
+    assert torch.equal(joined.is_slip, bins.is_slip)
+    assert torch.equal(joined.weight, bins.weight)
+
+
+def test_groups_of_one_class_are_joined_to_groups_of_both():
+    """Recordings that are slip, or are not, as a whole."""
+    joined = sample_of([(6, 0), (0, 5)] * 20).joined()
+    for place in range(MOST_GROUPS):
+        assert len(joined.is_slip[joined.group == place].unique()) == 2
+
+
+def test_ten_groups_stay_as_they_are():
+    bins = sample_of([(4, 3)] * MOST_GROUPS)
+    assert bins.joined() is bins
 
 
 def test_a_sample_of_fewer_than_none_or_of_nothing_is_refused():

@@ -1,5 +1,7 @@
 """An even clock through timestamps: what is late, what is missing, and what cannot be."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -60,6 +62,34 @@ def test_what_was_dropped_is_found_and_filled(gaps, jitter, seed):
     bridged = EvenSamples(kept, found, most_bridged=1000)  # a ramp is its own bridge
     for first, stop in ((0, 1000), (17, 333), (500, 501), (990, 2000), (40, 40)):
         torch.testing.assert_close(bridged.read(first, stop), ramp[:, first:stop])
+
+
+@settings(max_examples=60)
+@given(drops, st.integers(0, 40), st.integers(1, 400), st.integers(0, 99))
+def test_any_pieces_of_a_file_put_together_are_the_whole(gaps, most_bridged, length, seed):
+    """With gaps and samples that are not finite, some of them bridged."""
+    dropped = {tick for start, count in gaps for tick in range(start, start + count)}
+    found = clock_of(ticks(1000, dropped)[0], RATE)
+    source = np.random.default_rng(seed)
+    stored = source.normal(size=(3, 1000 - len(dropped)))
+    for row, place, num in zip(
+        *source.integers([[0], [0], [1]], [[3], [960], [50]], (3, 9)), strict=True
+    ):
+        stored[row, place : place + num] = np.nan
+    kept = Samples("a.csv", stored, time_axis=1)
+    even = EvenSamples(kept, found, most_bridged, rows=[2, 0])
+    whole = even.read(0, 1000)
+    cut = [even.read(first, first + length) for first in range(0, 1000, length)]
+    torch.testing.assert_close(torch.cat(cut, 1), whole, rtol=0, atol=1e-12, equal_nan=True)
+    on_clock = np.full((3, 1000), np.nan)
+    on_clock[:, [tick for tick in range(1000) if tick not in dropped]] = stored
+    for row, of_file in zip(whole.numpy(), on_clock[[2, 0]], strict=True):
+        np.testing.assert_array_equal(row[np.isfinite(of_file)], of_file[np.isfinite(of_file)])
+        for is_nan, run in itertools.groupby(range(1000), key=np.isnan(of_file).__getitem__):
+            places = list(run)
+            is_edge = places[0] == 0 or places[-1] == 999
+            is_bridged = len(places) <= most_bridged and not is_edge
+            assert np.isnan(row[places]).all() == (is_nan and not is_bridged)
 
 
 @pytest.mark.parametrize(("rate", "unit"), ROUNDED)

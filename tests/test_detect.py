@@ -18,7 +18,7 @@ from tactslip_torch.data.formats import FORMATS, Samples
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, score_stream
 from tactslip_torch.onset.rules import KOfN
-from tactslip_torch.report.onset import COLUMNS
+from tactslip_torch.report.onset import COLUMNS, OverviewRow, Traces, overview_figure
 
 RATE_HZ = 2000.0
 SETTINGS = AlarmSettings(20, Platt(1.0, 0.0), KOfN(2, 3), 2.0, target_per_hour=1.0, lead_s=0.02)
@@ -83,7 +83,7 @@ def run(model, tmp_path_factory):
     place, folder = tmp_path_factory.mktemp("in"), tmp_path_factory.mktemp("out")
     save(place / "a.npz", recording())
     save(place / "b.npz", quiet())
-    return folder, detected(model, place, folder, "decisions=true")
+    return folder, detected(model, place, folder, "decisions=true", "figure=all")
 
 
 def offline(samples):
@@ -132,7 +132,7 @@ def test_an_alarm_behind_the_first_release_is_not_early(model, tmp_path):
 def test_the_files_agree_with_each_other(run):
     folder, content = run
     each = [f"{name}_{kind}" for name in "ab" for kind in ("decisions.csv", "onsets.png")]
-    names = [*each, "config.yaml", "onsets.csv", "onsets.json"]
+    names = [*each, "config.yaml", "onsets.csv", "onsets.json", "overview.png"]
     assert sorted(path.name for path in folder.iterdir()) == names
     assert_png(folder / "a_onsets.png")
     rows = rows_of(folder / "onsets.csv")
@@ -170,7 +170,7 @@ def test_a_recording_nobody_annotated_has_no_false_alarms(model, tmp_path):
     entries = []
     for told in ({}, {"non_slip_s": ((0, 8),)}):
         save(tmp_path / "a.npz", recording(provenance={}, **NOTHING, **told))
-        found = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
+        found = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=none")
         entries += found["recordings"]
     bare, told = entries
     assert (bare["truth"], bare["simulated"]) == (None, False)
@@ -198,7 +198,7 @@ def test_no_more_than_a_second_is_in_hand(model, tmp_path, monkeypatch):
     monkeypatch.setattr(Samples, "read", watched)
     monkeypatch.setattr(module.StreamingDetector, "push", pushing)
     save(tmp_path / "a.npz", recording())
-    detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
+    detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=none")
     assert max(asked) == max(pushed) == 2000
     assert sum(pushed) == 16000
     assert max(held) < 2000 * 4 * 4  # what a stream keeps is less than what it is given
@@ -228,8 +228,7 @@ def test_a_damaged_file_in_a_folder_costs_the_others_nothing(model, tmp_path, ca
     assert [entry["file"] for entry in written["failed"]] == ["c.npz", "e.npz"]
     assert "1000 Hz, the detector of 2000 Hz; resample it" in written["failed"][1]["error"]
     names = {path.name for path in out.iterdir()}
-    figures = {f"{name}_onsets.png" for name in "abd"}
-    assert names == figures | {"onsets.csv", "onsets.json", "config.yaml"}
+    assert names == {"onsets.csv", "onsets.json", "overview.png", "config.yaml"}
 
 
 def test_what_was_detected_before_an_interruption_stays(model, tmp_path, monkeypatch):
@@ -245,11 +244,80 @@ def test_what_was_detected_before_an_interruption_stays(model, tmp_path, monkeyp
 
     monkeypatch.setattr(module.StreamingDetector, "push", stopped)
     with pytest.raises(KeyboardInterrupt):
-        detected(model, tmp_path, tmp_path / "out", "decisions=true")
+        detected(model, tmp_path, tmp_path / "out", "decisions=true", "figure=all")
     written = json.loads((tmp_path / "out" / "onsets.json").read_text())
     assert [entry["file"] for entry in written["recordings"]] == ["a.npz"]
     names = ["a_decisions.csv", "a_onsets.png", "config.yaml", "onsets.csv", "onsets.json"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
+
+
+@pytest.mark.parametrize(
+    ("files", "figure", "wanted"),
+    [
+        ("a", "auto", ["a_onsets"]),
+        ("a", "none", []),
+        ("ab", "auto", ["overview"]),
+        ("ab", "none", []),
+        ("ab", "[b]", ["b_onsets", "overview"]),
+        ("ab", "[b.npz]", ["b_onsets", "overview"]),
+        ("ab", "all", ["a_onsets", "b_onsets", "overview"]),
+    ],
+)
+def test_figures_are_those_that_were_asked_for(model, tmp_path, files, figure, wanted):
+    for name in files:
+        save(tmp_path / f"{name}.npz", quiet(1.0))
+    detected(model, tmp_path, tmp_path / "out", f"figure={figure}")
+    assert sorted(path.stem for path in (tmp_path / "out").glob("*.png")) == wanted
+
+
+@pytest.mark.parametrize("figure", ["true", "null", "some", "[a,c]"])
+def test_a_figure_of_what_is_not_there_is_refused_before_anything_is_read(model, tmp_path, figure):
+    save(tmp_path / "a.npz", quiet(1.0))
+    with pytest.raises(ValueError, match=r"'c', which is no .* a$|must be auto, all, none or a li"):
+        detected(model, tmp_path, tmp_path / "out", f"figure={figure}")
+    assert not (tmp_path / "out" / "onsets.json").exists()
+
+
+def test_the_overview_has_what_each_recording_has(model, tmp_path, drawn):
+    """A row in the order of the files: alarms, decided and true slip, and what is not valid."""
+    lost = volts(4.0, ())
+    lost[:, 4000:6000] = torch.nan
+    save(tmp_path / "a.npz", recording())
+    save(tmp_path / "b.npz", quiet())
+    save(tmp_path / "c.npz", recording(lost, **NOTHING))
+    entries = detected(model, tmp_path, tmp_path / "out")["recordings"]
+    (axes,) = drawn[-1].axes
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["a.npz", "b.npz", "c.npz"]
+    rows = {name: [[], [], []] for name in ("recording", "slip", "invalid", "truth", "alarm")}
+    for part in axes.collections:
+        for path in part.get_paths():
+            low, high = path.vertices.min(0), path.vertices.max(0)
+            if part.get_gid() in rows:
+                row = round(float(low[1] + 0.3))
+                rows[part.get_gid()][row].append((float(low[0]), float(high[0])))
+    assert rows["recording"] == [[(0.0, 8.0)], [(0.0, 4.0)], [(0.0, 4.0)]]
+    assert rows["truth"] == [list(LOUD), [], []]
+    for entry, alarms, slips in zip(entries, rows["alarm"], rows["slip"], strict=True):
+        assert [start for start, _ in alarms] == [alarm["alarm_s"] for alarm in entry["alarms"]]
+        ends = [alarm["end_s"] or entry["duration_s"] for alarm in entry["alarms"]]
+        assert [end for _, end in slips] == pytest.approx(ends)
+    assert rows["invalid"][:2] == [[], []]
+    ((start_s, end_s),) = rows["invalid"][2]
+    assert 2.0 <= start_s < 2.2
+    assert 3.0 <= end_s < 3.2
+
+
+def test_an_overview_of_many_shows_those_with_alarms_and_says_how_many(tmp_path, drawn):
+    traces = Traces((), RATE_HZ, 0.01, (0.0, 1.0))
+    nothing = {"alarms": [], "truth": None, "simulated": False}
+    rows = [OverviewRow.of(nothing | {"file": f"{i}.csv"}, traces) for i in range(100)]
+    alarms = [{"alarm_s": 0.5}]
+    rows += [OverviewRow.of(nothing | {"file": "last.csv", "alarms": alarms}, traces)]
+    overview_figure(rows, tmp_path / "overview.png", of_simulated=False)
+    assert_png(tmp_path / "overview.png")
+    names = [text.get_text() for text in drawn[-1].axes[0].get_yticklabels()]
+    assert names == [*(f"{i}.csv" for i in range(59)), "last.csv"]
+    assert "101 recordings, 1 alarm, 60 shown" in drawn[-1].get_suptitle()
 
 
 OTHER_NAMES = HandLayout([HAND.channels[i] for i in (0, 2, 1, 3)])
@@ -306,7 +374,7 @@ def test_a_gap_in_the_times_is_missing_samples_and_a_clock_a_little_off_is_none(
     np.save(tmp_path / "b.npy", whole.where(~is_lost, torch.nan).numpy().T)
     write_table(tmp_path / "c.csv", whole, times_s / 1.0005)
     np.save(tmp_path / "d.npy", whole.numpy().T)
-    options = ("figure=false", f"sample_rate_hz={RATE_HZ}")
+    options = ("figure=none", f"sample_rate_hz={RATE_HZ}")
     found = detected(model, tmp_path, tmp_path / "out", *options)["recordings"]
     gap, missing, off, even = (
         (each["decisions"], each["duration_s"], [alarm["alarm_s"] for alarm in each["alarms"]])
@@ -328,4 +396,4 @@ def test_a_detector_of_counts_takes_counts_and_what_says_no_units(model, tmp_pat
     write_table(tmp_path / "in" / "b.csv", volts(), torch.arange(16000).double() / RATE_HZ)
     save(tmp_path / "in" / "c.npz", recording())
     with pytest.raises(ValueError, match=r"1 of 3 .*c\.npz is in V, the detector was .* counts"):
-        detected(tmp_path / "counts.pt", tmp_path / "in", tmp_path / "out", "figure=false")
+        detected(tmp_path / "counts.pt", tmp_path / "in", tmp_path / "out", "figure=none")

@@ -113,11 +113,11 @@ def test_detect_and_the_tool_for_sets_take_a_dataset(model, tmp_path, capsys):  
     loud = [volts(4.0, ((2.0, 3.0),), seed=seed) for seed in (0, 1)]
     episodes = [samples.double().numpy().T for samples in loud]
     root = dataset(tmp_path / "a", "v3.0", episodes, names=list(HAND.names))
-    found = detected(model, root, tmp_path / "out", "figure=false")["recordings"]
+    found = detected(model, root, tmp_path / "out", "figure=none")["recordings"]
     nothing = {"speeds_mm_s": (), "onsets_s": (), "sliding_s": (), "provenance": {}}
     for entry, samples in zip(found, loud, strict=True):
         save(tmp_path / "b.npz", recording(samples.double(), **nothing))
-        plain = detected(model, tmp_path / "b.npz", tmp_path / "b", "figure=false")
+        plain = detected(model, tmp_path / "b.npz", tmp_path / "b", "figure=none")
         assert entry["alarms"] == plain["recordings"][0]["alarms"] != []
         assert entry["material"] is entry["truth"] is None
     write_template(root, "episode_{trial}")

@@ -76,6 +76,13 @@ def test_evaluate_takes_no_simulated_hand_by_itself(command, general, tmp_path):
     assert "data.root" in ran.err
 
 
+def test_an_alarm_of_simulated_recordings_is_no_alarm_of_a_folder(command, folder, tmp_path):
+    ran = command(tmp_path, "train", str(folder), "onset=alarms", "cache=off")
+    assert ran.status == 2
+    assert "tactslip calibrate" in ran.err
+    assert not list(tmp_path.rglob("metrics.json"))
+
+
 def test_the_detector_of_a_folder_is_trained_on_all_and_reads_as_in_training(
     command, folder, tmp_path
 ):
@@ -100,7 +107,7 @@ def test_the_detector_of_a_folder_is_trained_on_all_and_reads_as_in_training(
     ran = command(tmp_path, "detect", str(new), "model=run/detector.pt", "threshold=0")
     assert ran.status == 2  # its column of times is called otherwise than in training
     assert "time" in ran.err
-    words = ["reading.time=seconds", "threshold=0", "figure=false"]
+    words = ["reading.time=seconds", "threshold=0", "figure=none"]
     ran = command(tmp_path, "detect", str(new), "model=run/detector.pt", *words)
     assert "note: reading.time=seconds; in training it was time" in ran.err
 

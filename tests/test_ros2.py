@@ -101,7 +101,7 @@ def stamped(content, kind):
 @pytest.mark.parametrize("kind", ["wrench", "array"])
 def test_the_bridge_publishes_the_alarms_that_detect_finds(kind, model, ros, tmp_path):  # noqa: F811
     place, said = bag(tmp_path / "bag", kind)
-    options = ["reading.samples=/tactile", "decisions=true", "figure=false"]
+    options = ["reading.samples=/tactile", "decisions=true", "figure=none"]
     options += [f"reading.channels=[{','.join(FORCES)}]"] if "channels" in said else []
     (wanted,) = detected(model, place, tmp_path / "out", *options)["recordings"]
     decided = rows_of(tmp_path / "out" / "bag_decisions.csv")

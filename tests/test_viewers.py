@@ -33,7 +33,7 @@ def run(model, tmp_path_factory):  # noqa: F811
     """A recording with slip, and everything ``detect`` says of it."""
     place = tmp_path_factory.mktemp("viewers")
     save(place / "a.npz", recording())
-    options = ("mcap=true", "decisions=true", "figure=false")
+    options = ("mcap=true", "decisions=true", "figure=none")
     return place, detected(model, place / "a.npz", place / "out", *options)
 
 

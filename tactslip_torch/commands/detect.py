@@ -2,8 +2,8 @@
 
 The place is a file or a folder of what ``data.formats`` knows. Samples are read piece by piece and
 pushed through a ``StreamingDetector``, so a recording may be of any length. Leaves
-``onsets.json``, ``onsets.csv`` and a figure of each recording. Where one cannot be read the others
-are done all the same; the exit status is 2 then.
+``onsets.json``, ``onsets.csv``, and the figure of a file or, of a folder, an overview. Where a
+recording cannot be read the others are done all the same; the exit status is 2 then.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,7 +26,7 @@ from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.data.file_recordings import hand_file
 from tactslip_torch.data.folder import file_metadata, recording_files
-from tactslip_torch.data.formats import Reading, open_file, pieces
+from tactslip_torch.data.formats import Reading, pieces
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.features.cache import versions
 from tactslip_torch.live.mcap_log import McapLog
@@ -47,12 +47,14 @@ from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.report.onset import (
     DecisionCounts,
+    OverviewRow,
     Traces,
     alarm_outcome,
     onset_figure,
     onsets_summary,
     onsets_table,
     onsets_title,
+    overview_figure,
     view_of,
     write_onsets,
 )
@@ -62,20 +64,24 @@ from tactslip_torch.runtime import plain, steps
 _LOG = logging.getLogger(__name__)
 
 FORMAT = "tactslip_torch onsets 1"
+OVERVIEW = "overview.png"
 _PIECE_S = 1.0
+_KEPT_EVERY_S = 2.0  # so long what was detected may be in memory only
+_MOST_NAMED = 8  # recordings in a message
 _TRAINED = "trained"  # of a setting: as in the detector's training
 _RULES = EventRules()
 
 
 @dataclass(frozen=True)
 class _DetectionContext:
-    """What is the same for every recording."""
+    """What is the same for every recording; ``drawn`` names those with a figure of their own."""
 
     detector: SlipDetector
     settings: AlarmSettings
     reading: Reading
     config: DictConfig
     folder: Path
+    drawn: frozenset[str]
 
     @property
     def units(self) -> str:
@@ -108,27 +114,43 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
         )
     detector = SlipDetector.load(config.model, backend=config.backend)
     reading = reading_of(config, detector)
-    context = _DetectionContext(detector, settings_of(config, detector), reading, config, folder)
+    settings = settings_of(config, detector)
     paths = recording_files(Path(str(config.input)))
+    stems = [path.stem for path in paths]
+    names = [path.stem if stems.count(path.stem) == 1 else path.name for path in paths]
+    drawn = _drawn(config.figure, names, paths)
+    context = _DetectionContext(detector, settings, reading, config, folder, drawn)
     save_config(config, folder)
     content = _origin(context) | {"events": None, "recordings": [], "failed": []}
     known: list[RecordingEvents] = []
-    stems = [path.stem for path in paths]
-    with steps("onsets", "s of signal", sum(_num_pieces(path, context) for path in paths)) as bar:
-        for path in paths:
-            name = path.stem if stems.count(path.stem) == 1 else path.name
-            try:
-                entry, events = _detect_in(path, name, context, bar.update)
-            except (ValueError, OSError) as error:
-                content["failed"].append({"file": path.name, "error": one_line(error)})
-                continue
-            content["recordings"].append(plain(entry))
-            content["simulated"] |= entry["simulated"] is True
-            known += [events] if events else []
-            write_onsets(content, folder)  # what is done stays, whatever comes
+    overview: list[OverviewRow] = []
+    kept_s = time.monotonic()
+    is_one = len(paths) == 1
+    try:
+        with steps("onsets", "s of signal" if is_one else "recordings", len(paths)) as bar:
+            for path, name in zip(paths, names, strict=True):
+                try:
+                    entry, events, row = _detect_in(path, name, context, bar if is_one else None)
+                except (ValueError, OSError) as error:
+                    content["failed"].append({"file": path.name, "error": one_line(error)})
+                    continue
+                content["recordings"].append(plain(entry))
+                content["simulated"] |= entry["simulated"] is True
+                known += [events] if events else []
+                overview.append(row)
+                if time.monotonic() - kept_s > _KEPT_EVERY_S:
+                    write_onsets(content, folder)
+                    kept_s = time.monotonic()
+                if not is_one:
+                    bar.update()
+    finally:
+        if content["recordings"]:  # what is done stays, whatever comes
+            content["events"] = pooled_metrics(known) if known else None
+            write_onsets(content, folder)
     if content["recordings"]:
-        content["events"] = pooled_metrics(known) if known else None
-        write_onsets(content, folder)
+        if config.figure != "none" and not is_one:
+            of_simulated = bool(detector.info.get("simulated"))
+            overview_figure(overview, folder / OVERVIEW, of_simulated=of_simulated)
         print("\n" + onsets_table(content))
         print(f"\n{onsets_summary(content, time.perf_counter() - started)}\nonsets in {folder}")
     if failed := content["failed"]:
@@ -140,10 +162,34 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
     return content
 
 
+def _drawn(figure: Any, names: Sequence[str], paths: Sequence[Path]) -> frozenset[str]:
+    """The names of the recordings that get a figure of their own.
+
+    Raises:
+        ValueError: if ``figure`` is neither ``auto``, ``all``, ``none`` nor a list of recordings.
+    """
+    of_words = {"auto": names if len(names) == 1 else (), "all": names, "none": ()}
+    if isinstance(figure, str) and figure in of_words:
+        return frozenset(of_words[figure])
+    wanted = plain_section(figure)
+    if not isinstance(wanted, list):
+        raise ValueError(f"figure must be auto, all, none or a list of names, got {figure!r}")
+    called = dict(zip((path.name for path in paths), names, strict=True))
+    called |= {name: name for name in names}
+    if unknown := [name for name in map(str, wanted) if name not in called]:
+        there = ", ".join(names[:_MOST_NAMED]) + ", .." * (len(names) > _MOST_NAMED)
+        raise ValueError(f"figure names {unknown[0]!r}, which is no recording; there are {there}")
+    return frozenset(called[str(name)] for name in wanted)
+
+
 def _detect_in(
-    path: Path, name: str, context: _DetectionContext, tick: Callable[[], object]
-) -> tuple[dict[str, Any], RecordingEvents | None]:
-    """One recording, also drawn: its entry, and its events where the truth is known."""
+    path: Path, name: str, context: _DetectionContext, bar: Any = None
+) -> tuple[dict[str, Any], RecordingEvents | None, OverviewRow]:
+    """One recording, drawn if that is wanted; ``bar`` counts its seconds.
+
+    Returns:
+        Its entry, its events where the truth is known, and its row of the overview.
+    """
     detector, config, hand = context.detector, context.config, context.detector.pool.hand
     rate, table = detector.pool.sample_rate_hz, context.folder / f"{name}_decisions.csv"
     given = hand_file(path, hand, rate, context.reading, context.units)
@@ -159,6 +205,9 @@ def _detect_in(
         kinds = [channel.kind for channel in hand.channels]
         view = view_of(config.view, entry["duration_s"])
         traces = Traces(hand.names, rate, stream.hop_s, view, context.units, kinds)
+        is_drawn = name in context.drawn
+        if bar is not None:
+            bar.reset(-(-samples.num_samples // context.piece_samples))
         truth = archived.recording if archived else None
         counts = DecisionCounts(first_releases(truth.onsets_s, truth.released_s) if truth else ())
         logs: list[Sink] = []
@@ -197,11 +246,13 @@ def _detect_in(
                     log.event("hand", event.text)
 
         for first, piece in enumerate(pieces(samples, context.piece_samples)):
-            traces.add_samples(piece.numpy())
+            if is_drawn:
+                traces.add_samples(piece.numpy())
             for log in logs:
                 log.samples(first * context.piece_samples, Block(piece.T.double().numpy()))
             take(stream.push(piece.T))
-            tick()
+            if bar is not None:
+                bar.update()
         take(stream.flush())
         if not counts.num_decisions:
             raise ValueError(f"{path} has {samples.num_samples} samples, too few for a decision")
@@ -211,12 +262,12 @@ def _detect_in(
         _LOG.warning("%s, %.3f s: %s", name, event["time_s"], event["text"])
     if archived and archived.recording.has_truth:
         entry, known = _with_truth(entry, archived.recording, counts, stream)
-    if config.figure:
+    if is_drawn:
         title = onsets_title(entry, of_simulated=bool(detector.info.get("simulated")))
         place, onset = context.folder / f"{name}_onsets.png", context.settings.onset
         threshold = None if onset is None else onset.threshold
         onset_figure(traces, entry, place, onset_threshold=threshold, title=title)
-    return entry, known
+    return entry, known, OverviewRow.of(entry, traces)
 
 
 def _cell(value: Any) -> Any:
@@ -296,15 +347,6 @@ def settings_of(config: DictConfig, detector: SlipDetector) -> AlarmSettings:
     if type(config.threshold) not in (int, float) or not math.isfinite(config.threshold):
         raise ValueError(f"threshold must be a finite number, got {config.threshold!r}")
     return settings.at_threshold(float(config.threshold))
-
-
-def _num_pieces(path: Path, context: _DetectionContext) -> int:
-    """For the bar; of a file that cannot be read, which is reported later, none."""
-    try:
-        with open_file(path, context.reading) as opened:
-            return -(-opened.samples.num_samples // context.piece_samples)
-    except (ValueError, OSError):
-        return 0
 
 
 def _origin(context: _DetectionContext) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import hashlib
 import logging
 import math
 import os
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -285,13 +286,13 @@ def _some(names: Sequence[str]) -> str:
 
 
 class EvenSamples(Samples):
-    """Samples of a file on an even clock; those of a file with gaps are read whole.
+    """Samples of a file on an even clock, read by stretches.
 
     Args:
         samples: of the file.
         clock: of its times.
         most_bridged: gaps and samples that are not finite, of at most so many in a channel, are
-            crossed by a straight line; in other gaps is NaN. If it is not 0 all are read whole.
+            crossed by a straight line; in other gaps is NaN.
         rows: of the file, that are wanted; ``None`` for all.
 
     Attributes:
@@ -306,12 +307,14 @@ class EvenSamples(Samples):
         rows: Sequence[int] | None = None,
     ) -> None:
         self.num_samples, self.dtype = clock.num_samples, samples.dtype
-        self._rows = list(range(samples.num_channels) if rows is None else rows)
-        self.num_channels = len(self._rows)
-        self._inner, self._whole = samples, None
+        all_rows = list(range(samples.num_channels))
+        wanted = all_rows if rows is None else list(rows)
+        self._rows = None if wanted == all_rows else wanted
+        self.num_channels = len(wanted)
+        self._inner = samples
         self.level: Tensor | None = None
-        if clock.gaps or most_bridged:
-            self._whole = _bridged(_without_gaps(samples, clock)[self._rows], most_bridged)
+        self._gaps, self._most_bridged = clock.gaps, most_bridged
+        self._starts = [gap.start for gap in clock.gaps]
 
     def read(self, first: int, stop: int) -> Tensor:
         """Samples from ``first`` to before ``stop`` on the clock, ``[C, n]``."""
@@ -319,21 +322,37 @@ class EvenSamples(Samples):
 
     def exact(self, first: int, stop: int) -> Tensor:
         """The same, in float64 if a level is taken off."""
-        if self._whole is not None:
-            found = self._whole[:, first : max(stop, first)]
-        else:
-            found = self._inner.read(first, stop)[self._rows]
+        first = min(max(first, 0), self.num_samples)
+        stop = min(max(stop, first), self.num_samples)
+        beside = self._most_bridged + 1 if self._most_bridged else 0  # what a line is drawn through
+        start = max(first - beside, 0)
+        found = self._on_clock(start, min(stop + beside, self.num_samples))
+        found = found if self._rows is None else found[self._rows]
+        if beside:
+            found = _bridged(found.clone(), self._most_bridged)[:, first - start : stop - start]
         return found if self.level is None else found - self.level
 
+    def _on_clock(self, first: int, stop: int) -> Tensor:
+        """Samples of all rows of the file, ``[C, n]``: NaN in gaps."""
+        if not self._gaps:
+            return self._inner.read(first, stop)
+        begins, ends = self._place(first), self._place(stop)
+        read = self._inner.read(begins, ends)
+        found = torch.full((len(read), stop - first), torch.nan, dtype=read.dtype)
+        is_there = torch.ones(stop - first, dtype=torch.bool)
+        since = max(bisect_right(self._starts, first) - 1, 0)
+        for gap in self._gaps[since : bisect_left(self._starts, stop)]:
+            is_there[max(gap.start - first, 0) : max(gap.start + gap.missing - first, 0)] = False
+        found[:, is_there] = read
+        return found
 
-def _without_gaps(samples: Samples, clock: Clock) -> Tensor:
-    """All samples on an even clock, ``[C, T]``: NaN in gaps."""
-    read = samples.read(0, samples.num_samples)
-    if not clock.gaps:
-        return read
-    whole = torch.full((len(read), clock.num_samples), torch.nan, dtype=read.dtype)
-    whole[:, torch.from_numpy(~_gaps_on(clock))] = read
-    return whole
+    def _place(self, moment: int) -> int:
+        """How many samples of the file come before a moment of the clock."""
+        number = bisect_left(self._starts, moment)
+        if not number:
+            return moment
+        gap = self._gaps[number - 1]
+        return gap.place + max(moment - gap.start - gap.missing, 0)
 
 
 def _gaps_on(clock: Clock) -> NDArray[np.bool_]:

@@ -1,9 +1,9 @@
 """Decisions on streams: what is kept while one passes, its figure, table and files.
 
-The figure follows the paper's last one (section V-D): fast channels over time, blue where no slip
-is decided and yellow where slip is; below them the decided and the true status, and the probability
-of slip. Everything stands at the time at which it was known, so the delay of a decision can be
-seen.
+The figure of a recording follows the paper's last one (section V-D): fast channels over time, blue
+where no slip is decided and yellow where slip is; below them the decided and the true status, and
+the probability of slip. Everything stands at the time at which it was known, so the delay of a
+decision can be seen. Of many recordings there is an overview, a row each.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -28,6 +28,7 @@ Segments = Sequence[tuple[float, float]]
 """Start and end of each, in seconds."""
 
 REST, SLIP = style.BLUE, style.ORANGE
+_QUIET = "#B5D0E4"  # no slip, under marks
 COLUMNS = (
     *("file", "alarm_s", "onset_s", "end_s", "score", "probability", "statistic"),
     *("in_range", "channels_lost", "raised_by"),
@@ -36,11 +37,13 @@ COLUMNS = (
 """Of ``onsets.csv``."""
 _NUM_SEGMENTS = 1500  # of each line, of which the least and the greatest value are kept
 _MOST_ROWS = 40
+_MOST_DRAWN = 60  # rows of an overview
 _SAME_S = 1e-8
 _WIDTH, _ROOM = 1.2, 40  # of marks, in points, as long as there are no more of a kind
 _INVALID: dict[str, Any] = {
     "facecolor": "none", "edgecolor": "#999999", "hatch": "////", "linewidth": 0, "zorder": 0.5,
 }  # fmt: skip
+_HIDDEN: dict[str, Any] = {"facecolor": "white", "zorder": 1.5, "gid": "invalid"}
 _LANE, _LEAST_LANE, _HIGH = 0.3, 0.15, 7.2  # inches: of a channel, its least, of many together
 _MOST_DELAYS = 12  # reported beside their alarms
 _ONSET: dict[str, Any] = {"color": style.INK, "linestyle": "-."}
@@ -439,6 +442,108 @@ def onset_figure(
     handles += [Patch(label="not valid", **_INVALID)] if invalid else []
     style.legend_below(figure, handles, len(handles))
     style.save(figure, path, dpi=120)
+
+
+class OverviewRow(NamedTuple):
+    """What an overview shows of a recording.
+
+    Args:
+        entry: of ``onsets.json``.
+        view: start and end of what is shown, in seconds.
+        slips: where slip is decided.
+        invalid: where decisions are not valid.
+    """
+
+    entry: Mapping[str, Any]
+    view: tuple[float, float]
+    slips: Segments
+    invalid: Segments
+
+    @classmethod
+    def of(cls, entry: Mapping[str, Any], traces: Traces) -> OverviewRow:
+        """From an entry of ``onsets.json`` and what was gathered of its recording."""
+        decided_s, (_, is_slip, is_invalid, _) = traces.decisions()
+        end_s = traces.view[1]
+        return cls(
+            entry,
+            traces.view,
+            slips=_spans(decided_s, is_slip, end_s),
+            invalid=_spans(decided_s, is_invalid, end_s),
+        )
+
+    @property
+    def is_of_note(self) -> bool:
+        """Whether there is an alarm in it, or a slip that none found."""
+        onsets = (self.entry["truth"] or {}).get("onsets", ())
+        is_missed = any(onset["outcome"] == "missed" for onset in onsets)
+        return bool(self.entry["alarms"]) or is_missed
+
+
+@style.styled
+def overview_figure(rows: Sequence[OverviewRow], path: str | Path, *, of_simulated: bool) -> None:
+    """Write a picture of many recordings, a row each: decided and true slip, and alarms.
+
+    Of more than 60, those with an alarm or a missed slip come before others; the title says so.
+
+    Args:
+        rows: of the recordings, in the order of files.
+        path: the PNG to write, replaced as a whole if it exists.
+        of_simulated: whether the detector was trained on simulated data.
+    """
+    order = sorted(range(len(rows)), key=lambda place: (not rows[place].is_of_note, place))
+    drawn = [rows[place] for place in sorted(order[:_MOST_DRAWN])]
+    has_truth = any(row.entry["truth"] for row in drawn)
+    title = _overview_title(rows, len(drawn), of_simulated)
+    figure = style.new_figure(12.0, 1.5 + 0.2 * max(len(drawn), 3), title)
+    axes = figure.subplots()
+    slip_height = 0.4 if has_truth else 0.7
+    for place, row in enumerate(drawn):
+        truth = row.entry["truth"]
+        onsets = truth["onsets"] if truth else ()
+        bars: list[tuple[Segments, float, float, dict[str, Any]]] = []
+        bars += [([row.view], -0.35, slip_height, {"facecolor": _QUIET, "gid": "recording"})]
+        bars += [(row.slips, -0.35, slip_height, {"facecolor": SLIP, "gid": "slip"})]
+        bars += [(row.invalid, -0.35, slip_height, _INVALID | _HIDDEN)]
+        if truth:
+            bars += [([row.view], 0.08, 0.27, {"facecolor": "#EEEEEE", "gid": "known"})]
+            bars += [(truth["sliding_s"], 0.08, 0.27, {"facecolor": style.GREEN, "gid": "truth"})]
+        for segments, low, height, look in bars:
+            if beams := [(start, end - start) for start, end in segments]:
+                axes.broken_barh(beams, (place + low, height), **look)
+        alarms = [alarm["alarm_s"] for alarm in row.entry["alarms"]]
+        starts = [onset["onset_s"] for onset in onsets]
+        axes.vlines(starts, place + 0.05, place + 0.38, color=style.INK, linewidth=1.2, gid="onset")
+        axes.vlines(alarms, place - 0.4, place + 0.1, color=style.ALARM, linewidth=1, gid="alarm")
+        axes.plot(alarms, np.full(len(alarms), place - 0.4), "v", color=style.ALARM, markersize=4)
+    names = [row.entry["file"] for row in drawn]
+    axes.set_yticks(range(len(drawn)), names, fontsize=7)
+    axes.set_ylim(max(len(drawn), 3) - 0.4, -0.8)
+    axes.set_xlim(min(row.view[0] for row in drawn), max(row.view[1] for row in drawn))
+    axes.grid(visible=False, axis="y")
+    axes.set_xlabel("time, s")
+    handles: list[Any] = [
+        Patch(facecolor=_QUIET, label="decided: no slip"),
+        Patch(facecolor=SLIP, label="decided: slip"),
+        Line2D([], [], marker="v", label="alarm", **_ALARM),
+    ]
+    if has_truth:
+        handles += [Patch(facecolor=style.GREEN, label="slip, true")]
+        handles += [Line2D([], [], color=style.INK, label="onset, true")]
+    handles += [Patch(label="not valid", **_INVALID)] if any(row.invalid for row in drawn) else []
+    style.legend_below(figure, handles, len(handles))
+    style.save(figure, path, dpi=110)
+
+
+def _overview_title(rows: Sequence[OverviewRow], num_drawn: int, of_simulated: bool) -> str:
+    """How many recordings and alarms there are, which are drawn, and what is simulated."""
+    entries = [row.entry for row in rows]
+    simulated = "SIMULATED recordings" if any(e["simulated"] for e in entries) else "recordings"
+    count = sum(len(entry["alarms"]) for entry in entries)
+    title = [f"{len(rows)} {simulated}", f"{count} alarm{'s' * (count != 1)}"]
+    if num_drawn < len(rows):
+        title += [f"{num_drawn} shown, those with an alarm or a missed slip first"]
+    title += ["detector trained on simulated data"] if of_simulated else []
+    return ", ".join(title)
 
 
 def _draw_channels(axes: Axes, traces: Traces, slips: Segments) -> None:

@@ -1,19 +1,23 @@
 """Labelled bins of recordings, and a bounded random sample that any worker would have drawn.
 
 A bin's key is a hash of its recording and number. The sample of a stratum (group, scene and class)
-is the bins of smallest key, so it depends neither on their order nor on who saw them.
+is the bins of smallest key, so it depends neither on their order nor on who saw them. Of many
+groups each gives fewer bins, so that the sample does not grow with their number.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from tactslip_torch.data.recording import PAPER_SCENE
+
+MOST_GROUPS = 10
+"""Of more groups each stratum is sampled less, and validation leaves several out together."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,36 @@ class SampledBins:
         """Group, scene and class of each bin as one number, ``[n]``."""
         return 2 * (self.group * len(self.scene_names) + self.scene) + self.is_slip.long()
 
+    def joined(self, most: int = MOST_GROUPS) -> SampledBins:
+        """The same bins in at most so many groups, those joined called ``cup and 4 more``.
+
+        Groups are dealt out from the largest on, each to where bins of its commoner class are
+        fewest; of equal ones the name decides.
+        """
+        num = len(self.group_names)
+        if num <= most:
+            return self
+        counts = torch.zeros(num, 2, dtype=torch.float64)
+        counts.index_put_((self.group, self.is_slip.long()), self.weight, accumulate=True)
+        joined, members = (
+            torch.zeros(most, 2, dtype=torch.float64),
+            [list[int]() for _ in range(most)],
+        )
+        order = sorted(range(num), key=lambda group: (-float(counts[group].sum()), group))
+        for group in order:
+            of_class = joined[:, int(counts[group].argmax())].tolist()
+            place = min(range(most), key=lambda one: (of_class[one], len(members[one])))
+            members[place].append(group)
+            joined[place] += counts[group]
+        members = sorted(sorted(own) for own in members)
+        to = torch.empty(num, dtype=torch.long)
+        for place, own in enumerate(members):
+            to[own] = place
+        names = [self.group_names[own[0]] for own in members]
+        more = [f" and {len(own) - 1} more" if len(own) > 1 else "" for own in members]
+        named = tuple(name + behind for name, behind in zip(names, more, strict=True))
+        return replace(self, group=to[self.group], group_names=named)
+
 
 class _Stratum(NamedTuple):
     """Bins of one stratum: how many there were, and those of smallest key, ascending."""
@@ -82,7 +116,7 @@ class BinSample:
     """At most so many bins of every group, scene and class, drawn by ``bin_keys``.
 
     Args:
-        most: bins kept of each stratum.
+        most: bins kept of each stratum; of more than ``MOST_GROUPS`` groups fewer, in proportion.
 
     Raises:
         ValueError: if ``most`` is negative.
@@ -94,14 +128,22 @@ class BinSample:
         self.most = most
         self._longest_run: int | None = None
         self._strata: dict[tuple[str, str, bool], _Stratum] = {}
+        self._groups: set[str] = set()
+
+    @property
+    def kept(self) -> int:
+        """Bins kept of each stratum by the number of groups so far, at least 2 if any are."""
+        share = self.most * MOST_GROUPS // max(len(self._groups), MOST_GROUPS)
+        return max(share, min(self.most, 2))
 
     def update(self, bins: RecordingBins) -> None:
         """Add the bins of a recording, all at once and once only (that is not checked)."""
         self._add_run(bins.longest_run)
+        self._add_groups({bins.group} if len(bins.is_slip) else set())
         keys = bin_keys(bins.name, len(bins.is_slip))
         for label in (False, True):
             rows = (bins.is_slip == label).nonzero()[:, 0]
-            kept = rows[keys[rows].argsort()[: self.most]]
+            kept = rows[keys[rows].argsort()[: self.kept]]
             places = [(float(keys[row]), bins.name, row) for row in kept.tolist()]
             if len(rows):
                 stratum = bins.group, bins.scene, label
@@ -110,6 +152,7 @@ class BinSample:
     def merge(self, other: BinSample) -> None:
         """Add the bins of another sample of that size; of other recordings (not checked)."""
         self._add_run(other._longest_run)
+        self._add_groups(other._groups)
         for name, part in other._strata.items():
             self._add(name, part)
 
@@ -145,6 +188,16 @@ class BinSample:
         runs = [run for run in (self._longest_run, longest_run) if run is not None]
         self._longest_run = max(runs, default=None)
 
+    def _add_groups(self, groups: set[str]) -> None:
+        """Note groups; where there are many, strata that are there are cut to what all may have."""
+        before = self.kept
+        self._groups |= groups
+        if self.kept < before:
+            for name, part in self._strata.items():
+                if len(part.places) > self.kept:
+                    features = part.features[: self.kept].clone()  # a view would keep the rest
+                    self._strata[name] = _Stratum(part.num_seen, part.places[: self.kept], features)
+
     def _add(self, name: tuple[str, str, bool], part: _Stratum) -> None:
         if name in self._strata:
             own = self._strata[name]
@@ -153,7 +206,7 @@ class BinSample:
                 own.places + part.places,
                 torch.cat([own.features, part.features]),
             )
-        order = sorted(range(len(part.places)), key=part.places.__getitem__)[: self.most]
+        order = sorted(range(len(part.places)), key=part.places.__getitem__)[: self.kept]
         places = [part.places[i] for i in order]
         self._strata[name] = _Stratum(part.num_seen, places, part.features[order])
 

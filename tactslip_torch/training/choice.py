@@ -5,7 +5,7 @@ and a penalty C. In each fold everything that is learned, compression constants,
 included, is learned without the group that is left out. Of the candidates within a tolerance of the
 best, the simplest machine with the strongest penalty is taken. The choice itself is evaluated by
 leaving out two groups: for each group the same choice is made without it, and that machine is
-evaluated on it.
+evaluated on it. Many groups are joined, so that there are few to leave out.
 
 Reference:
     Cawley and Talbot (2010), Journal of Machine Learning Research 11, 2079-2107.
@@ -182,7 +182,7 @@ def choose_model(
 
 
 class CandidateBins:
-    """Sampled bins of the features that may be used.
+    """Sampled bins of the features that may be used, many groups of them joined.
 
     Args:
         sample: the bins.
@@ -200,9 +200,9 @@ class CandidateBins:
         allowed: Tensor,
         pooling: str | Sequence[str] | None = None,
     ) -> None:
-        self.sample, self.weights, self.pooling = sample, weights, pooling
-        self.is_slip, self.groups = sample.is_slip, sample.group
-        self.group_names = sample.group_names
+        self.sample, self.weights, self.pooling = sample.joined(), weights, pooling
+        self.is_slip, self.groups = sample.is_slip, self.sample.group
+        self.group_names = self.sample.group_names
         self.hand = pool.hand
         self.span_features = SpanFeatures(pool.hand, pool.names, pool.bin_samples)
         self.spans = self.span_features(sample.features)

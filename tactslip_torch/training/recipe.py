@@ -585,6 +585,7 @@ class Paper(_Recipe):
             log.warning("C=%g is taken unvalidated: one group", middle)
             return middle, []
         rows, scored = list[dict[str, Any]](), list[Tensor]()
+        sample = sample.joined()
         machine = HeldOut(bins, sample.group, self.kernel)
         for penalty in bar(penalties, "choose C on held-out groups", show=show):
             scores = machine.at(penalty).scores

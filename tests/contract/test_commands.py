@@ -77,7 +77,7 @@ def test_detect_decides_as_a_stream(command, trained_or_slow, recordings, tmp_pa
     """And finds the slip of every recording."""
     trained = trained_or_slow
     told = settings(model=trained.file, input=recordings, folder="run")
-    command.well(tmp_path, "detect", *told, *settings(every_decision=True, figure=False))
+    command.well(tmp_path, "detect", *told, *settings(every_decision=True, figure="none"))
     found = read(tmp_path / "run" / names.ONSETS[0])
     assert len(found["recordings"]) == NUM_RECORDINGS
     rows = table(tmp_path / "run" / names.ONSETS[1])
@@ -98,7 +98,7 @@ def test_stream_decides_as_detect_and_ends_whole_by_a_signal(
 ):
     """Of a file, as fast as it goes; then over and over, until it is stopped."""
     model = settings(model=trained_or_slow.file)
-    told = settings(input=recordings / "D_2.csv", folder="run", every_decision=True, figure=False)
+    told = settings(input=recordings / "D_2.csv", folder="run", every_decision=True, figure="none")
     command.well(tmp_path, "detect", *model, *told)
     decided = table(tmp_path / "run" / names.DECISIONS.format("D_2"))
     told = settings(source_of_stream=recordings / "D_2.csv", every_decision=True, speed=None)
