@@ -186,7 +186,7 @@ def test_what_the_fit_is_given_is_checked(data: Any) -> None:
         SlipClassifier().fit(X, y)
     with pytest.raises(ValueError, match="or features=, which has both"):
         SlipClassifier(RATE_HZ, features=TactileFeatures(RATE_HZ)).fit(X, y)
-    with pytest.raises(ValueError, match="at most 1024 samples.*got 1025; cut shorter windows"):
+    with pytest.raises(ValueError, match=r"at most 1024 samples.*got 1025; cut shorter windows"):
         SlipClassifier(RATE_HZ).fit(np.zeros((8, 2, 1025)), np.arange(8) % 2)
 
 
