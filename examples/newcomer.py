@@ -11,7 +11,7 @@ import numpy as np
 import onnxruntime
 from sklearn.model_selection import LeaveOneGroupOut, cross_val_score
 
-from tactslip_torch import SlipClassifier, TactileFeatures
+from tactslip_torch import SlipClassifier
 
 folder = Path(sys.argv[1])
 X, y, materials = [], [], []
@@ -24,7 +24,7 @@ for path in sorted(folder.glob("*.csv")):
     materials += [material] * windows.shape[1]
 X = np.stack(X)  # windows, channels, 50 ms of samples
 
-classifier = SlipClassifier(TactileFeatures(sample_rate_hz=2000))
+classifier = SlipClassifier(sample_rate_hz=2000)
 scores = cross_val_score(classifier, X, y, groups=materials, cv=LeaveOneGroupOut())
 print(f"materials left out: {scores.mean():.3f}")
 classifier.fit(X, y, materials).save(folder / "slip.pt")

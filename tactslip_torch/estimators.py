@@ -265,18 +265,20 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     A kernel ridge machine (extreme learning machine) on compressed and scaled columns. Both classes
     weigh the same, however many windows they have. What is not set is chosen by leaving out groups:
-    which columns, how many, the degree, and C; of the choices within ``tolerance`` of the best
+    which columns, how many, the degree, and C; of the choices within half a point of the best
     balanced accuracy the simplest with the strongest penalty is taken. Without ``groups`` five
     blocks of consecutive rows of each class are left out in turn; with fewer than two rows of a
     class nothing is, and the first choice with the middle C is taken.
 
     Args:
-        features: how windows are described; ``TactileFeatures(sample_rate_hz)`` at least.
+        sample_rate_hz: of the windows.
+        hand: the channels, as ``TactileFeatures`` has them.
+        features: in place of both, how windows are described; ``None``: by
+            ``TactileFeatures(sample_rate_hz, hand)``.
         num_features: how many columns; ``None``: all; or several to choose from.
         degree: of the polynomial kernel, 1, 2 or both.
         penalties: values of the paper's C to choose from; small ones are the strong penalties. Of
             several, a grid whose end is best is extended.
-        tolerance: as above.
         drop_channels: with pooled columns: a second copy of every window is trained on, without up
             to this part of its channels, so that a broken one does little harm.
         slip_label: the label of ``y`` that is slip. ``None``: ``True``, 1 of 0 and 1 or of -1 and
@@ -294,27 +296,29 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         >>> rng = np.random.default_rng(0)
         >>> X, y = rng.standard_normal((60, 3, 100)), np.repeat(["grip", "slip"], 30)
         >>> X[y == "slip"] *= 2
-        >>> classifier = SlipClassifier(TactileFeatures(2000.0)).fit(X, y)
+        >>> classifier = SlipClassifier(2000.0).fit(X, y)
         >>> classifier.predict(X[:1]), classifier.predict_proba(X).shape
         (array(['grip'], dtype='<U4'), (60, 2))
     """
 
     def __init__(
         self,
-        features: TactileFeatures,
+        sample_rate_hz: float | None = None,
+        hand: HandLayout | None = None,
         *,
+        features: TactileFeatures | None = None,
         num_features: int | Sequence[int | None] | None = (None, 120),
         degree: int | Sequence[int] = (1, 2),
         penalties: float | Sequence[float] = General.penalties,
-        tolerance: float = 0.005,
         drop_channels: float = 0.5,
         slip_label: Any = None,
     ) -> None:
+        self.sample_rate_hz = sample_rate_hz
+        self.hand = hand
         self.features = features
         self.num_features = num_features
         self.degree = degree
         self.penalties = penalties
-        self.tolerance = tolerance
         self.drop_channels = drop_channels
         self.slip_label = slip_label
 
@@ -335,15 +339,11 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
         Raises:
             TypeError: if ``features`` are no ``TactileFeatures``.
-            ValueError: for other shapes, NaN, another number of classes than two, labels that do
-                not say which is slip, or groups of which no two parts with both labels can be made.
+            ValueError: if there is no rate, or one beside ``features``; for other shapes, NaN,
+                another number of classes than two, labels that do not say which is slip, or groups
+                of which no two parts with both labels can be made.
         """
-        if not isinstance(self.features, TactileFeatures):
-            raise TypeError(
-                f"features must be TactileFeatures, got {self.features!r}; give "
-                "TactileFeatures(sample_rate_hz)"
-            )
-        features: TactileFeatures = clone(self.features)
+        features = self._described_by()
         windows = features._lay_out(X)
         y = column_or_1d(y.numpy() if isinstance(y, Tensor) else y)
         check_consistent_length(windows, y)
@@ -359,7 +359,6 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             num_features=self.num_features,
             degree=self.degree,
             penalties=self.penalties,
-            tolerance=self.tolerance,
             drop_channels=self.drop_channels,
             sample_bins=max(len(windows), 2),
         )
@@ -380,6 +379,22 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         detector.sensing = replace(detector.sensing, stuck_samples=stuck)
         self._set(detector, features)
         return self
+
+    def _described_by(self) -> TactileFeatures:
+        """How windows are described, not fitted."""
+        if self.features is None:
+            if self.sample_rate_hz is None:
+                raise ValueError("the rate of the windows is not known; give sample_rate_hz=")
+            return TactileFeatures(self.sample_rate_hz, self.hand)
+        if not isinstance(self.features, TactileFeatures):
+            raise TypeError(
+                f"features must be TactileFeatures, got {self.features!r}; give "
+                "TactileFeatures(sample_rate_hz)"
+            )
+        if self.sample_rate_hz is not None or self.hand is not None:
+            raise ValueError("give sample_rate_hz and hand, or features=, which has both")
+        described: TactileFeatures = clone(self.features)
+        return described
 
     def decision_function(self, X: ArrayLike | Tensor) -> Array:
         """Scores ``[N]``; above 0 means ``classes_[1]``, 0 where the decision is not valid."""
@@ -428,7 +443,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             pool.sample_rate_hz, pool.hand, filtered=filtered, align=layer.align
         )
         features._set(pool, layer)
-        made = cls(features, slip_label=labels[1])
+        made = cls(features=features, slip_label=labels[1])
         made.classes_, made.slip_label_ = np.unique(np.array(labels)), np.array(labels)[1]
         found = detector.calibration
         made._slope = _UNCALIBRATED if found is None else found[0]

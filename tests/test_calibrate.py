@@ -287,6 +287,7 @@ REFUSED = {
     "nothing to set": ({}, [], "per_hour=RATE slip"),
     "no label": ({"label": ""}, ["per_hour=2000"], "label slip_free=true"),
     "no rate": ({}, ["per_hour=-1"], "per_hour positive -1"),
+    "no confidence": ({}, ["per_hour=2000", "confidence=2"], "error: confidence 2"),
 }
 
 

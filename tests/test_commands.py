@@ -206,6 +206,27 @@ def test_bad_input_is_refused_before_anything_is_simulated(overrides, line, tmp_
     assert_one_line(caught.value, line)
 
 
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["split.seen=[A]"], "all recordings are of one"),
+        (["recipe=paper", "recipe.penalties=[0.1]"], "give several recipe.penalties"),
+    ],
+)
+def test_that_no_alarm_will_be_set_is_told_before_the_fit(
+    overrides, words, tmp_path, monkeypatch, caplog
+):
+    def stop(*_):
+        raise InterruptedError
+
+    module = importlib.import_module("tactslip_torch.commands.train")
+    monkeypatch.setattr(module, "run_experiment", stop)
+    with pytest.raises(InterruptedError):
+        train(composed(*TINY, *overrides), tmp_path / "run")
+    (told,) = [record.message for record in caplog.records if "no alarm is set" in record.message]
+    assert words in told
+
+
 # Experiments, on the simulated hand ---------------------------------------------------------------
 
 

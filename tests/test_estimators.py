@@ -33,7 +33,7 @@ estimators_unfitted"""
 @pytest.mark.parametrize("kind", [TactileFeatures, SlipClassifier])
 def test_scikit_learns_checks_that_need_no_flat_data(kind: Any, name: str) -> None:
     features = TactileFeatures(RATE_HZ)
-    estimator = features if kind is TactileFeatures else SlipClassifier(features)
+    estimator = features if kind is TactileFeatures else SlipClassifier(features=features)
     getattr(estimator_checks, f"check_{name}")(kind.__name__, estimator)
 
 
@@ -52,7 +52,7 @@ def features_of(**options: Any) -> TactileFeatures:
 
 @pytest.fixture(scope="module")
 def fitted(data: tuple[Array, Array, Array]) -> SlipClassifier:
-    return SlipClassifier(features_of()).fit(*data)
+    return SlipClassifier(features=features_of()).fit(*data)
 
 
 @pytest.mark.parametrize("use", ["channel", "pooled", None])
@@ -73,7 +73,7 @@ def test_features_are_those_of_the_filtered_bins(data: Any, use: str | None) -> 
 
 def test_pipelines_grids_and_groups_left_out(data: Any) -> None:
     X, y, groups = data
-    logo, classifier = LeaveOneGroupOut(), SlipClassifier(features_of(use="pooled"))
+    logo, classifier = LeaveOneGroupOut(), SlipClassifier(features=features_of(use="pooled"))
     plain = make_pipeline(features_of(), LogisticRegression(max_iter=9999))
     assert cross_val_score(plain, X, y, groups=groups, cv=logo).mean() > 0.9
     with sklearn.config_context(enable_metadata_routing=True):
@@ -161,7 +161,7 @@ def test_a_mistake_in_the_windows_is_one_line(
 )
 def test_parameters_are_checked_in_the_fit(data: Any, options: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        SlipClassifier(features_of(**options)).fit(*data)
+        SlipClassifier(features=features_of(**options)).fit(*data)
 
 
 def test_windows_that_are_too_long_are_told_without_keys_of_the_commands() -> None:
@@ -173,7 +173,7 @@ def test_windows_that_are_too_long_are_told_without_keys_of_the_commands() -> No
 
 def test_what_the_fit_is_given_is_checked(data: Any) -> None:
     X, y, groups = data
-    model = SlipClassifier(features_of())
+    model = SlipClassifier(features=features_of())
     with pytest.raises(ValueError, match="one for each of the 72 rows"):
         model.fit(X, y, groups[:2])
     with pytest.raises(ValueError, match="must have two classes, got 1 class;"):
@@ -181,9 +181,13 @@ def test_what_the_fit_is_given_is_checked(data: Any) -> None:
     with pytest.raises(ValueError, match="slip_label='slide' is none of the labels"):
         clone(model).set_params(slip_label="slide").fit(X, y)
     with pytest.raises(TypeError, match="give TactileFeatures"):
-        SlipClassifier(RATE_HZ).fit(X, y)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="at most 1024 samples, got 1025"):
-        SlipClassifier(TactileFeatures(RATE_HZ)).fit(np.zeros((8, 2, 1025)), np.arange(8) % 2)
+        SlipClassifier(features=RATE_HZ).fit(X, y)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="give sample_rate_hz="):
+        SlipClassifier().fit(X, y)
+    with pytest.raises(ValueError, match="or features=, which has both"):
+        SlipClassifier(RATE_HZ, features=TactileFeatures(RATE_HZ)).fit(X, y)
+    with pytest.raises(ValueError, match=r"at most 1024 samples.*got 1025; cut shorter windows"):
+        SlipClassifier(RATE_HZ).fit(np.zeros((8, 2, 1025)), np.arange(8) % 2)
 
 
 def loud_windows(num: int) -> tuple[Array, Array]:
@@ -208,7 +212,8 @@ SAY_NOT = [(1, 2), ("slip_1", "slip_2"), ("non-slip", "other"), ("slipper", "a")
 def test_slip_is_the_label_that_says_so_or_that_is_given(labels: tuple[Any, ...]) -> None:
     first, second, *place = labels
     X, is_second = loud_windows(40)
-    y, model = np.array([first, second])[is_second], SlipClassifier(TactileFeatures(RATE_HZ))
+    y = np.array([first, second])[is_second]
+    model = SlipClassifier(features=TactileFeatures(RATE_HZ))
     model.set_params(features__use="pooled", **QUICK)
     if place:
         assert model.fit(X, y).slip_label_ == labels[place[0]]
@@ -230,7 +235,9 @@ GROUPS = {
 @pytest.mark.parametrize("kind", GROUPS)
 def test_groups_are_put_together_until_both_labels_are_left_out(kind: str) -> None:
     (groups, num), (X, y) = GROUPS[kind], loud_windows(80)
-    model = SlipClassifier(TactileFeatures(RATE_HZ, use="pooled"), num_features=None, degree=1)
+    model = SlipClassifier(
+        features=TactileFeatures(RATE_HZ, use="pooled"), num_features=None, degree=1
+    )
     rows = model.fit(X, y, groups).validation_
     assert len({name for row in rows for name in row["balanced_accuracy"]}) == num
     assert model.score(X, y) > 0.8
@@ -241,5 +248,5 @@ def test_groups_that_cannot_be_put_together_are_refused(kind: str) -> None:
     X, y = loud_windows(80)
     groups = y if kind == "a group a label" else np.where(y, 1000, np.arange(80))
     with pytest.raises(ValueError, match="two parts that have both labels") as caught:
-        SlipClassifier(TactileFeatures(RATE_HZ)).fit(X, y, groups)
+        SlipClassifier(RATE_HZ).fit(X, y, groups)
     assert "recipe" not in str(caught.value)

@@ -76,6 +76,13 @@ def test_evaluate_takes_no_simulated_hand_by_itself(command, general, tmp_path):
     assert "data.root" in ran.err
 
 
+def test_an_alarm_of_simulated_recordings_is_no_alarm_of_a_folder(command, folder, tmp_path):
+    ran = command(tmp_path, "train", str(folder), "onset=alarms", "cache=off")
+    assert ran.status == 2
+    assert "tactslip calibrate" in ran.err
+    assert not list(tmp_path.rglob("metrics.json"))
+
+
 def test_the_detector_of_a_folder_is_trained_on_all_and_reads_as_in_training(
     command, folder, tmp_path
 ):

@@ -18,7 +18,6 @@ from tactslip_torch import (
     SlipClassifier,
     StreamingDetector,
     SufficientStats,
-    TactileFeatures,
     simulate,
 )
 
@@ -57,7 +56,7 @@ def test_a_repr_says_what_it_is_in_a_line(general: Trained) -> None:
         (recording, "24 channels, 0.50 s at 2000 Hz, in V, material M6, no slip marked, simulated"),
         (Scene("M6", cycle=2), "'M6', cycle=2"),
         (stats, "1 batches, 2 slip and 3 non-slip bins of 3 features, degree 2"),
-        (SlipClassifier(TactileFeatures(2000.0, detector.pool.hand)), "hand=HandLayout(4 channels"),
+        (SlipClassifier(2000.0, detector.pool.hand), "hand=HandLayout(4 channels"),
     ]
     for thing, words in shown:
         assert words in repr(thing), repr(thing)

@@ -279,7 +279,7 @@ def hand(adapting):
 )
 def test_channels_that_count_must_be_alive_on_any_hand(made, num_lost, is_valid):
     x, y = windows(len(made), 100)
-    classifier = SlipClassifier(TactileFeatures(RATE, made, use="pooled")).fit(x, y)
+    classifier = SlipClassifier(features=TactileFeatures(RATE, made, use="pooled")).fit(x, y)
     lost = x.copy()
     lost[:, :num_lost] = 7.0
     assert classifier.predict_valid(x).all()
@@ -293,12 +293,17 @@ def test_channels_that_count_must_be_alive_on_any_hand(made, num_lost, is_valid)
 def test_short_windows_of_whole_counts_are_never_silent():
     x, y = windows(3, 5, whole=True)
     x[3:6] = 1.0
-    assert SlipClassifier(TactileFeatures(25.0, wavelet="haar")).fit(x, y).predict_valid(x).all()
+    assert (
+        SlipClassifier(features=TactileFeatures(25.0, wavelet="haar"))
+        .fit(x, y)
+        .predict_valid(x)
+        .all()
+    )
 
 
 def test_windows_with_missing_samples_are_predicted_and_not_fitted():
     x, y = windows(4, 100)
-    classifier = SlipClassifier(TactileFeatures(RATE)).fit(x, y)
+    classifier = SlipClassifier(RATE).fit(x, y)
     missing = x.copy()
     missing[0], missing[1, 0], missing[2, :, 5] = np.nan, np.nan, np.inf
     assert classifier.predict_valid(missing)[:4].tolist() == [False, True, False, True]

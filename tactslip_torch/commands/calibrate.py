@@ -28,7 +28,7 @@ from tactslip_torch.report.calibration import (
     calibration_table,
     pooled_outcome,
 )
-from tactslip_torch.runtime import check_number, plain, write_json
+from tactslip_torch.runtime import check_number, check_share, plain, write_json
 from tactslip_torch.training.alarm import OURS, Stream, Timing, score_streams
 from tactslip_torch.training.calibrate import (
     Calibrator,
@@ -57,12 +57,13 @@ def calibrate(config: DictConfig, folder: Path) -> dict[str, Any]:
     """
     detector = SlipDetector.load(config.model)
     settings, pool = AlarmSettings.of(detector), detector.pool
+    if config.per_hour is not None:
+        check_number("per_hour", config.per_hour)
+    check_share("confidence", config.confidence)
     if "channels" in config.data and config.data.channels is None:
         config.data.channels = pool.hand.to_rows()
     source: RecordingSource = instantiate(config.data, _convert_="all")
     _check_hand(detector, source)
-    if config.per_hour is not None:
-        check_number("per_hour", config.per_hour)
     timing = Timing(
         pool.sample_rate_hz, settings.hop_samples, pool.bin_samples, detector.look_ahead
     )
@@ -334,7 +335,8 @@ def _tell(report: Mapping[str, Any]) -> None:
     if alarm := report.get("alarm"):
         if alarm["is_set"]:
             print(
-                f"alarm threshold {alarm['after']:.4g} ({alarm['before']:.4g} before): at most "
+                f"alarm threshold {round(alarm['after'], 9):.4g} "
+                f"({round(alarm['before'], 9):.4g} before): at most "
                 f"{alarm['bound']:.3g} false alarms an hour with a confidence of "
                 f"{alarm['confidence']:g} in use like these recordings, which have "
                 f"{alarm['alarms']} in {alarm['hours']:.3g} h"

@@ -18,6 +18,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, save_config
+from tactslip_torch.data.recording import RecordingSource
+from tactslip_torch.data.splits import ROLES
 from tactslip_torch.deploy.check import GraphKind
 from tactslip_torch.deploy.export import export_detector, read_sidecar
 from tactslip_torch.model.detector import SlipDetector
@@ -34,9 +36,14 @@ from tactslip_torch.training.experiment import (
     run_experiment,
     write_tensorboard,
 )
+from tactslip_torch.training.recipe import Paper, Recipe
 
 log = logging.getLogger(__name__)
 
+_NO_ALARM = (
+    "no alarm is set, so that detect and stream.onnx do not work on this detector: "
+    "onset=debounced needs scores of recordings left out"
+)
 _OF_A_HAND = (
     *("pattern", "labels", "rename", "channels", "kind", "adapting", "units"),
     *("skip_s", "slide_s"),
@@ -100,6 +107,7 @@ def _experiment(config: DictConfig) -> Experiment:
     )
     recipe.allowed(maker.pool)  # refused before any work
     alarm: CalibratedAlarm | DebouncedAlarm | None
+    _refuse_simulated_streams(config, source)
     alarm = instantiate(config.onset, _convert_="all") or None
     if type(config.train_on_all) is not bool:
         raise ValueError(f"train_on_all must be true or false, got {config.train_on_all!r}")
@@ -108,8 +116,14 @@ def _experiment(config: DictConfig) -> Experiment:
             f"onset=alarms sets the alarm of one detector, this split makes {len(folds)}; take "
             "split=unseen4 or split=seen6, or onset=debounced"
         )
-    if isinstance(alarm, DebouncedAlarm):  # refused before the fit
+    if isinstance(alarm, CalibratedAlarm):  # refused before the fit
+        alarm.classifier.evidence(source.hand, source.sample_rate_hz)
+    if isinstance(alarm, DebouncedAlarm):
         alarm.hop_samples(maker.pool.sample_rate_hz, maker.pool.bin_samples)
+        trained = [{r for fold in folds for r in fold.having(*ROLES)}]
+        trained = trained if config.train_on_all else [set(f.having("train")) for f in folds]
+        if why := _why_unvalidated(recipe, min(len({r.material for r in of}) for of in trained)):
+            log.warning("%s: %s", _NO_ALARM, why)
     return Experiment(
         maker=maker,
         folds=folds,
@@ -128,6 +142,27 @@ def _experiment(config: DictConfig) -> Experiment:
         export=export_fold if config.export else None,
         train_on_all=config.train_on_all,
     )
+
+
+def _refuse_simulated_streams(config: DictConfig, source: RecordingSource) -> None:
+    """Refuse an alarm that is calibrated on another hand's simulated recordings."""
+    streams = config.onset.get("streams") or {}
+    if source.is_simulated or "SimulatedRecordings" not in str(streams.get("_target_")):
+        return
+    raise ValueError(
+        "onset=alarms is calibrated on simulated recordings, and these are not; leave onset at "
+        "debounced, and set the alarm for a rate with tactslip calibrate FOLDER model=RUN/"
+        "detector.pt per_hour=5"
+    )
+
+
+def _why_unvalidated(recipe: Recipe, num_materials: int) -> str | None:
+    """Why there will be no scores of recordings left out, which an alarm needs."""
+    if num_materials < 2:
+        return "training leaves objects out for it, and all recordings are of one; record another"
+    if isinstance(recipe, Paper) and len(recipe.penalties_ascending) < 2:
+        return "recipe=paper leaves objects out where it chooses; give several recipe.penalties"
+    return None
 
 
 def _reading_settings(config: DictConfig) -> dict[str, Any]:
@@ -150,10 +185,7 @@ def _set_alarm(
         }
         return alarm(detector, baselines, num_workers)
     if detector.calibration is None:
-        log.warning(
-            "no alarm is set, so that detect and stream.onnx do not work on this detector: "
-            "onset=debounced needs scores of validation; give several recipe.penalties"
-        )
+        log.warning("%s, or these do not tell slip from non-slip", _NO_ALARM)
     else:
         alarm(detector)
     return {}

@@ -336,7 +336,10 @@ def _cycles_of(recordings: Sequence[RecordingId], material: str) -> list[Recordi
     cycles = sorted(recording for recording in recordings if recording.material == material)
     if not cycles:
         known = ", ".join(sorted({recording.material for recording in recordings}))
-        raise ValueError(f"no recording of material {material!r}; the set has {known or 'none'}")
+        raise ValueError(
+            f"no recording of material {material!r}; the set has {known or 'none'}; name those in "
+            "split.seen and split.unseen, or take split=groups, which needs no names"
+        )
     return cycles
 
 

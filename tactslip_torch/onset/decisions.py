@@ -168,8 +168,8 @@ class AlarmSettings:
         """
         if KEY not in detector.info:
             raise ValueError(
-                "this detector has no alarm threshold; train with +exp=onset, which sets one, or "
-                "with onset=debounced, which is set for no rate"
+                "this detector has no alarm threshold; train it with onset=debounced, the default, "
+                "on recordings of two objects or more; tactslip calibrate then sets it for a rate"
             )
         return cls.from_dict(detector.info[KEY], detector.pool.hand, detector.pool.sample_rate_hz)
 

@@ -110,8 +110,9 @@ class OnsetEvidence:
             )
         if not 1 <= self.hop_samples <= 0.005 * self.sample_rate_hz:
             raise ValueError(
-                f"a hop of {self.hop_samples} samples at {self.sample_rate_hz:g} Hz is no hop of "
-                "at most 5 ms"
+                f"onsets are decided at least every 5 ms, got {self.hop_samples} samples between "
+                f"decisions at {self.sample_rate_hz:g} Hz; take onset=debounced, which needs no "
+                "such rate"
             )
         scales = [*self.fast_compression, *self.slow_compression]
         num_scales = len(WIDTHS_S) + 1 + len(STEPS_S)

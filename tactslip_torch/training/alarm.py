@@ -964,8 +964,8 @@ class DebouncedAlarm:
         known = detector.calibration
         if known is None:
             raise ValueError(
-                "onset=debounced needs the calibration of held-out scores, and training chose "
-                "nothing; give several recipe.penalties"
+                "onset=debounced needs scores of recordings left out, and there are none; train on "
+                "recordings of two objects or more, with several recipe.penalties"
             )
         hop = self.hop_samples(detector.pool.sample_rate_hz, detector.pool.bin_samples)
         detector.info[KEY] = self._settings(known[0], hop).to_dict()

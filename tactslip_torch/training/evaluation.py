@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.special import ndtr, stdtrit
 from torch import Tensor
 
 from tactslip_torch.data.labels import NO_POSITION
@@ -142,8 +143,9 @@ def compared(outcomes: Sequence[Outcomes], role: str) -> dict[str, Any]:
     Returns:
         ``baselines``: of each its ``balanced_accuracy``, and ``difference`` from the detector's
         with a 95 % interval, above 0 where the baseline is better; ``detector``: its balanced
-        accuracy. The interval is a bootstrap over ``num_drawn`` of what ``drawn`` says: recordings
-        or, where whole materials (or sessions) are left out and there are five or more, those.
+        accuracy. The interval is a bootstrap over ``num_drawn`` of what ``drawn`` says, expanded
+        for few: recordings or, where whole materials (or sessions) are left out and there are five
+        or more, those.
         Empty without baselines or where a class is absent.
 
     Args:
@@ -165,7 +167,10 @@ def compared(outcomes: Sequence[Outcomes], role: str) -> dict[str, Any]:
             break
     places = {group: place for place, group in enumerate(dict.fromkeys(groups))}
     place = torch.tensor([places[group] for group in groups])
-    bootstrap = Bootstrap(len(places))
+    number = max(len(places), 2)
+    # percentiles are too narrow for few: expanded as Hesterberg (2015), Am. Stat. 69, 371-386
+    tail = ndtr(math.sqrt(number / (number - 1)) * stdtrit(number - 1, 0.025))
+    bootstrap = Bootstrap(len(places), 1 - 2 * float(tail))
 
     def difference(sums: Tensor) -> Tensor:
         """``[n, 2, 2, 2]``, of the detector and a baseline, to ``[n]``."""

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
 from tactslip_torch.features.sensing import SILENT_FRACTION
+from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
@@ -66,6 +67,20 @@ class OnsetTraining:
     def __post_init__(self) -> None:
         check_number("onset.classifier.cycles", self.cycles, whole=True)
 
+    def evidence(self, hand: HandLayout, sample_rate_hz: float) -> OnsetEvidence:
+        """What decisions are made of, before its scales are learned.
+
+        Raises:
+            ValueError: if the hand has no fast channel, or the rate no such hop.
+        """
+        return OnsetEvidence(
+            hand,
+            sample_rate_hz,
+            round(self.hop_ms * 1e-3 * sample_rate_hz),
+            mains_hz=self.mains_hz,
+            comb_periods=self.comb_periods,
+        )
+
     def __call__(
         self,
         source: RecordingSource,
@@ -90,13 +105,7 @@ class OnsetTraining:
             raise ValueError(
                 "no recording is left to learn onsets from; give onset.streams more cycles"
             )
-        evidence = OnsetEvidence(
-            source.hand,
-            source.sample_rate_hz,
-            round(self.hop_ms * 1e-3 * source.sample_rate_hz),
-            mains_hz=self.mains_hz,
-            comb_periods=self.comb_periods,
-        )
+        evidence = self.evidence(source.hand, source.sample_rate_hz)
         usual, some = (
             partial(_compression_scales, source, evidence),
             _some(recordings, _SCALE_RECORDINGS),

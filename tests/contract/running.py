@@ -7,7 +7,6 @@ import multiprocessing
 import os
 import runpy
 import sys
-import time
 import traceback
 import warnings
 from collections.abc import Sequence
@@ -127,11 +126,3 @@ def _become(folder: Path, arguments: Sequence[str]) -> None:
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     os._exit(status)
-
-
-def wait_for(path: Path, timeout_s: float = 600.0) -> None:
-    """Wait until a file is there."""
-    end = time.monotonic() + timeout_s
-    while not path.exists():
-        assert time.monotonic() < end, f"{path} did not appear in {timeout_s} s"
-        time.sleep(0.002)
