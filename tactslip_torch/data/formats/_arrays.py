@@ -1,7 +1,8 @@
 """Recordings in files of arrays: NumPy's, HDF5, and MAT of versions 5 and 7.3.
 
-``.npz``, ``.mat`` of version 5 and the words of all are read whole; ``.npy``, HDF5 and MAT of
-version 7.3, which is HDF5 underneath with rows and columns exchanged, by stretches. Of foreign
+``.mat`` of version 5 and the words of all are read whole; ``.npy``, HDF5 and MAT of version 7.3,
+which is HDF5 underneath with rows and columns exchanged, by stretches. So are large arrays of
+``.npz``, by way of a temporary file (``TMPDIR``). Of foreign
 files the only matrix is the samples, or all vectors of one length are channels by name. Nothing is
 unpickled, and no other file is opened.
 """
@@ -12,12 +13,14 @@ import json
 import math
 import os
 import re
+import shutil
+import tempfile
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +43,7 @@ from tactslip_torch.data.formats._reading import (
     Opened,
     Reading,
     Samples,
+    StoredArray,
     _label_numbers,
     _nanoseconds,
     check_plausible,
@@ -54,6 +58,7 @@ from tactslip_torch.data.formats._reading import (
 from tactslip_torch.data.recording import MOMENTS, STRETCHES
 from tactslip_torch.runtime import setting
 
+_LARGE = 16 * 2**20  # bytes of an array that is not kept in memory
 _NOT_NUMBERS = {"b": "true or false", "c": "complex numbers", "V": "compound values"}
 _NOT_NUMBERS |= {"O": "objects or text", "S": "text", "U": "text"}
 _Labels = list[tuple[str, ...]]
@@ -373,15 +378,23 @@ def write_npz(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> N
 def read_npz(path: Path, how: Reading, stack: ExitStack) -> Opened:
     """A package file, an array, or an archive of arrays: ``samples``, if there is one."""
     if not zipfile.is_zipfile(path):
-        array = np.lib.format.open_memmap(path, "r")  # type: ignore[no-untyped-call]
+        array = _stored_array(stack.enter_context(path.open("rb")))
         stored = {"samples": _why_not_numbers(array) or array}
         return _choose(path, stored, replace(how, samples=None))
     with zipfile.ZipFile(path) as archive:
-        claimed = sum(member.file_size for member in archive.infolist())
-    check_plausible("its arrays", claimed, path.stat().st_size, MOST_WHOLE)
-    found: dict[str, Any] = {}
+        members = archive.infolist()
+        claimed = sum(member.file_size for member in members)
+        check_plausible("its arrays", claimed, path.stat().st_size, MOST_WHOLE)
+        large = [one.filename for one in members if one.file_size > _LARGE]
+        found: dict[str, Any] = {
+            name.removesuffix(".npy"): _unpacked(archive, name, stack)
+            for name in large
+            if name.endswith(".npy")
+        }
     with np.load(path, allow_pickle=False) as content:
         for name in content.files:
+            if name in found:
+                continue
             try:
                 found[name] = content[name]
             except ValueError as error:
@@ -393,10 +406,37 @@ def read_npz(path: Path, how: Reading, stack: ExitStack) -> Opened:
     if how.samples is None and "samples" in found:
         how = replace(how, samples="samples")
     for name, kept in found.items():
-        if isinstance(kept, np.ndarray):
+        if isinstance(kept, np.ndarray | StoredArray):
             labels = _as_labels(name, kept, how)
             found[name] = (_why_not_numbers(kept) or kept) if labels is None else labels
     return _choose(path, found, how)
+
+
+def _unpacked(archive: zipfile.ZipFile, name: str, stack: ExitStack) -> StoredArray | str:
+    """An array of an archive, in a temporary file; why it is none of numbers otherwise."""
+    file = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
+    with archive.open(name) as member:
+        shutil.copyfileobj(member, file, FREE_BYTES // 64)
+    file.seek(0)
+    try:
+        return _stored_array(file)
+    except Refused as error:
+        return str(error)
+
+
+def _stored_array(file: IO[bytes]) -> StoredArray:
+    """The array of an open ``.npy`` file.
+
+    Raises:
+        ValueError: if it is none, or cut.
+    """
+    version: tuple[int, int] = np.lib.format.read_magic(file)  # type: ignore[no-untyped-call]
+    form = np.lib.format
+    read_header = form.read_array_header_1_0 if version == (1, 0) else form.read_array_header_2_0
+    shape, is_fortran, dtype = read_header(file)  # type: ignore[no-untyped-call]
+    if dtype.hasobject:
+        raise Refused("holds objects or text")
+    return StoredArray(file, dtype, shape, file.tell(), "F" if is_fortran else "C")
 
 
 def _npz_header(content: Mapping[str, Any]) -> dict[str, Any]:

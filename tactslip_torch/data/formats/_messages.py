@@ -33,6 +33,7 @@ from tactslip_torch.data.formats._reading import (
     Reading,
     Samples,
     Spool,
+    StoredArray,
     check_plausible,
     chosen_columns,
     header_in,
@@ -352,7 +353,7 @@ class _TopicSamples(TopicColumns):
         if named is not None:
             self._named.append(named)
 
-    def ordered(self) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
+    def ordered(self) -> tuple[StoredArray, NDArray[np.float64] | None]:
         """All samples ``[T, C]`` in the order of their times, and these in seconds.
 
         No times if nobody asks for them, or of a single block where nobody gives the rate.

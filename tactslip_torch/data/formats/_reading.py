@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, fields
 from types import MappingProxyType, ModuleType
-from typing import Any, Literal, NamedTuple, get_args
+from typing import IO, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -50,6 +50,7 @@ MOST_MEMBERS = 10_000
 MOST_RATIO, FREE_BYTES = 100, 64 * 2**20
 """A file may hold so many times its size, and so many bytes in any case."""
 _MOST_SHOWN = 200
+_BLOCK = 1 << 15  # rows of a table of which some columns are read at a time
 
 
 @contextmanager
@@ -313,11 +314,63 @@ class Samples:
         with guarded(self.path):
             if isinstance(self._source, list):
                 return np.stack([_along(column, part) for column in self._source])
+            if self._rows is not None and not self._axis:
+                return self._some_rows(part)
             if self._axis:
                 values = np.asarray(self._source[:, part])
             else:
                 values = np.asarray(self._source[part]).T
         return values if self._rows is None else values[self._rows]
+
+    def _some_rows(self, part: slice) -> NDArray[Any]:
+        """Some columns of a table, a block of its rows after the other; ``[C, n]``."""
+        found = np.empty((self.num_channels, part.stop - part.start), self._source.dtype)
+        for first in range(part.start, part.stop, _BLOCK):
+            stop = min(first + _BLOCK, part.stop)
+            rows = np.asarray(self._source[first:stop])
+            found[:, first - part.start : stop - part.start] = rows.T[self._rows]
+        return found
+
+
+class StoredArray:
+    """An array of numbers in an open file, indexed as NumPy's are; nothing of it stays in memory.
+
+    Args:
+        file: that holds it.
+        dtype: of its numbers.
+        shape: of it.
+        offset: bytes before it.
+        order: of its axes, ``"C"`` or ``"F"``.
+
+    Raises:
+        ValueError: if the file is shorter.
+    """
+
+    def __init__(
+        self,
+        file: IO[bytes],
+        dtype: Any,
+        shape: tuple[int, ...],
+        offset: int = 0,
+        order: Literal["C", "F"] = "C",
+    ) -> None:
+        self._file, self._offset, self._order = file, offset, order
+        self.dtype, self.shape, self.ndim = np.dtype(dtype), shape, len(shape)
+        _ = self._mapped()
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, key: Any) -> NDArray[Any]:
+        return np.array(self._mapped()[key])  # pages of a map that stays would stay as well
+
+    def _mapped(self) -> NDArray[Any]:
+        if not math.prod(self.shape):
+            return np.empty(self.shape, self.dtype)
+        found: NDArray[Any] = np.memmap(
+            self._file, self.dtype, "r", self._offset, self.shape, self._order
+        )
+        return found
 
 
 _INDEX = re.compile(r"[\s_.\-\[(]*\d+[\])]?$")
@@ -418,10 +471,16 @@ class Opened(NamedTuple):
         """
         if self.stamps is None:
             return None
-        values = self.stamps.stored(0, self.stamps.num_samples)[0]
-        values = values.astype(np.int64 if values.dtype.kind in "iu" else np.float64)
+        stored = self.stamps.stored(0, self.stamps.num_samples)[0]
+        values: NDArray[Any] = np.array(
+            stored, np.int64 if stored.dtype.kind in "iu" else np.float64
+        )
+        del stored
         unit = self.time_unit or epoch_unit(float(np.fmax.reduce(values, initial=0))) or "s"
-        return np.asarray((values - values[:1]).astype(np.float64) * SECONDS[unit])
+        values -= values[:1].copy()  # in place: those of hours are large
+        seconds = values.astype(np.float64, copy=False)
+        seconds *= SECONDS[unit]
+        return seconds
 
 
 class Spool:
@@ -436,13 +495,12 @@ class Spool:
         with np.errstate(over="ignore"):
             self._file.write(np.asarray(rows, self._dtype).tobytes())
 
-    def array(self) -> NDArray[Any]:
+    def array(self) -> StoredArray:
         """All rows; none can be added behind them."""
         self._file.flush()
-        if not self._file.tell():
-            return np.empty((0, self._num_columns), self._dtype)
-        rows: NDArray[Any] = np.memmap(self._file, self._dtype, "r")
-        return rows.reshape(-1, self._num_columns)
+        dtype = np.dtype(self._dtype)
+        num_rows = self._file.tell() // (dtype.itemsize * self._num_columns)
+        return StoredArray(self._file, dtype, (num_rows, self._num_columns))
 
 
 # Columns of a table -----------------------------------------------------------------------------
