@@ -101,8 +101,8 @@ def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(
         prog="tactslip demo",
-        description="Find the slip in the sample recordings that come with the package, a simulated "
-        "and a real one, draw it, and write a detector as ONNX with a page for the browser.",
+        description="Find the slip in the recordings that come with the package, a simulated and "
+        "a real one, draw it, and write a detector as ONNX with a page for the browser.",
         epilog="example: tactslip demo --out first",
     )
     parser.add_argument(
