@@ -59,7 +59,10 @@ def test_the_demo_says_when_the_slip_began_and_leaves_all_it_names(typed, tmp_pa
     assert f"slips from {real_onset_s():.2f} s on" in printed
     assert f"alarms at {real['alarms'][0]['alarm_s']:.2f} s" in printed
     assert real["simulated"] is None
-    files = "real/box_5_onsets.png real/recordings/LICENSE.md recording_onsets.png model.onnx stream.onnx.json web/page.mjs web/stream.onnx node/npy.mjs"
+    files = (
+        "real/box_5_onsets.png real/recordings/LICENSE.md recording_onsets.png model.onnx "
+        "stream.onnx.json web/page.mjs web/stream.onnx node/npy.mjs"
+    )
     assert all((out / name).is_file() for name in files.split())
     status, _, err = typed(demo, "--out", out)
     assert status == 2
