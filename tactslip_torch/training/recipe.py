@@ -417,13 +417,17 @@ class General(_Recipe):
         candidates = CandidateBins(sample, weight, pool, allowed, self.pooling)
         num_bins = round(float(sample.weight.sum()))
         structures, penalties = self._structures(num_bins), self.penalties_ascending
-        if len(sample.group_names) > 1:
+        if (num_whole := len(candidates.whole_groups())) > 1:
             how = {"is_nested": is_nested, "show": show}
             choice = choose_model(candidates, structures, penalties, self.tolerance, **how)
         else:
             choice = Choice(structures[0], penalties[len(penalties) // 2])
             log.warning(
-                "%s, C=%g are taken unvalidated: one group", choice.structure, choice.penalty
+                "no recordings are left out to choose by: that needs two groups with slip and "
+                "non-slip, got %d of %s; C=%g is taken",
+                num_whole,
+                ", ".join(candidates.group_names),
+                choice.penalty,
             )
         selection = candidates.select(choice.structure)
         is_pooled = selection.pooling is not None and self.drop_channels > 0
