@@ -209,7 +209,7 @@ def test_bad_input_is_refused_before_anything_is_simulated(overrides, line, tmp_
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["split.seen=[A]"], "all recordings are of one"),
+        (["split.seen=[A]", "data.cycles=2", "split.train_fraction=0.5"], "there is one"),
         (["recipe=paper", "recipe.penalties=[0.1]"], "give several recipe.penalties"),
     ],
 )

@@ -310,6 +310,14 @@ def test_files_of_several_rates_are_brought_to_one(tmp_path):
         assert torch.allclose(read.samples[:, middle], expected[middle].expand(3, -1), atol=5e-3)
 
 
+def test_a_rate_that_time_stamps_show_but_for_rounding_is_resampled_as_it_is_meant(tmp_path):
+    table(tmp_path / "A_1.csv", samples(1, 480), times=np.arange(480) / 48)
+    table(tmp_path / "A_2.csv", samples(2, 240), times=np.arange(240) / 23.9999968)
+    manifest(tmp_path, "A_1.csv,A,1,2,,", "A_2.csv,A,2,2,,")
+    source = FileRecordings(tmp_path, reading={"resample_hz": 48.0})
+    assert [source.load(one).samples.shape[1] for one in source.ids] == [480, 480]
+
+
 def test_truth_follows_the_clock_of_the_file(tmp_path):
     """A logger that counts 199.5 Hz is taken as 200 Hz; its fifth second is not ours."""
     rates = (199.5, 199.6, 200.2)

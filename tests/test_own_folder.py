@@ -4,6 +4,7 @@ import json
 import shutil
 
 import pytest
+import torch
 import yaml
 from contract.recordings import CHANNELS, HELD_OUT, SEEN, TRIALS
 from hydra.core.config_store import ConfigStore
@@ -12,6 +13,8 @@ from tactslip_torch import SlipDetector
 from tactslip_torch.commands.configuration import checked
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import everything, leave_groups_out
+from tactslip_torch.training.bins import SampledBins
+from tactslip_torch.training.datamodule import _grouping
 
 HAND = {
     "data": {"channels": CHANNELS, "reading": {"time": "time", "gaps": "missing"}},
@@ -166,3 +169,32 @@ def test_everything_has_one_role():
 
 def teardown_module():
     ConfigStore.instance().repo.pop("own", None)
+
+
+@pytest.mark.parametrize(
+    ("sessions", "expected"),
+    [(["", ""], {"cup/0", "cup/1"}), (["", "2"], {"session 1", "session 2"})],
+)
+def test_of_one_object_validation_leaves_out_sessions_or_recordings(sessions, expected):
+    ids = [RecordingId("cup", cycle, session=session) for cycle, session in enumerate(sessions)]
+    (fold,) = everything([r for r in ids if not r.session] + ids[1:], role="train")
+    group = _grouping(fold.having("train"))
+    assert {group(r).replace("@2", "") for r in ids} == expected
+    assert _grouping([*ids, RecordingId("box", 0)])(ids[0]) == "cup"
+
+
+def test_recordings_of_one_label_are_joined_until_two_groups_have_both():
+    group = torch.arange(6).repeat_interleave(2)
+    sample = SampledBins(
+        torch.zeros(12, 1),
+        group >= 3,
+        group,
+        tuple("abcdef"),
+        torch.zeros(12),
+        ("",),
+        torch.ones(12, dtype=torch.float64),
+    )
+    joined = sample.joined()
+    assert len(joined.group_names) == 3
+    for each in range(3):
+        assert set(joined.is_slip[joined.group == each].tolist()) == {True, False}

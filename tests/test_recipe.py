@@ -12,6 +12,7 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.training import recipe as recipes
 from tactslip_torch.training.bins import BinSample, RecordingBins
 from tactslip_torch.training.choice import CandidateBins, balanced_accuracy, group_scores
 from tactslip_torch.training.recipe import FREE_CONSTANT, General, Paper
@@ -235,6 +236,17 @@ def test_a_grid_that_ends_at_its_edge_is_extended_and_logged(moved, caplog):
         fit = few.fit(moved[0], FAST_POOL)
     assert "extended by 0.0001" in caplog.text
     assert min(row["penalty"] for row in fit.validation) < 0.001
+
+
+@pytest.mark.parametrize(("degree", "wanted"), [([1, 2], {1}), (2, {2})])
+def test_of_many_bins_degree_2_is_no_candidate_unless_it_is_the_only_one(
+    moved, monkeypatch, degree, wanted
+):
+    for name in ("MOST_DUAL_BINS", "MOST_SQUARE_BINS"):
+        monkeypatch.setattr(recipes, name, 10)
+    recipe = replace(ALL, degree=degree, num_features=10, penalties=0.1)
+    rows = recipe.fit(moved[0], FAST_POOL, is_nested=False).validation
+    assert {row["kernel"]["degree"] for row in rows} == wanted
 
 
 SINGLE = [

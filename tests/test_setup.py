@@ -59,7 +59,8 @@ NAMES = [
         "{material:big_box|cup|tea_can}_{label:no_slip|slip}_*",
     ),
     (names("obj{a}_trial{n}.csv", a=range(4), n=range(3)), (), "obj{material}_trial{trial}"),
-    (names("rec{n}.csv", n=range(9)), (), "{material}"),
+    (names("rec{n}.csv", n=range(9)), (), "{material}{trial}"),
+    (["morning.csv", "noon.csv"], (), "{material}"),
 ]
 
 

@@ -1,4 +1,4 @@
-"""The detector that comes with the package, on its sample recording: ``tactslip demo``."""
+"""The detectors that come with the package, each on its sample recording: ``tactslip demo``."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from pathlib import Path
 def demo(folder: Path) -> None:
     """Find the slip of the sample recording, draw it, export the detector, copy the page.
 
+    Then the same, without a page, with a real recording.
+
     Args:
         folder: for ``detector.pt``, ``recording.npz``, the results of ``detect``, both ONNX files
-            and the page.
+            and the page; real recordings, with their detector and results, go into ``real``.
 
     Raises:
         FileExistsError: if the folder is there and not empty.
@@ -48,24 +50,59 @@ def demo(folder: Path) -> None:
         )
     else:
         print(f"\nThe slip began at {onset_s:.3f} s. The detector raised no alarm.")
+    print("Detector and recording are simulated.")
+    real = _real(folder / "real")
     print(
-        f"Detector and recording are simulated.\n\n"
-        f"picture       {folder / 'recording_onsets.png'}\n"
+        f"\npicture       {folder / 'recording_onsets.png'}\n"
         f"ONNX files    {folder / 'model.onnx'}, {folder / 'stream.onnx'}\n"
         f"page          needs Node 18 or later and, once, the internet:\n"
         f"              cd {page} && npm ci && node serve.mjs\n"
         f"              then open the address it prints: the recording plays\n"
         f"live          needs pip install websockets:\n"
-        f"              tactslip stream model={model} source={place} serve=true repeat=true"
+        f"              tactslip stream model={model} source={place} serve=true repeat=true\n"
+        f"real          {real}\n"
+        f"              tactslip setup {real}   looks at them, as at yours; then\n"
+        f"              tactslip train {real} recipe=pooled"
     )
+
+
+def _real(folder: Path) -> Path:
+    """Write the real recordings and detect in the one that its detector was not trained on.
+
+    Returns:
+        The folder of the recordings.
+    """
+    from tactslip_torch.commands.configuration import compose_config
+    from tactslip_torch.commands.detect import detect
+    from tactslip_torch.model.detector import SlipDetector
+    from tactslip_torch.pretrained import (
+        HELD_OUT,
+        REAL_NAME,
+        real_onset_s,
+        write_real_recordings,
+    )
+
+    recordings, model = folder / "recordings", folder / "detector.pt"
+    write_real_recordings(recordings)
+    SlipDetector.pretrained(REAL_NAME).save(model)
+    config = compose_config("detect")
+    config.model, config.input = str(model), str(recordings / HELD_OUT)
+    (found,) = detect(config, folder)["recordings"]
+    alarms = ", ".join(f"{alarm['alarm_s']:.2f} s" for alarm in found["alarms"]) or "none"
+    print(
+        f"\nReal recording of two XELA uSkin fingers that lose a box: it slips from "
+        f"{real_onset_s():.2f} s on, alarms at {alarms}.\n"
+        "Its detector was trained on six others, too few to say how often it is right."
+    )
+    return recordings
 
 
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(
         prog="tactslip demo",
-        description="Find the slip in the sample recording that comes with the package, draw it, "
-        "and write the detector as ONNX with a page for the browser. All of it is simulated.",
+        description="Find the slip in the recordings that come with the package, a simulated and "
+        "a real one, draw it, and write a detector as ONNX with a page for the browser.",
         epilog="example: tactslip demo --out first",
     )
     parser.add_argument(

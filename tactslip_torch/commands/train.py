@@ -122,7 +122,7 @@ def _experiment(config: DictConfig) -> Experiment:
         alarm.hop_samples(maker.pool.sample_rate_hz, maker.pool.bin_samples)
         trained = [{r for fold in folds for r in fold.having(*ROLES)}]
         trained = trained if config.train_on_all else [set(f.having("train")) for f in folds]
-        if why := _why_unvalidated(recipe, min(len({r.material for r in of}) for of in trained)):
+        if why := _why_unvalidated(recipe, min(map(len, trained))):
             log.warning("%s: %s", _NO_ALARM, why)
     return Experiment(
         maker=maker,
@@ -156,10 +156,10 @@ def _refuse_simulated_streams(config: DictConfig, source: RecordingSource) -> No
     )
 
 
-def _why_unvalidated(recipe: Recipe, num_materials: int) -> str | None:
+def _why_unvalidated(recipe: Recipe, num_recordings: int) -> str | None:
     """Why there will be no scores of recordings left out, which an alarm needs."""
-    if num_materials < 2:
-        return "training leaves objects out for it, and all recordings are of one; record another"
+    if num_recordings < 2:
+        return "training leaves recordings out for it, and there is one; record another"
     if isinstance(recipe, Paper) and len(recipe.penalties_ascending) < 2:
         return "recipe=paper leaves objects out where it chooses; give several recipe.penalties"
     return None

@@ -2,12 +2,14 @@
 
 The step is the common slope of the times between pauses. A sample may come late if the next few
 make up for it; what stays late is a gap, as many samples as steps. Stamps may be rounded down to a
-unit, even one as long as a step or two, as milliseconds are at 2 kHz.
+unit, even one as long as a step or two, as milliseconds are at 2 kHz. Times of hours are gone
+through in blocks: beside them one array as long is kept.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
@@ -21,6 +23,7 @@ GapRule = Literal["refuse", "missing", "bridge"]
 
 _Numbers = NDArray[np.float64]
 _MOST_FOR_STEP = 1 << 18  # times that the step is found from
+_BLOCK = 1 << 17  # times that are gone through together, a multiple of the next
 _PHASE_BLOCK = 1024  # samples of which one phase is kept, to see a drift
 _MAKES_UP = 8  # so many samples may pass until a late one must have been made up for
 _WINDOW = 64  # samples over which neighbours are compared
@@ -89,15 +92,14 @@ def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "tim
     if not np.isfinite(times).all():
         place = int(np.argmin(np.isfinite(times)))
         raise ValueError(f"{name}: the time of sample {place} is {times[place]}")
-    if (is_back := np.diff(times) < 0).any():
+    if (is_back := times[1:] < times[:-1]).any():
         place = int(np.argmax(is_back))
         raise ValueError(
             f"{name}: time goes back at sample {place + 1}, from {times[place]:g} to "
             f"{times[place + 1]:g} s; sort the file, or go without: {setting('reading.time')}=null"
         )
     _refuse_jumps(times, name)
-    seconds = times - times[0]
-    start = seconds[:_MOST_FOR_STEP]
+    start = times[:_MOST_FOR_STEP] - times[0]
     _refuse_bursts(np.diff(start), name)
     step_s, unit_s = _step_of(start, name)
     if stated_hz is not None and abs(stated_hz * step_s - 1) > _RATE_ERR:
@@ -106,25 +108,79 @@ def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "tim
             f"{_unit_hint(stated_hz * step_s)}"
             f"correct it, or go without the times: {setting('reading.time')}=null"
         )
-    late = seconds / step_s - np.arange(len(seconds))
+    late = _Lateness(times, step_s)
     gaps, jitter = _gaps_in(late, step_s, unit_s / step_s, name)
-    missing = np.zeros(len(late))
-    missing[[gap.place for gap in gaps]] = [gap.missing for gap in gaps]
-    missing = missing.cumsum()
-    ticks = np.arange(len(late)) + missing
-    slope = float(np.polyfit(ticks, late - missing, 1)[0])
-    rest = late - missing - slope * ticks
-    blocks = range(0, len(rest) - _PHASE_BLOCK // 2, _PHASE_BLOCK)
-    phases = np.array([rest[place : place + _PHASE_BLOCK].mean() for place in blocks])
-    drift = float(np.abs(phases - np.median(phases)).max()) if len(phases) else 0.0
+    slope, drift = _drift_in(late, gaps)
     step_s *= 1 + slope
     rate_hz = stated_hz if stated_hz is not None else 1 / step_s
     num_samples = len(times) + sum(gap.missing for gap in gaps)
     return Clock(rate_hz, num_samples, gaps, step_s * max(jitter, drift if drift > 1 else 0.0))
 
 
+class _Lateness(NamedTuple):
+    """How many steps times are behind their numbers, by stretches.
+
+    Args:
+        times: in seconds, ``[T]``.
+        step_s: from a sample to the next.
+    """
+
+    times: _Numbers
+    step_s: float
+
+    def of(self, first: int, stop: int) -> _Numbers:
+        """Of the times from ``first`` to before ``stop``."""
+        seconds = self.times[first:stop] - self.times[0]
+        return np.asarray(seconds / self.step_s - np.arange(first, first + len(seconds)))
+
+    def calm(self, first: int, stop: int) -> _Numbers:
+        """The same without what is made up for by the next few."""
+        beside = 4 * (_MAKES_UP + 1)  # as far as four filters reach
+        since, until = max(first - beside, 0), min(stop + beside, len(self.times))
+        padded = np.pad(self.of(since, until), _MAKES_UP + 1, mode="edge")
+        found = grey_closing(grey_opening(padded, _MAKES_UP + 1), _MAKES_UP + 1)
+        found = found[_MAKES_UP + 1 : -_MAKES_UP - 1]
+        return np.asarray(found[first - since : stop - since])
+
+    def blocks(self) -> Iterator[tuple[int, int]]:
+        """Starts and ends of blocks of all times."""
+        for first in range(0, len(self.times), _BLOCK):
+            yield first, min(first + _BLOCK, len(self.times))
+
+
+def _drift_in(late: _Lateness, gaps: Sequence[_Gap]) -> tuple[float, float]:
+    """By how much the step is longer, of itself, and the most that phases differ, in steps."""
+    places = np.array([gap.place for gap in gaps], dtype=np.int64)
+    sums = np.cumsum([0, *(gap.missing for gap in gaps)]).astype(np.float64)
+
+    def ticks_and_rest(first: int, stop: int) -> tuple[_Numbers, _Numbers]:
+        numbers = np.arange(first, stop)
+        missing: _Numbers = sums[np.searchsorted(places, numbers, side="right")]
+        return numbers + missing, late.of(first, stop) - missing
+
+    num = len(late.times)
+    totals = np.zeros(2)
+    for block in late.blocks():
+        totals += [values.sum() for values in ticks_and_rest(*block)]
+    mean_tick, mean_rest = totals / num
+    products = np.zeros(2)
+    for block in late.blocks():
+        ticks, rest = ticks_and_rest(*block)
+        ticks -= mean_tick
+        products += [ticks @ (rest - mean_rest), ticks @ ticks]
+    slope = float(products[0] / products[1])
+    phases: list[float] = []
+    for first, stop in late.blocks():
+        ticks, rest = ticks_and_rest(first, stop)
+        rest -= slope * ticks
+        whole = range(0, min(stop, num - _PHASE_BLOCK // 2) - first, _PHASE_BLOCK)
+        phases += [float(rest[place : place + _PHASE_BLOCK].mean()) for place in whole]
+    apart = np.abs(np.array(phases) - np.median(phases)) if phases else np.zeros(1)
+    return slope, float(apart.max())
+
+
 def _gaps_in(
-    late: _Numbers, step_s: float, unit: float, name: str
+    late: _Lateness, step_s: float, unit: float, name: str
 ) -> tuple[tuple[_Gap, ...], float]:
     """Where samples are missing, and by how many steps one came late that was made up for.
 
@@ -140,10 +196,12 @@ def _gaps_in(
     Raises:
         ValueError: if late samples cannot be told from missing ones, or samples are there twice.
     """
-    padded = np.pad(late, _MAKES_UP + 1, mode="edge")
-    calm = grey_closing(grey_opening(padded, _MAKES_UP + 1), _MAKES_UP + 1)
-    calm = calm[_MAKES_UP + 1 : -_MAKES_UP - 1]
-    spread = _width_of(calm)
+    level, jitter = np.empty(len(late.times)), 0.0
+    for first, stop in late.blocks():
+        calm = late.calm(first, stop)
+        jitter = max(jitter, float(np.abs(late.of(first, stop) - calm).max()))
+        level[first:stop] = calm
+    spread = _width_of(level)
     if spread > 1 + unit:
         raise ValueError(
             f"{name}: its times come so unevenly, by up to {spread * step_s:.3g} s, that missing "
@@ -152,13 +210,16 @@ def _gaps_in(
     slip = abs(unit - round(unit))
     beat = 1 / slip if slip > 2 / _MOST_FOR_STEP else 0.0  # samples until rounding repeats
     reach = max(_WINDOW, round(2 * beat))
-    is_change = np.abs(np.diff(calm, prepend=calm[0])) > 0.5 + spread + unit
+    changes: list[int] = []
+    for first, stop in late.blocks():
+        own = level[max(first - 1, 0) : stop]
+        is_change = np.abs(np.diff(own)) > 0.5 + spread + unit
+        changes += (is_change.nonzero()[0] + max(first, 1)).tolist()
     gaps: list[_Gap] = []
     total = 0
-    level = calm.copy()  # missing samples taken off
-    for place, until in pairwise([*is_change.nonzero()[0].tolist(), len(late)]):
-        before = level[max(place - reach, 0) : place].mean()
-        behind = calm[place : min(until, place + reach)].mean()
+    for place, until in pairwise([*changes, len(level)]):
+        before = level[max(place - reach, 0) : place].mean()  # missing samples taken off
+        behind = level[place : min(until, place + reach)].mean()
         missing = math.floor(behind - before + 0.4)
         if missing < total:
             raise ValueError(
@@ -169,18 +230,18 @@ def _gaps_in(
             gaps.append(_Gap(place + total, missing - total, place))
             total = missing
         level[place:until] -= total
-    return tuple(gaps), float(np.abs(late - calm).max())
+    return tuple(gaps), jitter
 
 
 def _refuse_jumps(times: _Numbers, name: str) -> None:
     """Refuse times of which a clock would have mostly missing samples, before it has any."""
-    steps = np.diff(times)
+    steps = np.diff(times[:_MOST_FOR_STEP])
     forward = steps[steps > 0]
     if not len(forward):
         return  # a burst
     num = (times[-1] - times[0]) / np.median(forward)
     if num > (1 + _MOST_LOST) * len(times) + _FREE:
-        place = int(np.argmax(steps))
+        place = int(np.argmax(np.diff(times)))
         raise ValueError(
             f"{name}: time jumps at sample {place + 1}, from {times[place]:.9g} to "
             f"{times[place + 1]:.9g} s; cut the file there, or {_hint()}"

@@ -231,6 +231,9 @@ def _fields(parts: Sequence[_Part], label_words: set[str]) -> dict[int, str]:
     take("material", [p for p in free() if parts[p].is_repeated and before(p) in _OBJECTS])
     take("scene", [p for p in free() if p in words and len(parts[p].counts) <= _MOST_SCENES])
     take("trial", [p for p in reversed(free()) if parts[p].kind == "number"])
+    if "trial" in found.values():  # numbers of one object, whose name all files have
+        alike = [p for p, part in enumerate(parts) if part.is_fixed and part.segment == 0]
+        take("material", [p for p in alike if parts[p].kind in ("word", "text")])
     return found
 
 

@@ -633,8 +633,9 @@ class FileRecordings:
                 heads.append((entry, found))
         rate_hz = _common_rate([head for _, head in heads])
         for entry, head in heads:
-            if head.is_measured and abs(head.rate_hz / rate_hz - 1) <= _RATE_ERROR:
-                head = head._replace(rate_hz=rate_hz)
+            if head.is_measured:
+                is_near = abs(head.rate_hz / rate_hz - 1) <= _RATE_ERROR
+                head = head._replace(rate_hz=rate_hz if is_near else nominal_rate(head.rate_hz))
             wrong = self._difference(head, *heads[0], rate_hz)
             times, misfits = (Timeline(), [wrong]) if wrong else self._timed(entry, head)
             problems += map(entry.problem, misfits)

@@ -504,7 +504,7 @@ class SlipDetector(nn.Module):
         folder = PACKAGE / "pretrained"
         known = sorted(path.stem for path in folder.glob("*.pt"))
         if name not in known:
-            raise ValueError(f"no pretrained detector {name!r}; there is {', '.join(known)}")
+            raise ValueError(f"no pretrained detector {name!r}; there are {', '.join(known)}")
         return cls.load(folder / f"{name}.pt", backend)
 
     @classmethod

@@ -60,3 +60,15 @@ def write_real_recordings(folder: Path) -> list[Path]:
             paths.append(folder / f"{name}.csv")
             paths[-1].write_text("\n".join(rows) + "\n", encoding="utf-8")
     return paths
+
+
+def real_onset_s() -> float:
+    """When the box begins to slip in ``HELD_OUT``, by its labels.
+
+    Example:
+        >>> round(real_onset_s(), 2)
+        1.34
+    """
+    name = HELD_OUT.removesuffix(".csv")
+    with np.load(REAL) as stored:
+        return float(stored[f"{name}_slip"].argmax() / stored[f"{name}_rate_hz"])

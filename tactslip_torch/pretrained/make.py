@@ -40,7 +40,7 @@ TRAIN = ["+exp=unseen4", "onset=debounced", "baselines=false", "export=false"]
 SCENE = Scene(
     "wood", seed=7, session="sample", strokes=(Stroke(40.0, 40.0, pause_s=1.2),), tail_s=0.4
 )
-SETUP_REAL = ["--yes"]
+SETUP_REAL = ["--yes", "--units", "counts"]
 TRAIN_REAL = ["recipe=pooled", "baselines=false", "export=false"]
 _XELA = (
     "Recordings of two XELA uSkin fingers: github.com/imanlab/proactive-slip-control, data_set; "
@@ -116,6 +116,7 @@ def _make_real_detector() -> None:
     info = {name: value for name, value in detector.info.items() if name not in _LEFT_OUT}
     detector.info = info | {
         "name": REAL_NAME,
+        "trained_on": sorted(detector.info["train_recordings"]),
         "made_by": " ".join(["tactslip train", *TRAIN_REAL]),
         "source": _XELA,
         "versions": versions(),

@@ -595,7 +595,8 @@ def _structure(row: Mapping[str, Any]) -> tuple[str, ...]:
 def _scene_rows(metrics: _Metrics) -> list[dict[str, Any]]:
     """Scores by role, then scene, then detector: the paper's scene first, then those trained on.
 
-    Empty if all is of one kind of scene. ``is_trained`` is ``None`` where the results do not tell.
+    Empty if all is of one kind of scene, or each detector was trained on all of them.
+    ``is_trained`` is ``None`` where the results do not tell.
     """
     is_fit = "detector" not in metrics  # evaluate's training role is not what was trained on
     rows = []
@@ -610,7 +611,7 @@ def _scene_rows(metrics: _Metrics) -> list[dict[str, Any]]:
     of_any = {row["scene"] for row in rows if row["is_trained"]}
     scenes.sort(key=lambda scene: (scene != "paper", scene not in of_any))
     rows.sort(key=lambda row: (roles.index(row["role"]), scenes.index(row["scene"])))
-    return rows if len(scenes) > 1 else []
+    return rows if len(scenes) > 1 and not all(row["is_trained"] for row in rows) else []
 
 
 def confound_table(metrics: _Metrics) -> str:

@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,13 @@ def _fit_forest(columns: Tensor, sample: SampledBins) -> Any:
     return made.fit(columns.numpy(), truth, sample_weight=weights).set_params(n_jobs=None)
 
 
+def _says_forest(made: Any, columns: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """As ``made.predict``, which takes twice as long for the few bins of a recording."""
+    x = columns.astype(np.float32)
+    votes = sum(tree.predict_proba(x, check_input=False) for tree in made.estimators_)
+    return np.asarray(votes[:, 1] > votes[:, 0])
+
+
 class PooledNumber:
     """The mean or deviation over channels of one descriptor with the best balanced accuracy.
 
@@ -229,7 +237,8 @@ class Baselines:
                 votes = [tree.predict_proba(few, check_input=False) for tree in made.estimators_]
                 found[name] = torch.from_numpy(made.classes_[np.mean(votes, 0).argmax(1)])
                 continue
-            found[name] = torch.from_numpy(made.predict(x) if len(x) else np.zeros(0, bool))
+            predict = partial(_says_forest, made) if "forest" in name else made.predict
+            found[name] = torch.from_numpy(predict(x) if len(x) else np.zeros(0, bool))
         return found
 
 

@@ -76,14 +76,18 @@ class SampledBins:
     def joined(self, most: int = MOST_GROUPS) -> SampledBins:
         """The same bins in at most so many groups, those joined called ``cup and 4 more``.
 
-        Groups are dealt out from the largest on, each to where bins of its commoner class are
-        fewest; of equal ones the name decides.
+        In fewer where no two groups have both classes, so that as many as can have them do. Groups
+        are dealt out from the largest on, each to where bins of its commoner class are fewest; of
+        equal ones the name decides.
         """
         num = len(self.group_names)
-        if num <= most:
-            return self
         counts = torch.zeros(num, 2, dtype=torch.float64)
         counts.index_put_((self.group, self.is_slip.long()), self.weight, accumulate=True)
+        has = counts > 0
+        if int(has.all(1).sum()) < 2 <= int(has.sum(0).min()):
+            most = min(most, int(has.sum(0).min()))
+        if num <= most:
+            return self
         joined, members = (
             torch.zeros(most, 2, dtype=torch.float64),
             [list[int]() for _ in range(most)],

@@ -139,15 +139,12 @@ def choose_model(
     """Choose a structure and a penalty.
 
     Args:
-        bins: sampled training bins.
+        bins: sampled training bins, of which two groups or more have both classes.
         structures: to choose from, the simplest first.
         penalties: to choose from, ascending.
         tolerance: of balanced accuracy, within which a simpler candidate is as good.
         is_nested: whether to evaluate the choice itself by leaving out two groups.
         show: a progress bar.
-
-    Raises:
-        ValueError: if there are not two groups with bins of both classes.
     """
     groups = bins.whole_groups()
     if not all(each.use == "pooled" and each.kernel.degree == 1 for each in structures):
@@ -213,19 +210,9 @@ class CandidateBins:
         self.is_kept = torch.ones_like(sample.is_slip)
 
     def whole_groups(self) -> list[int]:
-        """The groups with bins of both classes.
-
-        Raises:
-            ValueError: if there are not two.
-        """
+        """The groups with bins of both classes, of which validation needs two."""
         numbers = range(len(self.group_names))
-        whole = [g for g in numbers if has_both_classes(self.is_slip[self.groups == g])]
-        if len(whole) < 2:
-            raise ValueError(
-                "validation leaves out groups and needs two with bins of both classes, got "
-                f"{len(whole)} of {', '.join(self.group_names)}; add recordings of others"
-            )
-        return whole
+        return [g for g in numbers if has_both_classes(self.is_slip[self.groups == g])]
 
     def thinned(self) -> CandidateBins:
         """The same, to be fitted to fewer bins of each stratum; those that stay weigh more."""

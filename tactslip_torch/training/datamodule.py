@@ -268,17 +268,27 @@ class TrainingBins:
     recordings: Sequence[RecordingId]
 
     def __iter__(self) -> Iterator[RecordingBins]:
+        group = _grouping(self.fold.having("train"))
         for recording in self.recordings:
             made = self.maker(recording).in_split(self.fold)
             some = made.of(made.roles["train"])
             yield RecordingBins(
                 str(recording),
-                recording.material,
+                group(recording),
                 some.features,
                 some.is_slip,
                 recording.scene,
                 made.longest_run,
             )
+
+
+def _grouping(recordings: Sequence[RecordingId]) -> Callable[[RecordingId], str]:
+    """What validation leaves out: materials; of one its sessions, of one session recordings."""
+    if len({recording.material for recording in recordings}) > 1:
+        return lambda recording: recording.material
+    if len({recording.session for recording in recordings}) > 1:
+        return lambda recording: f"session {recording.session or 1}"
+    return str
 
 
 class SlipDataModule(L.LightningDataModule):

@@ -307,6 +307,7 @@ def make_trainer(config: DictConfig, folder: Path) -> L.Trainer:
     # Lightning's advertisements and a deprecation inside it are nothing a user can act on
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).*")
+    warnings.filterwarnings("ignore", message="Experiment logs directory .* exists")  # said before
     trainer: L.Trainer = instantiate(
         config,
         default_root_dir=str(folder),

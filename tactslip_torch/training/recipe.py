@@ -72,6 +72,9 @@ POOLING = ("mean", "std", "min", "max")
 MOST_DUAL_BINS = 2500
 """Up to so many training bins a machine of degree 2 on all features is a candidate: it does not
 fold, so its cost grows with the bins."""
+MOST_SQUARE_BINS = 60_000
+"""Up to so many training bins degree 2 is a candidate beside degree 1: the 7,381 products of 120
+columns take some minutes of a processor for as many bins."""
 
 
 @dataclass(frozen=True)
@@ -327,7 +330,8 @@ class General(_Recipe):
             half where nothing is pooled.
         use: ``"channel"`` features, ``"pooled"`` ones or ``"both"``.
         num_features: how many are selected, best first; ``None`` takes all.
-        degree: of the polynomial kernel, 1 or 2.
+        degree: of the polynomial kernel, 1 or 2; of both, only 1 is a candidate for more than
+            60,000 training bins.
         pooling: statistics over the channels of a kind, as ``features.pooling`` has them.
         tolerance: choices within so much of the best balanced accuracy are as good: of them, the
             simplest machine with the strongest penalty is taken.
@@ -413,13 +417,17 @@ class General(_Recipe):
         candidates = CandidateBins(sample, weight, pool, allowed, self.pooling)
         num_bins = round(float(sample.weight.sum()))
         structures, penalties = self._structures(num_bins), self.penalties_ascending
-        if len(sample.group_names) > 1:
+        if (num_whole := len(candidates.whole_groups())) > 1:
             how = {"is_nested": is_nested, "show": show}
             choice = choose_model(candidates, structures, penalties, self.tolerance, **how)
         else:
             choice = Choice(structures[0], penalties[len(penalties) // 2])
             log.warning(
-                "%s, C=%g are taken unvalidated: one group", choice.structure, choice.penalty
+                "no recordings are left out to choose by: that needs two groups with slip and "
+                "non-slip, got %d of %s; C=%g is taken",
+                num_whole,
+                ", ".join(candidates.group_names),
+                choice.penalty,
             )
         selection = candidates.select(choice.structure)
         is_pooled = selection.pooling is not None and self.drop_channels > 0
@@ -446,10 +454,13 @@ class General(_Recipe):
         """
         sizes = sorted(_several(self.num_features), key=lambda size: (size is not None, size or 0))
         may_grow = num_bins <= MOST_DUAL_BINS
+        may_square = num_bins <= MOST_SQUARE_BINS or len(self.kernels) == 1
         found = [
             Structure(use, size, kernel)
             for size, kernel, use in itertools.product(sizes, self.kernels, _several(self.use))
-            if kernel.degree == 1 or may_grow or (size is not None and not self.scene_weights)
+            if kernel.degree == 1
+            or may_grow
+            or (may_square and size is not None and not self.scene_weights)
         ]
         if not found:
             raise ValueError(

@@ -65,7 +65,7 @@ def test_train_leaves_its_files_and_counts_every_bin(trained):
 
 def test_evaluate_gives_what_training_gave(command, trained_or_slow, recordings, cache, tmp_path):
     trained = trained_or_slow
-    data = [*of_set(recordings), *split_of_set()]
+    data = [*of_set(recordings), "split=unseen4", *split_of_set()]
     told = settings(model=trained.file, workers=0, cache=cache, folder="run")
     command.well(tmp_path, "evaluate", *data, *told)
     splits = read(tmp_path / "run" / names.METRICS)[names.SPLITS]
@@ -148,7 +148,7 @@ def test_detect_does_without_masked_channels(command, paper, recordings, tmp_pat
 def test_converted_recordings_are_the_same_set(command, paper, recordings, tmp_path):
     told = settings(root_of_data=recordings, channels=CHANNELS, workers=0)
     command.well(tmp_path, "data", *settings(action=names.CONVERT, format="h5", output="to"), *told)
-    data = [*settings(data="files", root="to"), *split_of_set()]
+    data = [*settings(data="files", root="to"), "split=unseen4", *split_of_set()]
     words = settings(model=paper.file, workers=0, cache="off", folder="run")
     command.well(tmp_path, "evaluate", *data, *words)
     splits = read(tmp_path / "run" / names.METRICS)[names.SPLITS]
