@@ -272,6 +272,27 @@ def test_compression_scaler_and_pooling_of_a_fold_are_learned_without_the_left_o
         assert row["balanced_accuracy"][out.group] == pytest.approx(expected, abs=1e-9)
 
 
+def test_of_many_groups_several_are_left_out_together_and_train_nothing(rng):
+    bins = moving_slip(rng, [f"M{number:02}" for number in range(13)])
+    recipe = replace(
+        ALL, use="pooled", num_features=None, degree=1, penalties=0.1, drop_channels=0.0
+    )
+    (row,) = recipe.fit(bins, FAST_POOL, is_nested=False).validation
+    sample = BinSample(recipe.sample_bins)
+    for of in bins:
+        sample.update(of)
+    whole, joined = sample.bins(), sample.bins().joined()
+    assert list(row["balanced_accuracy"]) == list(joined.group_names)
+    left_out = []
+    for place, name in enumerate(joined.group_names):
+        groups = {whole.group_names[group] for group in whole.group[joined.group == place]}
+        left_out += groups
+        inside, others = ([of for of in bins if (of.group in groups) == is_in] for is_in in (1, 0))
+        expected = accuracy(recipe.fit(others, FAST_POOL, is_nested=False), inside)
+        assert row["balanced_accuracy"][name] == pytest.approx(expected, abs=1e-9)
+    assert sorted(left_out) == sorted({of.group for of in bins})
+
+
 @pytest.mark.parametrize("seed", [0, 4])  # draws by which the choices differ, and their scores
 def test_the_nested_score_of_a_group_is_of_the_choice_made_without_it(seed):
     """Not of the overall choice, which has seen the group."""
