@@ -2,11 +2,12 @@
 
 import itertools
 from collections import deque
+from dataclasses import replace
 
 import pytest
 import torch
 
-from tactslip_torch.data.labels import LabelRule, label_bins
+from tactslip_torch.data.labels import LabelRule, bins_of
 from tactslip_torch.data.recording import RecordingId, Timeline
 from tactslip_torch.onset.events import LatencyParts
 from tactslip_torch.training import evaluation
@@ -20,11 +21,12 @@ def batch_of(onsets=(2.0, 6.0), ends=(4.0, 8.0), stretches=(), roles=None, slip_
     """What the learner sees of a recording without disturbances, features left out."""
     rule = LabelRule(**rule)
     slides, speeds = tuple(zip(onsets, ends, strict=True)), (20.0, 40.0)[: len(onsets)]
-    bins = label_bins(rule, onsets, slides, 12.0, RATE_HZ, stretches, slip_s)
+    times = Timeline(onsets_s=onsets, speeds_mm_s=speeds, sliding_s=slides)
+    labelled = replace(times, non_slip_s=stretches, slip_s=slip_s, duration_s=12.0)
+    bins = bins_of(rule, labelled, RATE_HZ)
     num, speed = len(bins.starts), torch.tensor([*speeds, 0.0])[bins.stroke]
     ends_s = (bins.starts + bins.bin_samples).double() / RATE_HZ
     columns = torch.zeros(num, 1), bins.is_slip, speed, bins.position, bins.stroke, ends_s
-    times = Timeline(onsets_s=onsets, speeds_mm_s=speeds, sliding_s=slides)
     hop_s, roles = (rule.hop_ms or rule.bin_ms) / 1000, roles or {"test": torch.ones(num) > 0}
     return RecordingFeatures(RecordingId("M1", 0), *columns, times, hop_s, roles)
 

@@ -12,7 +12,6 @@ from tactslip_torch.data.labels import (
     NO_POSITION,
     LabelRule,
     bins_of,
-    label_bins,
 )
 from tactslip_torch.data.recording import Timeline
 
@@ -24,7 +23,9 @@ HALF = LabelRule(layout="half_second")
 
 
 def lay(rule=None, onsets=ONSETS, slides=SLIDES, duration_s=DURATION, rate=RATE, **stretches):
-    return label_bins(rule or LabelRule(), onsets, slides, duration_s, rate, **stretches)
+    stretches = {name: tuple(each) for name, each in stretches.items()}
+    times = Timeline(tuple(onsets), sliding_s=tuple(slides), duration_s=duration_s, **stretches)
+    return bins_of(rule or LabelRule(), times, rate)
 
 
 # Layouts -------------------------------------------------------------------------------------
@@ -95,8 +96,8 @@ def test_bins_are_those_laid_by_hand(layout, hop_ms, strokes, late_s, non_slip_s
         slides.append((now + pause_s, now + pause_s + length_s))
         now = slides[-1][1]
     marked = [start + late_s for start, _ in slides]
-    told = (rule, marked, slides, 8.0, RATE, non_slip_s, slip_s)
-    expected, bins = by_hand(*told), label_bins(*told)
+    told, spans = (rule, marked, slides, 8.0, RATE), {"non_slip_s": non_slip_s, "slip_s": slip_s}
+    expected, bins = by_hand(*told, **spans), lay(*told, **spans)
     columns = bins.starts, bins.is_slip, bins.stroke, bins.position
     assert [*zip(*(column.tolist() for column in columns), strict=True)] == expected
     dtypes = torch.int64, torch.bool, torch.int64, torch.int64

@@ -62,7 +62,7 @@ def setup(
     if proposal.manifest:
         write_table(folder / MANIFEST, list(proposal.manifest[0]), proposal.manifest)
         print(f"\n{folder / MANIFEST} lists the recordings with their intervals")
-    (folder / HAND_FILE).write_text(hand_yaml(proposal), encoding="utf-8")
+    (folder / HAND_FILE).write_text(_hand_yaml(proposal), encoding="utf-8")
     print(f"\n{folder / HAND_FILE} says how the recordings are read; change what is wrong there")
     _draw(folder, proposal)
     return proposal
@@ -104,7 +104,7 @@ def _number(text: str, flag: str) -> float:
 # hand.yaml ----------------------------------------------------------------------------------------
 
 
-def hand_yaml(proposal: Proposal) -> str:
+def _hand_yaml(proposal: Proposal) -> str:
     """The settings of a proposal as YAML, with the reason of each value."""
     lines = ["# How the recordings of this folder are read and labelled (tactslip setup).", ""]
     for section, settings in proposal.settings.items():

@@ -319,15 +319,8 @@ class LabelledBins:
     bin_samples: int
 
 
-def label_bins(
-    rule: LabelRule,
-    onsets_s: Sequence[float],
-    sliding_s: Sequence[Stretch],
-    duration_s: float,
-    sample_rate_hz: float,
-    non_slip_s: Sequence[Stretch] = (),
-    slip_s: Sequence[Stretch] = (),
-    unlabelled_s: Sequence[Stretch] = (),
+def bins_of(
+    rule: LabelRule, times: Timeline, sample_rate_hz: float, before: int = 0, after: int = 0
 ) -> LabelledBins:
     """Lay bins around the onsets of a recording, and in its stretches of slip or of none.
 
@@ -335,32 +328,40 @@ def label_bins(
     wholly between what was slip or not labelled and the onset, or wholly inside a stretch. Bins of
     a stretch start with it, a hop apart; those that would meet a bin of a stroke, one of an earlier
     stretch, or a slide are left out. With the other assignments the same samples have a label, and
-    bins are those of which all have one. Nothing is laid before the start of the recording. One
-    without onsets and stretches has no bins.
+    bins are those of which all have one. Nothing is laid before the start of the recording, nor
+    where a bin needs missing samples. One without onsets and stretches has no bins.
 
     Args:
         rule: the layout.
-        onsets_s: one per stroke, annotated or exact as the caller chose.
-        sliding_s: start and end of each slide, exact. Strokes read only the ends.
-        duration_s: length of the recording.
+        times: of the recording.
         sample_rate_hz: of the recording.
-        non_slip_s: start and end of each stretch that is non-slip beside what is around onsets.
-        slip_s: the same of slip; its bins come last if bins are whole.
-        unlabelled_s: stretches that are not non-slip although an onset follows.
+        before: samples that the filter reads before a bin.
+        after: and behind it.
 
     Raises:
         ValueError: if a slide or stretch leaves the recording, or a bin is no whole number of
             samples.
     """
+    bins = _laid_bins(rule, times, sample_rate_hz)
+    first, stop = bins.starts - before, bins.starts + bins.bin_samples + after
+    is_whole = torch.ones_like(bins.is_slip)
+    for start_s, end_s in times.missing_s:
+        start, end = round(start_s * sample_rate_hz), round(end_s * sample_rate_hz)
+        is_whole &= (stop <= start) | (first >= end)
+    names = ("starts", "is_slip", "stroke", "position")
+    return replace(bins, **{name: getattr(bins, name)[is_whole] for name in names})
+
+
+def _laid_bins(rule: LabelRule, times: Timeline, sample_rate_hz: float) -> LabelledBins:
+    """Bins whether samples are missing or not."""
     bin_samples = whole_samples(rule.bin_ms, sample_rate_hz, "labels.bin_ms")
     hop = bin_samples
     if rule.hop_ms is not None:
         hop = whole_samples(rule.hop_ms, sample_rate_hz, "labels.hop_ms")
-    num_samples = round(duration_s * sample_rate_hz)
-    strokes = _strokes(
-        rule, onsets_s, sliding_s, (*slip_s, *unlabelled_s), num_samples, sample_rate_hz
-    )
-    told = [(stretch, False) for stretch in non_slip_s] + [(stretch, True) for stretch in slip_s]
+    num_samples = round(times.duration_s * sample_rate_hz)
+    strokes = _strokes(rule, times, num_samples, sample_rate_hz)
+    told = [(stretch, False) for stretch in times.non_slip_s]
+    told += [(stretch, True) for stretch in times.slip_s]
     stretches = [(*_samples_of(s, num_samples, sample_rate_hz), is_slip) for s, is_slip in told]
     if rule.assign != "whole":
         return _windows(rule, strokes, stretches, bin_samples, hop, num_samples)
@@ -416,23 +417,21 @@ class _Stroke(NamedTuple):
 
 
 def _strokes(
-    rule: LabelRule,
-    onsets_s: Sequence[float],
-    sliding_s: Sequence[Stretch],
-    others_s: Sequence[Stretch],
-    num_samples: int,
-    sample_rate_hz: float,
+    rule: LabelRule, times: Timeline, num_samples: int, sample_rate_hz: float
 ) -> list[_Stroke]:
     """What the layout labels around each onset.
 
-    No earlier time is non-slip than the end of ``others_s`` that lie before it. Onsets that a
-    column labels are exact; others are moved as the authors do.
+    No earlier time is non-slip than the end of what was slip or not labelled before it. Onsets that
+    a column labels are exact; others are moved as the authors do.
     """
+    is_annotated = rule.onsets == "annotated" and times.annotated_onsets_s
+    onsets_s = times.annotated_onsets_s if is_annotated else times.onsets_s
+    others_s = (*times.slip_s, *times.unlabelled_s)
     lead_s, shift_s = (1.0, 0.010) if rule.layout == "whole_slide" else (0.5, 0.0)
     shift_s = 0.0 if rule.column is not None else shift_s
     lead = round(lead_s * sample_rate_hz)
     found: list[_Stroke] = []
-    for onset_s, (start_s, end_s) in zip(onsets_s, sliding_s, strict=True):
+    for onset_s, (start_s, end_s) in zip(onsets_s, times.sliding_s, strict=True):
         edge = round((onset_s - shift_s) * sample_rate_hz)
         last = int(end_s * sample_rate_hz)
         if rule.layout == "half_second":
@@ -510,57 +509,6 @@ def _samples_of(stretch: Stretch, num_samples: int, sample_rate_hz: float) -> tu
             f"recording of {num_samples / sample_rate_hz:.3f} s"
         )
     return first, stop
-
-
-def bins_of(
-    rule: LabelRule, times: Timeline, sample_rate_hz: float, before: int, after: int
-) -> LabelledBins:
-    """The bins of a recording, without those that need missing samples; see ``label_bins``.
-
-    Args:
-        rule: the layout.
-        times: of the recording.
-        sample_rate_hz: of the recording.
-        before: samples that the filter reads before a bin.
-        after: and behind it.
-    """
-    bins = label_bins(
-        rule,
-        times.annotated_onsets_s if rule.onsets == "annotated" else times.onsets_s,
-        times.sliding_s,
-        times.duration_s,
-        sample_rate_hz,
-        times.non_slip_s,
-        times.slip_s,
-        times.unlabelled_s,
-    )
-    return _clear_of(bins, times.missing_s, before, after, sample_rate_hz)
-
-
-def _clear_of(
-    bins: LabelledBins,
-    missing_s: Sequence[Stretch],
-    before: int,
-    after: int,
-    sample_rate_hz: float,
-) -> LabelledBins:
-    """The bins of which no sample is missing that their filter needs.
-
-    Args:
-        bins: of a recording.
-        missing_s: start and end of each stretch without samples.
-        before: samples that the filter reads before a bin.
-        after: and behind it.
-        sample_rate_hz: of the recording.
-    """
-    first = bins.starts - before
-    stop = bins.starts + bins.bin_samples + after
-    is_whole = torch.ones_like(bins.is_slip)
-    for start_s, end_s in missing_s:
-        start, end = round(start_s * sample_rate_hz), round(end_s * sample_rate_hz)
-        is_whole &= (stop <= start) | (first >= end)
-    names = ("starts", "is_slip", "stroke", "position")
-    return replace(bins, **{name: getattr(bins, name)[is_whole] for name in names})
 
 
 def needed_windows(

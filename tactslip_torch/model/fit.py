@@ -384,7 +384,7 @@ def _gram_matrix(kernel: Polynomial, z: Tensor) -> Tensor:
 # Pattern Recognition 40(8), 2154-2162.
 
 
-class HeldOutFit(NamedTuple):
+class _HeldOutFit(NamedTuple):
     """A machine, and what its training bins would score without their groups.
 
     Attributes:
@@ -432,7 +432,7 @@ class HeldOut:
         else:
             self._system = kernel.sums(self._z, self._weights)
 
-    def at(self, penalty: float) -> HeldOutFit:
+    def at(self, penalty: float) -> _HeldOutFit:
         """The machine and the held-out scores for one value of C.
 
         The scores are right to 100 eps times the condition of the system of all bins.
@@ -448,7 +448,7 @@ class HeldOut:
         head, residuals = self._dual(penalty) if self._is_dual else self._primal(penalty)
         scores = torch.empty_like(residuals)
         scores[self._order] = self._targets - residuals
-        return HeldOutFit(head, scores)
+        return _HeldOutFit(head, scores)
 
     def _dual(self, penalty: float) -> tuple[Head, Tensor]:
         beta, report, factor = solve_symmetric(

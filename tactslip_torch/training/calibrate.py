@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.data.labels import LabelRule, label_bins
+from tactslip_torch.data.labels import LabelRule, bins_of
 from tactslip_torch.data.recording import Stretch, Timeline
 from tactslip_torch.model.calibration import Platt, fit_platt
 from tactslip_torch.model.detector import SlipDetector
@@ -129,17 +129,7 @@ class Calibrator:
             assign="majority" if self.rule.assign == "whole" else self.rule.assign,
             shuffle_seed=None,
         )
-        exact = times.onsets_s if rule.onsets == "exact" else times.annotated_onsets_s
-        laid = label_bins(
-            rule,
-            exact or times.onsets_s,
-            times.sliding_s,
-            times.duration_s,
-            rate_hz,
-            times.non_slip_s,
-            times.slip_s,
-            times.unlabelled_s,
-        )
+        laid = bins_of(rule, times, rate_hz)
         place = laid.starts // self.timing.hop_samples
         is_there = place < len(stream.score)
         place, is_slip = place[is_there], laid.is_slip[is_there]
