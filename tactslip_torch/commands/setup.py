@@ -79,16 +79,9 @@ def _answered(answers: Answers, question: Question, answer: str) -> Answers:
     if question.name in ("slip", "non_slip"):
         words = {word.strip(): question.name == "slip" for word in answer.split(",")}
         return replace(answers, words={**answers.words, **words})
-    if question.name == "pattern":
-        return replace(answers, pattern=answer)
-    if question.name == "column":
-        return replace(answers, column=answer)
-    number = _number(answer, question.flag)
-    return (
-        replace(answers, rate_hz=number)
-        if question.name == "rate_hz"
-        else replace(answers, over=number)
-    )
+    is_text = question.name in ("pattern", "column")
+    given: dict[str, Any] = {question.name: answer if is_text else _number(answer, question.flag)}
+    return replace(answers, **given)
 
 
 def _number(text: str, flag: str) -> float:
