@@ -431,11 +431,9 @@ class _Progress(tqdm):  # type: ignore[misc]
             state = self.format_dict
             of = "" if state["total"] is None else f" of {state['total']}"
             what = (self.desc or "").removesuffix(": ").strip()
-            left = (
-                ""
-                if not state["rate"] or state["total"] is None
-                else (f", {(state['total'] - state['n']) / state['rate']:.0f} s left")
-            )
+            left = ""
+            if state["rate"] and state["total"] is not None:
+                left = f", {(state['total'] - state['n']) / state['rate']:.0f} s left"
             log.info(
                 "%s: %s%s%s in %.0f s%s", what, state["n"], of, self.unit, state["elapsed"], left
             )

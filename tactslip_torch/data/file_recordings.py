@@ -825,8 +825,9 @@ class FileRecordings:
             samples = _even(opened, path, head, how)
             num = samples.num_samples
             if how.resample_hz is not None and how.resample_hz != rate_hz:
-                even = resample(samples.exact(0, num).double(), rate_hz, how.resample_hz)
-                kept = even[:, : self._num_recorded(head)].to(samples.dtype)
+                kept = _Resampled(samples, rate_hz, how.resample_hz).read(
+                    0, self._num_recorded(head)
+                )
             else:
                 kept = torch.full((samples.num_channels, num), torch.nan, dtype=samples.dtype)
                 for start, end in windows if windows is not None else [(0.0, num / rate_hz)]:

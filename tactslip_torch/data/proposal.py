@@ -479,9 +479,10 @@ def _propose_rate(found: Look, given: Answers, draft: Proposal) -> float:
         unit = f" in {table.time_unit}" if table.time_unit else ""
         how = "stated" if given.time else "by its name" if is_time(str(name)) else "it rises evenly"
         draft.tell("time", f"column {name}{unit}", how)
-    elif table.times_s is None and not table.rate_hz:
-        draft.set(f"{reading}.time", None, "the files have no times")
     if not has_times:
+        if wrong or not table.rate_hz:
+            why = "the times are uneven; samples are taken as even"
+            draft.set(f"{reading}.time", None, why if wrong else "the files have no times")
         rate_hz = given.rate_hz or (rates[0] if rates and not wrong else 0.0)
         if not rate_hz:
             own = [one.own_rate_hz for one in found.tables if one.own_rate_hz]
@@ -490,8 +491,6 @@ def _propose_rate(found: Look, given: Answers, draft: Proposal) -> float:
             text = f"How many samples a second does each channel have? ({why})"
             draft.ask("rate_hz", text, "--rate HZ", default)
             return 0.0
-        if wrong:
-            draft.set(f"{reading}.time", None, "the times are uneven; samples are taken as even")
         reason = "stated" if given.rate_hz else "the files say it"
         draft.set(f"{reading}.sample_rate_hz", rate_hz, reason)
         draft.tell("rate", f"{rate_hz:g} Hz", reason)

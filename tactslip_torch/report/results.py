@@ -981,7 +981,7 @@ def alarm_table(metrics: _Metrics) -> str:
     return style.marked(metrics["simulated"], _target_line(metrics), rows, budget)
 
 
-def scene_rows(metrics: _Metrics) -> list[_Row]:
+def _confounder_rows(metrics: _Metrics) -> list[_Row]:
     """False alarms and slips found in confounding scenes, by the detector's own rule.
 
     Behind it the false alarms of the paper's rule and of the other methods. A row for seen and
@@ -1011,8 +1011,8 @@ def scene_rows(metrics: _Metrics) -> list[_Row]:
 
 
 def _scenes_table(metrics: _Metrics) -> str:
-    """``scene_rows`` for the terminal."""
-    return style.marked(metrics["simulated"], style.table(scene_rows(metrics), num_left=2))
+    """``_confounder_rows`` for the terminal."""
+    return style.marked(metrics["simulated"], style.table(_confounder_rows(metrics), num_left=2))
 
 
 @style.styled
