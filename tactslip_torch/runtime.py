@@ -405,48 +405,6 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-class SeenBatches(dict[str, str]):
-    """Which batches a statistic holds: their ids, each with a digest of what the batch held.
-
-    None is in it twice, none is mixed with another.
-    """
-
-    def add(self, batch_id: str, digest: str) -> None:
-        """Note a batch.
-
-        Raises:
-            ValueError: if the id is there already.
-        """
-        if batch_id in self:
-            raise ValueError(f"batch {batch_id!r} is in these statistics already; add it once")
-        self[batch_id] = digest
-
-    def merge(self, other: Mapping[str, str]) -> None:
-        """Take over other batches.
-
-        Raises:
-            ValueError: if a batch is in both; nothing is taken over then.
-        """
-        if both := sorted(self.keys() & other.keys()):
-            raise ValueError(
-                f"{len(both)} batches are in both statistics, such as {both[0]!r}; "
-                "merge each shard once"
-            )
-        self.update(other)
-
-
-def content_digest(*tensors: Tensor) -> str:
-    """A digest of dtype, shape and bytes of tensors."""
-    digest = hashlib.blake2b(digest_size=16)
-    for tensor in tensors:
-        digest.update(f"{tensor.dtype}{tuple(tensor.shape)}".encode())
-        if tensor.numel():  # an empty one may have strides that no view of bytes takes
-            flat = tensor.detach().cpu().contiguous().as_strided((tensor.numel(),), (1,))
-            content = flat.view(torch.uint8)  # which strides of axes of length 1 would not allow
-            digest.update(content.numpy().data)  # no copy, and NumPy need not know the dtype
-    return digest.hexdigest()
-
-
 LEAD = 31
 _EVERY_S = 10.0
 
@@ -473,11 +431,9 @@ class _Progress(tqdm):  # type: ignore[misc]
             state = self.format_dict
             of = "" if state["total"] is None else f" of {state['total']}"
             what = (self.desc or "").removesuffix(": ").strip()
-            left = (
-                ""
-                if not state["rate"] or state["total"] is None
-                else (f", {(state['total'] - state['n']) / state['rate']:.0f} s left")
-            )
+            left = ""
+            if state["rate"] and state["total"] is not None:
+                left = f", {(state['total'] - state['n']) / state['rate']:.0f} s left"
             log.info(
                 "%s: %s%s%s in %.0f s%s", what, state["n"], of, self.unit, state["elapsed"], left
             )

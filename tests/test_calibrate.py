@@ -126,16 +126,14 @@ def test_every_rule_keeps_the_rate_on_what_it_was_set_on(rule, offset):
     assert alarm.metadata["budget"][0]["alarms"] == len(found.alarms)
 
 
-def test_stretches_have_the_labels_of_their_recording():
+def test_stretches_are_quiet_where_their_recording_is():
     score = torch.arange(60.0)
-    slide = {"onsets_s": (8.0,), "annotated_onsets_s": (8.1,), "sliding_s": ((8.0, 12.0),)}
-    slide |= {"speeds_mm_s": (5.0,), "released_s": ((7.9, 8.2),), "non_slip_s": ((0.0, 6.0),)}
-    first, second, third = in_stretches(stream_of(score, **slide), TIMING, 3)
+    quiet = (0.0, 6.0), (9.0, 12.0)
+    first, second, third = in_stretches(stream_of(score, non_slip_s=quiet), TIMING, 3)
     assert torch.equal(torch.cat([first.score, second.score, third.score]), score)
-    assert (first.times.onsets_s, first.times.sliding_s) == ((8.0,), ((8.0, 10.0),))
-    assert (first.times.annotated_onsets_s, first.times.non_slip_s) == ((8.1,), ((0.0, 6.0),))
-    assert (second.times.onsets_s, second.times.slip_s) == ((), ((0.0, 2.0),))
-    assert (third.times.slip_s, third.times.duration_s) == ((), 10.0)
+    assert first.times.non_slip_s == ((0.0, 6.0), (9.0, 10.0))
+    assert second.times.non_slip_s == ((0.0, 2.0),)
+    assert (third.times.non_slip_s, third.times.duration_s) == ((), 10.0)
 
 
 # The decision threshold --------------------------------------------------------------------------

@@ -226,7 +226,10 @@ def test_a_damaged_file_in_a_folder_costs_the_others_nothing(model, tmp_path, ca
     written = json.loads((out / "onsets.json").read_text())
     assert [entry["file"] for entry in written["recordings"]] == ["a.npz", "b.npz", "d.npz"]
     assert [entry["file"] for entry in written["failed"]] == ["c.npz", "e.npz"]
-    assert "1000 Hz, the detector of 2000 Hz; resample it" in written["failed"][1]["error"]
+    assert (
+        "1000 Hz, the detector of 2000 Hz; set reading.resample_hz=2000"
+        in written["failed"][1]["error"]
+    )
     names = {path.name for path in out.iterdir()}
     assert names == {"onsets.csv", "onsets.json", "overview.png", "config.yaml"}
 

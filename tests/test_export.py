@@ -11,7 +11,7 @@ from small_detector import HAND, alarming_detector, small_detector
 from test_commands import composed
 
 from tactslip_torch.commands.export import export as export_command
-from tactslip_torch.commands.train import export_fold
+from tactslip_torch.commands.train import _export_fold
 from tactslip_torch.deploy import export
 from tactslip_torch.deploy.export import (
     export_detector,
@@ -124,7 +124,7 @@ def test_a_wrong_model_is_not_left_and_the_earlier_files_are_kept(detector, tmp_
 def test_training_tells_of_each_graph_and_loses_nothing(detector, tmp_path, monkeypatch):
     detector.save(tmp_path / "detector.pt")
     monkeypatch.setattr(export, "check_model", lambda *given: {"worst_sd": 1e-6})
-    found = export_fold(detector, tmp_path)
+    found = _export_fold(detector, tmp_path)
     for kind, name in export.FILES.items():
         size = (tmp_path / name).stat().st_size
         assert found[kind] == {"error": 1e-6, "bytes": size}
@@ -133,7 +133,7 @@ def test_training_tells_of_each_graph_and_loses_nothing(detector, tmp_path, monk
         raise ValueError("no such descriptor\nas a graph")
 
     monkeypatch.setattr(export, "bin_graph", failing)
-    found = export_fold(small_detector(), tmp_path)
+    found = _export_fold(small_detector(), tmp_path)
     assert found == {"bin": f"{tmp_path / 'model.onnx'} was not written: no such descriptor"}
 
 

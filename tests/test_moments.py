@@ -76,7 +76,7 @@ def test_sums_come_back_from_their_file(degree, tmp_path):
     save_table(
         tmp_path / "other.pt",
         SUMS,
-        {"num_features": 3, "degree": 1, "batches": {}},
+        {"num_features": 3, "degree": 1, "batches": []},
         {"sums": stats.sums},
     )
     with pytest.raises(
@@ -126,6 +126,7 @@ BATCH = ("b", torch.rand(9, NUM).double(), torch.arange(9) % 2 == 0, torch.ones(
     [
         (1, with_value(BATCH[1], torch.nan), r"z must be within \[-1, 1\], got nan at bin 5, fe"),
         (3, torch.ones(9).index_fill(0, torch.tensor(4), 0.0), "finite, got 0 at bin 4"),
+        (0, "a", "is in these statistics already; add it once"),
         (1, BATCH[1][:, :3], r"expected z \[N, 4\], .* got \(9, 3\), \(9,\), \(9,\)"),
     ],
 )
@@ -133,7 +134,7 @@ def test_a_batch_that_is_refused_changes_nothing(place, value, message):
     stats = stats_of([("a", *BATCH[1:])])
     batch = list(BATCH)
     batch[place] = value
-    with pytest.raises(ValueError, match=rf"^batch 'b': .*{message}"):
+    with pytest.raises(ValueError, match=rf"^batch '{batch[0]}':? .*{message}"):
         stats.update(*batch)
     assert_same(stats, stats_of([("a", *BATCH[1:])]))
 

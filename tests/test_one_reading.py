@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from test_commands import composed
@@ -56,14 +57,19 @@ def test_check_train_detect_and_stream_agree(case, tmp_path, capsys):
     (tmp_path / "manifest.csv").write_text(
         "file,material,trial,label\n0.csv,M,0,slip\n1.csv,M,1,slip\n"
     )
-    said = {"data": {"reading": reading, "root": str(tmp_path)}}
+    said = {"data": {"reading": reading | {"gaps": "missing"}, "root": str(tmp_path)}}
     train = composed("data=files", f"data.root={tmp_path}")
     source = instantiate(OmegaConf.merge(train, said).data, _convert_="all")
     assert (source.hand.names, source.sample_rate_hz) == (tuple(names), rate_hz)
     of_check = composed(f"root={tmp_path}", "action=check", "num_workers=0", name="data")
-    num_missing = sum(int(np.isnan(values_of(case, file)).sum()) for file in (0, 1))
-    assert check(OmegaConf.merge(of_check, said)) == num_missing  # as train refuses these
+    assert check(OmegaConf.merge(of_check, said)) == 0
     printed = capsys.readouterr().out
+    refusing = {"data": {"reading": reading | {"gaps": "refuse"}, "root": str(tmp_path)}}
+    num_missing = sum(int(np.isnan(values_of(case, file)).sum()) for file in (0, 1))
+    assert check(OmegaConf.merge(of_check, refusing)) == num_missing
+    if num_missing:  # train refuses what check shows
+        with pytest.raises(InstantiationException, match=r"set data\.reading\.gaps=missing"):
+            instantiate(OmegaConf.merge(train, refusing).data, _convert_="all")
     assert f"channels: {', '.join(names)}\n" in printed
     assert f"2 channels at {rate_hz:g} Hz in {source.units}: " in printed
     pool = SimpleNamespace(hand=source.hand, sample_rate_hz=source.sample_rate_hz)

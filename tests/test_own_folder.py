@@ -3,14 +3,17 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 import torch
 import yaml
 from contract.recordings import CHANNELS, HELD_OUT, SEEN, TRIALS
 from hydra.core.config_store import ConfigStore
 
-from tactslip_torch import SlipDetector
+from tactslip_torch import HandLayout, SlipDetector
 from tactslip_torch.commands.configuration import checked
+from tactslip_torch.data.file_recordings import hand_file
+from tactslip_torch.data.formats import Reading
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import everything, leave_groups_out
 from tactslip_torch.training.bins import SampledBins
@@ -198,3 +201,18 @@ def test_recordings_of_one_label_are_joined_until_two_groups_have_both():
     assert len(joined.group_names) == 3
     for each in range(3):
         assert set(joined.is_slip[joined.group == each].tolist()) == {True, False}
+
+
+def test_a_file_of_another_rate_is_resampled_as_in_training_or_refused_by_the_key(tmp_path):
+    hand, rate_hz = HandLayout.from_rows([{"name": "a", "kind": "SG"}]), 24.0
+    time_s = np.arange(96) / rate_hz
+    table = np.column_stack([time_s, np.sin(2 * np.pi * time_s)])
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="time,a", comments="")
+    with hand_file(tmp_path / "a.csv", hand, 48.0, Reading(resample_hz=48.0), "V") as opened:
+        found = opened.samples.read(0, opened.samples.num_samples)[0].numpy()
+    assert len(found) == 192
+    wanted = np.sin(2 * np.pi * np.arange(192) / 48)
+    assert np.abs(found - wanted)[24:-24].max() < 0.01
+    refused = pytest.raises(ValueError, match=r"24 Hz, .* of 48 Hz; set .*reading\.resample_hz=48")
+    with refused, hand_file(tmp_path / "a.csv", hand, 48.0, Reading(), "V"):
+        pass

@@ -117,7 +117,7 @@ def gripper(tmp_path_factory):
 
 def test_a_grippers_recordings_need_no_answer(gripper):
     proposal = propose(look(gripper))
-    assert proposal.questions == ()
+    assert not proposal.questions
     data = proposal.settings["data"]
     assert data["pattern"] == "{material}_{trial}"
     assert data["reading"] == {
@@ -152,7 +152,7 @@ def test_folders_of_classes_ask_for_the_rate_and_the_word_of_non_slip(touches):
     asked = [question.name for question in propose(found, answers).questions]
     assert asked == ["rate_hz", "non_slip"]
     done = propose(found, Answers(rate_hz=100.0, words={"t": False}))
-    assert done.questions == ()
+    assert not done.questions
     data = done.settings["data"]
     assert data["labels"] == {"n": "slip", "s": "slip", "t": "non-slip"}
     assert data["pattern"] == "{label}/{material:cup|hd|pen}*"
@@ -173,7 +173,7 @@ def test_files_of_several_rates_and_a_column_of_several_values(tmp_path):
     (question,) = propose(look(tmp_path)).questions
     assert (question.name, question.default) == ("over", "0.125")
     done = propose(look(tmp_path), Answers(over=0.9))
-    assert done.questions == ()
+    assert not done.questions
     reading = done.settings["data"]["reading"]
     assert reading["resample_hz"] == 40.0
     assert "sample_rate_hz" not in reading
@@ -201,7 +201,7 @@ def test_a_table_of_intervals_becomes_a_manifest(tmp_path):
         "recording;start_ms;end_ms\ncup_1;1000;2500,5\ncup_1;3000;3500\nbox_2.csv;0;500\n"
     )
     proposal = propose(look(tmp_path))
-    assert proposal.questions == ()
+    assert not proposal.questions
     assert "pattern" not in proposal.settings["data"]
     rows = {row["file"]: row for row in proposal.manifest}
     assert set(rows) == {"cup_1.csv", "cup_2.csv", "box_1.csv", "box_2.csv"}
@@ -211,7 +211,7 @@ def test_a_table_of_intervals_becomes_a_manifest(tmp_path):
     assert rows["cup_2.csv"]["slip_s"] == rows["cup_2.csv"]["non_slip_s"] == ""  # nobody says
     assert (rows["box_2.csv"]["material"], rows["box_2.csv"]["trial"]) == ("box", "2")
     (tmp_path / "manifest.csv").write_text("file,material,slip_s\ncup_1.csv,cup,0-1\n")
-    assert propose(look(tmp_path)).manifest == ()  # one that is there is kept
+    assert not propose(look(tmp_path)).manifest  # one that is there is kept
 
 
 def test_files_that_are_no_recordings_are_told_and_do_not_change_how_names_are_read(tmp_path):

@@ -213,8 +213,7 @@ def _calibrated(
     calibrator: Calibrator, recordings: Sequence[ScoredRecording]
 ) -> tuple[dict[str, Any], Change | None]:
     """What is reported, and what changes of the detector; ``None``: nothing is better."""
-    budget, before = None, Change(0.0, None, calibrator.settings)
-    report: dict[str, Any] = {}
+    budget, report = None, dict[str, Any]()
     if calibrator.per_hour is not None:
         dispersion = calibrator.dispersion(recordings)
         hours = sum(one.hours for one in recordings)
@@ -234,7 +233,7 @@ def _calibrated(
     moves_bins = 0 < num_slip < sum(len(one.is_slip) for one in recordings)
     change = calibrator.fit(recordings, budget, moves_bins=moves_bins)
     changes, words = calibrator.left_out(recordings, change, budget)
-    rows = _rows(calibrator, recordings, before, changes)
+    rows = _rows(calibrator, recordings, changes)
     old, new = (pooled_outcome(row[when] for row in rows) for when in ("before", "after"))
     if moves_bins:
         is_set = new["balanced_accuracy"] > old["balanced_accuracy"]
@@ -248,21 +247,19 @@ def _calibrated(
         if not is_set:  # the alarm without it
             change = calibrator.fit(recordings, budget)
             changes, _ = calibrator.left_out(recordings, change, budget)
-            kept = _rows(calibrator, recordings, before, changes)
             if budget is not None:
-                rows = kept
+                rows = _rows(calibrator, recordings, changes)
                 new = pooled_outcome(row["after"] for row in rows)
     if budget is None and change.alarm != calibrator.settings and new["found"] < old["found"]:
         report["alarm_stays"] = [old["found"], new["found"], new["slips"]]
         change = change._replace(alarm=calibrator.settings)
         changes = [each._replace(alarm=calibrator.settings) for each in changes]
-        rows = _rows(calibrator, recordings, before, changes)
+        rows = _rows(calibrator, recordings, changes)
     if budget is not None:
         (counts,) = change.alarm.metadata["budget"]
-        rate = new["per_hour"] or 0.0
+        hours, rate = counts["amount"], new["per_hour"] or 0.0
         is_worse = rate > budget.limit and rate >= old["per_hour"]
         is_set = math.isfinite(change.alarm.alarm_threshold) and not is_worse
-        curve = calibrator.curve(recordings, change)
 
         def stated(threshold: float) -> float:
             return calibrator.restated(change, threshold).alarm_threshold
@@ -270,19 +267,17 @@ def _calibrated(
         report["alarm"] = {
             "per_hour": budget.limit,
             "confidence": budget.confidence,
-            "hours": counts["amount"],
+            "hours": hours,
             "dispersion": budget.dispersion,
-            "allowed": counts["allowed"],
-            "alarms": counts["alarms"],
-            "bound": counts["bound"],
+            **{name: counts[name] for name in ("allowed", "alarms", "bound")},
             "before": stated(calibrator.settings.alarm_threshold),
             "after": stated(change.alarm.alarm_threshold),
             "is_set": is_set,
             "rate_before": old["per_hour"],
             "rate_after": new["per_hour"],
             "curve": [
-                [stated(at), each, budget.bound(round(each * counts["amount"]), counts["amount"])]
-                for at, each in curve
+                [stated(at), each, budget.bound(round(each * hours), hours)]
+                for at, each in calibrator.curve(recordings, change)
             ],
         }
         if not is_set:
@@ -293,12 +288,10 @@ def _calibrated(
 
 
 def _rows(
-    calibrator: Calibrator,
-    recordings: Sequence[ScoredRecording],
-    before: Change,
-    changes: Sequence[Change],
+    calibrator: Calibrator, recordings: Sequence[ScoredRecording], changes: Sequence[Change]
 ) -> list[dict[str, Any]]:
     """Of each recording its group, and what came of it before and after."""
+    before = Change(0.0, None, calibrator.settings)
     return [
         {
             "recording": str(one.stream.recording),

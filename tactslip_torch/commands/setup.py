@@ -62,7 +62,7 @@ def setup(
     if proposal.manifest:
         write_table(folder / MANIFEST, list(proposal.manifest[0]), proposal.manifest)
         print(f"\n{folder / MANIFEST} lists the recordings with their intervals")
-    (folder / HAND_FILE).write_text(hand_yaml(proposal), encoding="utf-8")
+    (folder / HAND_FILE).write_text(_hand_yaml(proposal), encoding="utf-8")
     print(f"\n{folder / HAND_FILE} says how the recordings are read; change what is wrong there")
     _draw(folder, proposal)
     return proposal
@@ -79,16 +79,9 @@ def _answered(answers: Answers, question: Question, answer: str) -> Answers:
     if question.name in ("slip", "non_slip"):
         words = {word.strip(): question.name == "slip" for word in answer.split(",")}
         return replace(answers, words={**answers.words, **words})
-    if question.name == "pattern":
-        return replace(answers, pattern=answer)
-    if question.name == "column":
-        return replace(answers, column=answer)
-    number = _number(answer, question.flag)
-    return (
-        replace(answers, rate_hz=number)
-        if question.name == "rate_hz"
-        else replace(answers, over=number)
-    )
+    is_text = question.name in ("pattern", "column")
+    given: dict[str, Any] = {question.name: answer if is_text else _number(answer, question.flag)}
+    return replace(answers, **given)
 
 
 def _number(text: str, flag: str) -> float:
@@ -104,7 +97,7 @@ def _number(text: str, flag: str) -> float:
 # hand.yaml ----------------------------------------------------------------------------------------
 
 
-def hand_yaml(proposal: Proposal) -> str:
+def _hand_yaml(proposal: Proposal) -> str:
     """The settings of a proposal as YAML, with the reason of each value."""
     lines = ["# How the recordings of this folder are read and labelled (tactslip setup).", ""]
     for section, settings in proposal.settings.items():

@@ -139,7 +139,7 @@ def _experiment(config: DictConfig) -> Experiment:
         },
         num_workers=config.num_workers,
         with_baselines=config.baselines,
-        export=export_fold if config.export else None,
+        export=_export_fold if config.export else None,
         train_on_all=config.train_on_all,
     )
 
@@ -191,7 +191,7 @@ def _set_alarm(
     return {}
 
 
-def export_fold(detector: SlipDetector, folder: Path) -> dict[str, dict[str, float] | str]:
+def _export_fold(detector: SlipDetector, folder: Path) -> dict[str, dict[str, float] | str]:
     """Write the ONNX files; by graph their error, or why there is none: nothing learned is lost."""
     kinds: list[GraphKind] = ["bin", "stream"] if KEY in detector.info else ["bin"]
     found: dict[str, dict[str, float] | str] = {}

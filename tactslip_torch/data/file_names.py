@@ -62,7 +62,7 @@ class _Part:
         return len(counts) > 1 and shared >= _FEW * len(self.values)
 
 
-class NamePattern(NamedTuple):
+class _NamePattern(NamedTuple):
     """How the names of a set are read.
 
     Args:
@@ -83,7 +83,7 @@ def word_choices(files: Sequence[str]) -> list[tuple[str, ...]]:
     return sorted(dict.fromkeys(found), key=len)
 
 
-def name_pattern(files: Sequence[str], label_words: Sequence[str] = ()) -> NamePattern:
+def name_pattern(files: Sequence[str], label_words: Sequence[str] = ()) -> _NamePattern:
     """The pattern that reads each name one way, as many of its parts as can be told.
 
     Args:
@@ -101,9 +101,9 @@ def name_pattern(files: Sequence[str], label_words: Sequence[str] = ()) -> NameP
     fields = _fields(parts, {word.lower() for word in label_words})
     for pattern in _patterns(parts, fields):
         if (read := _read(files, pattern, parts, fields)) is not None:
-            return NamePattern(pattern, read)
+            return _NamePattern(pattern, read)
     simple = "{material}"
-    return NamePattern(simple, tuple(guessed(file, simple) for file in files), True)
+    return _NamePattern(simple, tuple(guessed(file, simple) for file in files), True)
 
 
 # Parts of names -----------------------------------------------------------------------------------

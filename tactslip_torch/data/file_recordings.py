@@ -472,6 +472,20 @@ def _most_bridged(reading: Reading, rate_hz: float) -> int:
     return int(reading.bridge_ms * rate_hz / 1000 + 1e-6) if reading.gaps == "bridge" else 0
 
 
+class _Resampled(Samples):
+    """Samples brought to another rate; they are read whole."""
+
+    def __init__(self, samples: EvenSamples, rate_hz: float, wanted_hz: float) -> None:
+        whole = samples.exact(0, samples.num_samples).double()
+        self._whole = resample(whole, rate_hz, wanted_hz).to(samples.dtype)
+        self.num_channels, self.num_samples = self._whole.shape
+        self.dtype = samples.dtype
+
+    def read(self, first: int, stop: int) -> Tensor:
+        """Samples from ``first`` to before ``stop``, ``[C, n]``."""
+        return self._whole[:, first : max(stop, first)]
+
+
 @contextmanager
 def hand_file(
     path: Path, hand: HandLayout, sample_rate_hz: float, reading: Reading, units: str
@@ -479,7 +493,8 @@ def hand_file(
     """Open a recording of a hand, native or foreign, to watch it by stretches.
 
     Its samples are those of the hand's channels; NaN where time stamps show a gap, unless
-    ``reading`` bridges it.
+    ``reading`` bridges it. Of another rate, they are brought to the one that is wanted if
+    ``reading.resample_hz`` is that.
 
     Args:
         path: of the file.
@@ -507,18 +522,24 @@ def hand_file(
                 )
         head = _head_of(opened, path, given)
         error = abs(head.rate_hz / sample_rate_hz - 1)
-        if error > (_WANTED_RATE_ERROR if head.is_measured else 0.0):
+        is_other = error > (_WANTED_RATE_ERROR if head.is_measured else 0.0)
+        if is_other and reading.resample_hz != sample_rate_hz:
             raise ValueError(
-                f"{path} is of {head.rate_hz:g} Hz, the detector of {sample_rate_hz:g} Hz; "
-                "resample it"
+                f"{path} is of {head.rate_hz:g} Hz, the detector of {sample_rate_hz:g} Hz; set "
+                f"{setting('reading.resample_hz')}={sample_rate_hz:g} to resample it"
             )
         if head.units != units:
             raise ValueError(
                 f"{path} is in {head.units}, the detector was trained on {units}; give it "
                 f"recordings in {units}, or train one on {head.units}"
             )
-        head = head._replace(rate_hz=sample_rate_hz)
-        yield opened._replace(samples=_even(opened, path, head, reading))
+        if is_other:
+            known = nominal_rate(head.rate_hz) if head.is_measured else head.rate_hz
+            even = _even(opened, path, head._replace(rate_hz=known), reading)
+            yield opened._replace(samples=_Resampled(even, known, sample_rate_hz))
+        else:
+            head = head._replace(rate_hz=sample_rate_hz)
+            yield opened._replace(samples=_even(opened, path, head, reading))
 
 
 # A folder ---------------------------------------------------------------------------------------
@@ -804,8 +825,9 @@ class FileRecordings:
             samples = _even(opened, path, head, how)
             num = samples.num_samples
             if how.resample_hz is not None and how.resample_hz != rate_hz:
-                even = resample(samples.exact(0, num).double(), rate_hz, how.resample_hz)
-                kept = even[:, : self._num_recorded(head)].to(samples.dtype)
+                kept = _Resampled(samples, rate_hz, how.resample_hz).read(
+                    0, self._num_recorded(head)
+                )
             else:
                 kept = torch.full((samples.num_channels, num), torch.nan, dtype=samples.dtype)
                 for start, end in windows if windows is not None else [(0.0, num / rate_hz)]:

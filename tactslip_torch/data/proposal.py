@@ -11,6 +11,7 @@ import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -23,7 +24,7 @@ from scipy.signal import detrend
 from tactslip_torch.data.clock import even_clock, nominal_rate
 from tactslip_torch.data.file_names import name_pattern, word_choices
 from tactslip_torch.data.folder import guessed, recording_files
-from tactslip_torch.data.formats import Opened, Reading, find_format, open_file
+from tactslip_torch.data.formats import Reading, find_format, open_file
 from tactslip_torch.data.formats._inference import (
     NUMBER,
     SECONDS,
@@ -105,7 +106,7 @@ class Question(NamedTuple):
     default: str = ""
 
 
-class Finding(NamedTuple):
+class _Finding(NamedTuple):
     """What was found, and why it is taken to be so."""
 
     what: str
@@ -113,7 +114,7 @@ class Finding(NamedTuple):
     reason: str
 
 
-@dataclass(frozen=True)
+@dataclass
 class Proposal:
     """How a set is read, labelled and split.
 
@@ -126,12 +127,31 @@ class Proposal:
         example: a recording that shows what is labelled.
     """
 
-    settings: Mapping[str, Mapping[str, Any]]
-    reasons: Mapping[str, str]
-    findings: tuple[Finding, ...]
-    questions: tuple[Question, ...] = ()
-    manifest: tuple[Mapping[str, str], ...] = ()
+    settings: dict[str, dict[str, Any]] = field(
+        default_factory=lambda: {name: {} for name in ("data", "labels", "features", "split")}
+    )
+    reasons: dict[str, str] = field(default_factory=dict)
+    findings: list[_Finding] = field(default_factory=list)
+    questions: list[Question] = field(default_factory=list)
+    manifest: list[dict[str, str]] = field(default_factory=list)
     example: str = ""
+
+    def set(self, key: str, value: Any, reason: str) -> None:
+        """A setting, such as ``labels.bin_ms`` or ``data.reading.time``."""
+        section, *inner, last = key.split(".")
+        place = self.settings[section]
+        for name in inner:
+            place = place.setdefault(name, {})
+        place[last] = value
+        self.reasons[key] = reason
+
+    def tell(self, what: str, value: str, reason: str) -> None:
+        """A finding."""
+        self.findings.append(_Finding(what, value, reason))
+
+    def ask(self, name: str, text: str, flag: str, default: str = "") -> None:
+        """A question."""
+        self.questions.append(Question(name, text, flag, default))
 
 
 # Looking ------------------------------------------------------------------------------------------
@@ -182,15 +202,17 @@ class Look:
         folder: the set.
         files: all of them, relative to it, but for those that were read and are not like others.
         tables: those that were read.
-        intervals: a table of when slip is, if there is one, with its rows.
         problems: by file, why it is not like the others.
+        table_of_intervals: the file that says when slip is, ``""`` if there is none.
+        intervals: its rows.
     """
 
     folder: Path
     files: tuple[str, ...]
     tables: tuple[_Table, ...]
-    intervals: tuple[str, tuple[Mapping[str, str], ...]] | None = None
-    problems: Mapping[str, str] = field(default_factory=dict)
+    problems: Mapping[str, str]
+    table_of_intervals: str
+    intervals: Sequence[Mapping[str, str]]
 
 
 def look(folder: Path, answers: Answers | None = None) -> Look:
@@ -203,9 +225,8 @@ def look(folder: Path, answers: Answers | None = None) -> Look:
     if not folder.is_dir():
         raise FileNotFoundError(f"no folder at {folder}")
     paths = sorted(recording_files(folder, in_folders=True))
-    intervals = _intervals(folder, paths)
-    if intervals is not None:
-        paths = [path for path in paths if path.relative_to(folder).as_posix() != intervals[0]]
+    name, intervals = _intervals(folder, paths)
+    paths = [path for path in paths if path.relative_to(folder).as_posix() != name]
     tables: list[_Table] = []
     problems: dict[str, str] = {}
     num_bytes = 0
@@ -225,10 +246,9 @@ def look(folder: Path, answers: Answers | None = None) -> Look:
     common = Counter(table.names for table in tables).most_common(1)[0][0]
     alike = tuple(table for table in tables if table.names == common)
     problems |= {t.file: "has other columns" for t in tables if t.names != common}
-    files = (path.relative_to(folder).as_posix() for path in paths)
-    return Look(
-        folder, tuple(file for file in files if file not in problems), alike, intervals, problems
-    )
+    files = [path.relative_to(folder).as_posix() for path in paths]
+    files = [file for file in files if file not in problems]
+    return Look(folder, tuple(files), alike, problems, name, intervals)
 
 
 def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
@@ -253,46 +273,29 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
         how = replace(how, channels=numbers)
         if names[0] == 0:  # without names
             how = replace(how, time=answers.time)
-    with open_file(path, how) as opened:
+    with ExitStack() as stack:
+        opened = stack.enter_context(open_file(path, how))
         if opened.archived is None and not is_text and opened.left_out and opened.names:
             labels = [n for n in opened.left_out if _SLIP_NAMES.search(n) or _LABEL_NAMES.search(n)]
-            with open_file(path, replace(how, channels=(*opened.names, *labels))) as wider:
-                return _read(folder, path, wider, words, delimiter, answers.time)
-        return _read(folder, path, opened, words, delimiter, answers.time)
-
-
-def _read(
-    folder: Path,
-    path: Path,
-    opened: Opened,
-    words: Mapping[str | int, Sequence[str]],
-    delimiter: str | None,
-    time: str | int | None,
-) -> _Table:
-    """What an open file holds; ``time`` is the column of times, if it is stated."""
-    file = path.relative_to(folder).as_posix()
-    own = opened.archived
-    values = opened.samples.read(0, opened.samples.num_samples).double().numpy()
-    if own is not None:
-        names: Sequence[str | int] = own.hand.names
-    else:
-        names = opened.names or range(len(values))
-    samples = dict(zip(names, values, strict=True))
-    if time not in names:
-        time = next((name for name in names if isinstance(name, str) and is_time(name)), None)
-    times = opened.times()
-    rate_hz = own.recording.sample_rate_hz if own else opened.sample_rate_hz
-    unit = opened.time_unit
+            wider = replace(how, channels=(*opened.names, *labels))
+            opened = stack.enter_context(open_file(path, wider))
+        own, times, unit = opened.archived, opened.times(), opened.time_unit
+        values = opened.samples.read(0, opened.samples.num_samples).double().numpy()
+        channels = own.hand.names if own else opened.names or range(len(values))
+        rate_hz = own.recording.sample_rate_hz if own else opened.sample_rate_hz
+    samples: dict[str | int, _Numbers] = dict(zip(channels, values, strict=True))
+    time: str | int | None = answers.time
+    if time not in samples:
+        time = next((name for name in samples if isinstance(name, str) and is_time(name)), None)
     if time is not None:
         samples.pop(time)
     elif times is None and rate_hz is None and own is None:
         time, unit = _times_by_values(samples)
         if time is not None and unit is not None:
             times = samples.pop(time) * SECONDS[unit]
-    kept = (*samples, *words)
-    return _Table(
-        file, kept, samples, words, times, time, unit, rate_hz, delimiter, own is not None
-    )
+    file, kept = path.relative_to(folder).as_posix(), (*samples, *words)
+    is_native = own is not None
+    return _Table(file, kept, samples, words, times, time, unit, rate_hz, delimiter, is_native)
 
 
 def _is_of_package(path: Path) -> bool:
@@ -342,9 +345,7 @@ _ENDS = re.compile(r"(end|stop|to|until)(_?(s|ms|sec|seconds|time))*", re.IGNORE
 _MOST_ROWS_BYTES = 2**20
 
 
-def _intervals(
-    folder: Path, paths: Sequence[Path]
-) -> tuple[str, tuple[Mapping[str, str], ...]] | None:
+def _intervals(folder: Path, paths: Sequence[Path]) -> tuple[str, list[Mapping[str, str]]]:
     """A table in the folder that names recordings, with starts and ends, and its rows."""
     known = {name: path for path in paths for name in (path.stem, path.name)}
     known |= {path.relative_to(folder).as_posix(): path for path in paths}
@@ -369,20 +370,20 @@ def _intervals(
             if n not in (starts[0], ends[0], named[0]) and all(label_of(row[n]) for row in rows)
         ]
         scale = 1e-3 if "ms" in re.split(r"[\W_]+", names[starts[0]].lower()) else 1.0
-        table = []
+        table: list[Mapping[str, str]] = []
         for row in rows:
             start, end = (float(row[n].replace(",", ".")) * scale for n in (starts[0], ends[0]))
             label = label_of(row[labels[0]]) if labels else "slip"
             file = known[row[named[0]]].relative_to(folder).as_posix()
             span = {"start": f"{start:.10g}", "end": f"{end:.10g}"}
             table.append({"file": file, **span, "label": label or ""})
-        return path.name, tuple(table)
-    return None
+        return path.name, table
+    return "", []
 
 
 def _manifest_rows(
     rows: Sequence[Mapping[str, str]], fields: Mapping[str, Mapping[str, str]]
-) -> tuple[Mapping[str, str], ...]:
+) -> list[dict[str, str]]:
     """Rows of a manifest: of each file its intervals; what lies between slips is non-slip.
 
     If intervals of non-slip are given as well, what lies between is not labelled. Files without
@@ -403,7 +404,7 @@ def _manifest_rows(
         texts = {name: "; ".join(map(_span_text, each)) for name, each in spans.items()}
         columns = {name: known.get(name, "") for name in ("material", "trial", "scene", "session")}
         found.append({"file": file, **columns, **texts})
-    return tuple(found)
+    return found
 
 
 def _span_text(span: tuple[float, float]) -> str:
@@ -414,30 +415,6 @@ def _span_text(span: tuple[float, float]) -> str:
 # Proposing ----------------------------------------------------------------------------------------
 
 
-class _Draft:
-    """What is known so far; findings come in the order in which people read them."""
-
-    def __init__(self) -> None:
-        self.settings: dict[str, dict[str, Any]] = {
-            name: {} for name in ("data", "labels", "features", "split")
-        }
-        self.reasons: dict[str, str] = {}
-        self.findings: list[Finding] = []
-        self.questions: list[Question] = []
-
-    def set(self, key: str, value: Any, reason: str) -> None:
-        """A setting, such as ``labels.bin_ms`` or ``data.reading.time``."""
-        section, *inner, last = key.split(".")
-        place = self.settings[section]
-        for name in inner:
-            place = place.setdefault(name, {})
-        place[last] = value
-        self.reasons[key] = reason
-
-    def tell(self, what: str, value: str, reason: str) -> None:
-        self.findings.append(Finding(what, value, reason))
-
-
 def propose(found: Look, answers: Answers | None = None) -> Proposal:
     """How a set is read, labelled and split, and what a person must say of it.
 
@@ -445,7 +422,7 @@ def propose(found: Look, answers: Answers | None = None) -> Proposal:
         found: the set.
         answers: what a person has said so far.
     """
-    given, draft = answers or Answers(), _Draft()
+    given, draft = answers or Answers(), Proposal()
     first = found.tables[0]
     endings = Counter(Path(file).suffix for file in found.files)
     reason = f"{len(found.tables)} of them were read"
@@ -465,21 +442,15 @@ def propose(found: Look, answers: Answers | None = None) -> Proposal:
     _propose_units(channels, given, draft)
     if rate_hz:
         _propose_bins(kinds, rate_hz, draft)
-    classes, manifest = _propose_labels_and_groups(found, label, given, draft)
-    return Proposal(
-        draft.settings,
-        draft.reasons,
-        tuple(draft.findings),
-        tuple(draft.questions),
-        manifest,
-        max(classes, key=lambda file: len(classes[file]), default=first.file),
-    )
+    classes = _propose_labels_and_groups(found, label, given, draft)
+    draft.example = max(classes, key=lambda file: len(classes[file]), default=first.file)
+    return draft
 
 
 # Rate and times -----------------------------------------------------------------------------------
 
 
-def _propose_rate(found: Look, given: Answers, draft: _Draft) -> float:
+def _propose_rate(found: Look, given: Answers, draft: Proposal) -> float:
     """The rate as recordings will be read; 0 if it must be asked."""
     table, reading = found.tables[0], "data.reading"
     if all(one.is_native for one in found.tables):
@@ -508,19 +479,18 @@ def _propose_rate(found: Look, given: Answers, draft: _Draft) -> float:
         unit = f" in {table.time_unit}" if table.time_unit else ""
         how = "stated" if given.time else "by its name" if is_time(str(name)) else "it rises evenly"
         draft.tell("time", f"column {name}{unit}", how)
-    elif table.times_s is None and not table.rate_hz:
-        draft.set(f"{reading}.time", None, "the files have no times")
     if not has_times:
+        if wrong or not table.rate_hz:
+            why = "the times are uneven; samples are taken as even"
+            draft.set(f"{reading}.time", None, why if wrong else "the files have no times")
         rate_hz = given.rate_hz or (rates[0] if rates and not wrong else 0.0)
         if not rate_hz:
             own = [one.own_rate_hz for one in found.tables if one.own_rate_hz]
             default = f"{nominal_rate(float(np.median(own)), 0.01):g}" if own else ""
             why = f"the times are uneven ({wrong})" if wrong else "the files have no times"
             text = f"How many samples a second does each channel have? ({why})"
-            draft.questions.append(Question("rate_hz", text, "--rate HZ", default))
+            draft.ask("rate_hz", text, "--rate HZ", default)
             return 0.0
-        if wrong:
-            draft.set(f"{reading}.time", None, "the times are uneven; samples are taken as even")
         reason = "stated" if given.rate_hz else "the files say it"
         draft.set(f"{reading}.sample_rate_hz", rate_hz, reason)
         draft.tell("rate", f"{rate_hz:g} Hz", reason)
@@ -545,7 +515,7 @@ def _propose_rate(found: Look, given: Answers, draft: _Draft) -> float:
     return rate_hz
 
 
-def _propose_gaps(found: Look, channels: Sequence[str | int], draft: _Draft) -> None:
+def _propose_gaps(found: Look, channels: Sequence[str | int], draft: Proposal) -> None:
     """What is done where samples are missing."""
     if found.tables[0].is_native:
         return
@@ -609,7 +579,7 @@ def _label_values(found: Look, name: str | int, reason: str) -> _Label:
     return _Label(name, tuple(sorted(words)), tuple(sorted(numbers)), reason)
 
 
-def _channels(found: Look, label: _Label | None, draft: _Draft) -> list[str | int]:
+def _channels(found: Look, label: _Label | None, draft: Proposal) -> list[str | int]:
     """The columns that are channels; those that are not are told, each with its reason."""
     table = found.tables[0]
     if table.is_native:
@@ -650,54 +620,54 @@ def _stems(names: Sequence[str]) -> list[str] | None:
     return None
 
 
-def _fast_part(values: _Numbers, rate_hz: float) -> float:
-    """How much of the variance lies above 5 Hz, a straight line taken off; NaN if there is none."""
-    is_there = np.isfinite(values)
-    if not rate_hz or is_there.sum() < _LEAST_BIN:
-        return math.nan
-    ticks = np.arange(len(values))
-    even = detrend(np.interp(ticks, ticks[is_there], values[is_there]))
-    power = np.abs(np.fft.rfft(even * np.hanning(len(even)))) ** 2
-    is_above = np.fft.rfftfreq(len(even), 1 / rate_hz) > _EDGE_HZ
-    return float(power[is_above].sum() / power.sum()) if power.sum() > 0 else math.nan
+def _fast_part(found: Look, name: str | int, rate_hz: float) -> float:
+    """How much of a channel's variance lies above 5 Hz, a line taken off: the median over files.
+
+    0 where no file tells.
+    """
+    parts = []
+    for table in found.tables:
+        values, own_rate_hz = table.samples[name], table.own_rate_hz or rate_hz
+        is_there = np.isfinite(values)
+        if not own_rate_hz or is_there.sum() < _LEAST_BIN:
+            continue
+        ticks = np.arange(len(values))
+        even = detrend(np.interp(ticks, ticks[is_there], values[is_there]))
+        power = np.abs(np.fft.rfft(even * np.hanning(len(even)))) ** 2
+        is_above = np.fft.rfftfreq(len(even), 1 / own_rate_hz) > _EDGE_HZ
+        parts += [power[is_above].sum() / power.sum()] if power.sum() > 0 else []
+    return float(np.median(parts)) if parts else 0.0
 
 
 def _propose_kinds(
-    found: Look, channels: Sequence[str | int], rate_hz: float, draft: _Draft
+    found: Look, channels: Sequence[str | int], rate_hz: float, draft: Proposal
 ) -> dict[str, str]:
     """Rows of channels; how each kind adapts."""
     if found.tables[0].is_native:
         draft.tell("channels", f"{len(channels)}", "the files say what they are")
         return {}
     names = [f"ch{name + 1}" if isinstance(name, int) else name for name in channels]
-    parts = [
-        float(np.nanmedian(each)) if np.isfinite(each).any() else 0.0
-        for each in (
-            np.array([_fast_part(t.samples[name], t.own_rate_hz or rate_hz) for t in found.tables])
-            for name in channels
-        )
-    ]
     is_known = rate_hz >= _SLOWEST_HZ
+    parts = [_fast_part(found, name, rate_hz) for name in channels]
+    speeds = ["fast" if is_known and part > 0.5 else "slow" for part in parts]
     stems = _stems(names)
-    kinds = stems or ["fast" if part > 0.5 and is_known else "slow" for part in parts]
+    kinds = stems or speeds
     for kind in set(kinds) if stems and is_known else ():
         own = [part for part, other in zip(parts, kinds, strict=True) if other == kind]
         if min(own) < 1 - _CLEARLY and max(own) > _CLEARLY:
-            kinds = [
-                f"{k}_{'fast' if p > 0.5 else 'slow'}" if k == kind else k
-                for k, p in zip(kinds, parts, strict=True)
-            ]
+            pairs = zip(kinds, speeds, strict=True)
+            kinds = [f"{other}_{speed}" if other == kind else other for other, speed in pairs]
     adapting = {}
     for kind in dict.fromkeys(kinds):
-        own = [part for part, other in zip(parts, kinds, strict=True) if other == kind]
-        part = float(np.median(own))
+        places = [place for place, other in enumerate(kinds) if other == kind]
+        part = float(np.median([parts[place] for place in places]))
         adapting[kind] = "fast" if is_known and part > 0.5 else "slow"
         reason = f"{100 * part:.0f} % of the variance is above {_EDGE_HZ:g} Hz"
         if not is_known:
             reason = f"below {_SLOWEST_HZ:g} Hz all channels are slow"
-        shown = [name for name, other in zip(names, kinds, strict=True) if other == kind]
+        shown = [names[place] for place in places]
         listed = ", ".join(shown if len(shown) < 7 else [*shown[:3], "...", shown[-1]])
-        value = f"{kind}: {len(own)} {adapting[kind]} channel{'s' * (len(own) > 1)} ({listed})"
+        value = f"{kind}: {len(shown)} {adapting[kind]} channel{'s' * (len(shown) > 1)} ({listed})"
         draft.tell("kind", value, reason)
         draft.reasons[f"kind.{kind}"] = f"{adapting[kind]}: {reason}"
     rows = [
@@ -709,7 +679,7 @@ def _propose_kinds(
     return adapting
 
 
-def _propose_units(channels: Sequence[str | int], given: Answers, draft: _Draft) -> None:
+def _propose_units(channels: Sequence[str | int], given: Answers, draft: Proposal) -> None:
     """The unit of samples, as names say it in brackets, or as it is stated, or volts."""
     told = [found[1] if (found := _UNIT_IN_NAME.search(str(name))) else "" for name in channels]
     units, reason = given.units, "stated"
@@ -752,7 +722,7 @@ def filter_frame(adapting: str, rate_hz: float) -> int | None:
     return num if num >= _LEAST_FRAME else None
 
 
-def _propose_bins(kinds: Mapping[str, str], rate_hz: float, draft: _Draft) -> None:
+def _propose_bins(kinds: Mapping[str, str], rate_hz: float, draft: Proposal) -> None:
     """Length and distance of bins, and the filters of kinds."""
     num = bin_samples(rate_hz)
     bin_ms, hop_ms = 1000 * num / rate_hz, 500 * num / rate_hz
@@ -775,32 +745,29 @@ def _propose_bins(kinds: Mapping[str, str], rate_hz: float, draft: _Draft) -> No
 
 
 def _propose_labels_and_groups(
-    found: Look, label: _Label | None, given: Answers, draft: _Draft
-) -> tuple[Mapping[str, set[bool]], tuple[Mapping[str, str], ...]]:
+    found: Look, label: _Label | None, given: Answers, draft: Proposal
+) -> dict[str, set[bool]]:
     """What says where slip is, what is an object, and what is left out in evaluation.
 
     Returns:
-        Of files whether they hold slip, none, or both, and the rows of a manifest, where a table
-        of intervals is to become one.
+        Of files whether they hold slip, none, or both.
     """
     has_manifest = (found.folder / MANIFEST).is_file()
+    intervals = () if has_manifest or label is not None else found.intervals
     fields: Mapping[str, Mapping[str, str]]
     by_name: dict[str, bool] = {}
     classes: dict[str, set[bool]] = {}
-    is_told = has_manifest or found.intervals is not None or found.tables[0].is_native
     if label is not None:
         classes = _propose_label_column(found, label, given, draft)
-    elif found.intervals is not None and not has_manifest:
-        name = found.intervals[0]
-        draft.tell(
-            "labels", f"intervals of {name}", f"it names recordings; {MANIFEST} is made of it"
-        )
-        for row in found.intervals[1]:
+    elif intervals:
+        told = f"it names recordings; {MANIFEST} is made of it"
+        draft.tell("labels", f"intervals of {found.table_of_intervals}", told)
+        for row in intervals:
             classes.setdefault(row["file"], {False}).add(row["label"] == "slip")
-    elif not is_told:
+    elif not (has_manifest or found.tables[0].is_native):
         by_name = _words_of_names(found.files, given, draft)
         if not by_name:
-            return classes, ()
+            return classes
     if has_manifest:
         listing = read_manifest(found.folder / MANIFEST, found.folder)
         fields = {
@@ -814,13 +781,12 @@ def _propose_labels_and_groups(
         if by_name:
             lower = {word.lower(): slips for word, slips in by_name.items()}
             classes = {file: {lower[each["label"].lower()]} for file, each in fields.items()}
-    if not fields:
-        return classes, ()
-    _propose_split(fields, classes, draft)
-    if found.intervals is not None and not has_manifest and label is None:
+    if fields:
+        _propose_split(fields, classes, draft)
+    if fields and intervals:
         del draft.settings["data"]["pattern"]
-        return classes, _manifest_rows(found.intervals[1], fields)
-    return classes, ()
+        draft.manifest = _manifest_rows(intervals, fields)
+    return classes
 
 
 def _states_of(entry: Entry) -> set[bool]:
@@ -834,7 +800,7 @@ def _states_of(entry: Entry) -> set[bool]:
 
 
 def _propose_label_column(
-    found: Look, label: _Label, given: Answers, draft: _Draft
+    found: Look, label: _Label, given: Answers, draft: Proposal
 ) -> dict[str, set[bool]]:
     """Slip by a column; which of the files that were read hold slip and non-slip."""
     draft.set(
@@ -848,7 +814,7 @@ def _propose_label_column(
                 f"Which words of column {label.name} mean slip, with commas between? It holds "
                 f"{', '.join(label.words)}"
             )
-            draft.questions.append(Question("slip", text, f"--label {unknown[0]}=slip"))
+            draft.ask("slip", text, f"--label {unknown[0]}=slip")
         slips = [word for word, is_slip in known.items() if is_slip]
         if given.words and not unknown:
             draft.set("labels.slip", slips, "words of that column that mean slip; others do not")
@@ -871,7 +837,7 @@ def _propose_label_column(
         )
         default = f"{(numbers[0] + numbers[1]) / 2:g}" if is_few else ""
         text = f"Above which value of column {label.name} is it slip? It holds {values}"
-        draft.questions.append(Question("over", text, "--over NUMBER", default))
+        draft.ask("over", text, "--over NUMBER", default)
         over = float(default or "nan")
     draft.set("labels.over", over, "slip is where that column is above it")
     lower = str(label.name).lower()
@@ -897,7 +863,7 @@ def _is_slip(word: str, words: Mapping[str, bool]) -> bool | None:
     return None if label is None else label == "slip"
 
 
-def _words_of_names(files: Sequence[str], given: Answers, draft: _Draft) -> dict[str, bool]:
+def _words_of_names(files: Sequence[str], given: Answers, draft: Proposal) -> dict[str, bool]:
     """The words of names or folders that are labels; asks where there is none that is known."""
     choices = word_choices(files)
     if given.pattern is not None and "{label" in given.pattern:
@@ -926,19 +892,19 @@ def _words_of_names(files: Sequence[str], given: Answers, draft: _Draft) -> dict
             "Nothing tells where slip is: no column, no table of intervals (a CSV with the columns "
             "file, start and end), no words in names. Which column says it?"
         )
-        draft.questions.append(Question("column", text, "--column NAME"))
+        draft.ask("column", text, "--column NAME")
         return {}
     listed = "; or ".join(", ".join(words[:12]) for words in choices)
     text = (
         "Nothing tells which recordings slip. Which word in the names of files or folders, or "
         f"which words with commas between, mean that nothing slips? They have {listed}"
     )
-    draft.questions.append(Question("non_slip", text, "--non-slip WORD, or --column NAME"))
+    draft.ask("non_slip", text, "--non-slip WORD, or --column NAME")
     return {}
 
 
 def _propose_pattern(
-    found: Look, by_name: Mapping[str, bool], given: Answers, draft: _Draft
+    found: Look, by_name: Mapping[str, bool], given: Answers, draft: Proposal
 ) -> Mapping[str, Mapping[str, str]]:
     """How names are read; what they tell of each file."""
     fields: dict[str, Mapping[str, str]]
@@ -956,7 +922,7 @@ def _propose_pattern(
                 "How are the names made, such as {label}/{material}_{trial}? The first is "
                 f"{found.files[0]}"
             )
-            draft.questions.append(Question("pattern", text, "--pattern PATTERN"))
+            draft.ask("pattern", text, "--pattern PATTERN")
             return {}
         draft.set("data.pattern", pattern.pattern, "how the names of files and folders are read")
         fields = dict(zip(found.files, pattern.fields, strict=True))
@@ -979,7 +945,7 @@ def _propose_pattern(
 
 
 def _propose_split(
-    fields: Mapping[str, Mapping[str, str]], classes: Mapping[str, set[bool]], draft: _Draft
+    fields: Mapping[str, Mapping[str, str]], classes: Mapping[str, set[bool]], draft: Proposal
 ) -> None:
     """What is left out, one after the other, to estimate how good a detector is on new ones."""
     by = "recording"

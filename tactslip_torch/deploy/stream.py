@@ -68,7 +68,7 @@ def stream_graph(
     With an onset classifier there are ``onset_score``, float64, and ``by_onset`` too, the threshold
     is the classifier's, and behind the memory of the rule the state has decisions of the alarm in a
     row that are not valid, the last bin's columns (``OF_LAST_BIN``, and the channels that
-    were lost) and the memory of blocks (``onset_scores``).
+    were lost) and the memory of blocks (``_onset_scores``).
 
     Args:
         detector: that scores the bins.
@@ -210,7 +210,7 @@ def stream_graph(
         sizes = graph.axes(*sizes_before, 1, num_kept)
         parts = graph.ops("Split", state, sizes, dtypes=[F64] * 9, axis=0)
         before, made, run, of_latch, lost, _, of_rule, alarm_lost, last_bin = parts
-        memory = onset_memory(given, small, onset.evidence)
+        memory = _onset_memory(given, small, onset.evidence)
 
         def decide_bins() -> list[Value]:
             number, scored, llr = bins(made)
@@ -247,7 +247,7 @@ def stream_graph(
             origin = first * hop - seen - float(onset.evidence.context)  # counted from the end
             x = held.slice(origin.cast(I64), END, 0)
             most_blocks = most_lost(onset.evidence.context + int(hop), hold, int(hop))
-            onset_score, after = onset_scores(x, places, memory, onset, most_blocks)
+            onset_score, after = _onset_scores(x, places, memory, onset, most_blocks)
             by_onset = onset_score >= level(onset.threshold, F64)
             samples = (number + 1.0) * hop
             last = ((samples - float(timing.first)) / of_bin).floor()
@@ -411,7 +411,7 @@ def _without_stuck(samples: Value, known: Value, most: int) -> tuple[Value, Valu
 # Onset scores ----------------------------------------------------------------------------------
 
 
-def onset_memory(state: Value, start: int, evidence: OnsetEvidence) -> list[Value]:
+def _onset_memory(state: Value, start: int, evidence: OnsetEvidence) -> list[Value]:
     """Lost and known blocks, scores of hops, half the log powers of blocks, and their means; flat.
 
     Args:
@@ -437,7 +437,7 @@ def onset_memory(state: Value, start: int, evidence: OnsetEvidence) -> list[Valu
     return graph.if_(state.length(0) > 0, known, nothing)
 
 
-def onset_scores(
+def _onset_scores(
     samples: Value,
     places: Value,
     memory: Sequence[Value],
@@ -449,7 +449,7 @@ def onset_scores(
     Args:
         samples: from ``context`` samples before the first of these hops on; NaN before a stream.
         places: of the hops, from 0.
-        memory: of ``onset_memory`` or the call before; as it is large, copied as seldom as can be.
+        memory: of ``_onset_memory`` or the call before; as it is large, copied as seldom as can be.
         classifier: that scores.
         most: lost blocks in a row, beyond which the memory begins anew.
 

@@ -50,7 +50,7 @@ _CHUNK = 256  # bins in whole groups that are treated together, unless one group
 # Solve -------------------------------------------------------------------------------------------
 
 
-class Solution(NamedTuple):
+class _Solution(NamedTuple):
     """Of a system.
 
     Attributes:
@@ -74,7 +74,7 @@ def solve_symmetric(
     name: str = "matrix",
     in_span: bool = False,
     most_condition: float | None = None,
-) -> Solution:
+) -> _Solution:
     """``(matrix + diag(1 / (penalty weights)))^-1 right`` in float64, and a report.
 
     By Cholesky where the condition allows it. Closer to singular, eigenvalues of
@@ -134,7 +134,7 @@ def solve_symmetric(
         x = torch.cholesky_solve(right[:, None], factor)[:, 0]
         error = math.sqrt(size) * _EPS * condition
         report = SolveReport("cholesky", size, penalty, condition, size, error)
-        return Solution(_finite(x, name), report, factor)
+        return _Solution(_finite(x, name), report, factor)
     reason = f"{name} + I/C at penalty={penalty:g} has condition {condition:.1e}"
     if most_condition is not None:
         raise ValueError(f"{reason}, wanted up to {most_condition:.0e}; lower the penalty")
@@ -142,7 +142,7 @@ def solve_symmetric(
     x, report = _pseudo_inverse(matrix, right, penalty, weights.sqrt(), in_span, name)
     if not math.isinf(penalty) or report.error > _UNREPORTED_ERROR:
         log.warning("%s, too much for Cholesky: solved by %s", reason, report)
-    return Solution(_finite(x, name), report, None)
+    return _Solution(_finite(x, name), report, None)
 
 
 def _pseudo_inverse(
@@ -384,7 +384,7 @@ def _gram_matrix(kernel: Polynomial, z: Tensor) -> Tensor:
 # Pattern Recognition 40(8), 2154-2162.
 
 
-class HeldOutFit(NamedTuple):
+class _HeldOutFit(NamedTuple):
     """A machine, and what its training bins would score without their groups.
 
     Attributes:
@@ -432,7 +432,7 @@ class HeldOut:
         else:
             self._system = kernel.sums(self._z, self._weights)
 
-    def at(self, penalty: float) -> HeldOutFit:
+    def at(self, penalty: float) -> _HeldOutFit:
         """The machine and the held-out scores for one value of C.
 
         The scores are right to 100 eps times the condition of the system of all bins.
@@ -448,7 +448,7 @@ class HeldOut:
         head, residuals = self._dual(penalty) if self._is_dual else self._primal(penalty)
         scores = torch.empty_like(residuals)
         scores[self._order] = self._targets - residuals
-        return HeldOutFit(head, scores)
+        return _HeldOutFit(head, scores)
 
     def _dual(self, penalty: float) -> tuple[Head, Tensor]:
         beta, report, factor = solve_symmetric(

@@ -16,7 +16,6 @@ from tactslip_torch.model.fit import check_weights, solve_normal_equations
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.products import ProductSums
 from tactslip_torch.package_files import SUMS, load_table, reading, save_table
-from tactslip_torch.runtime import SeenBatches, content_digest
 
 _CLASSES = ("non-slip", "slip")
 
@@ -24,8 +23,8 @@ _CLASSES = ("non-slip", "slip")
 class SufficientStats:
     """Sums over training bins, from which any class balance, penalty and offset are solved.
 
-    Memory does not grow with the number of bins: 168 MB for 120 features at degree 2, and a name
-    and a digest for every batch.
+    Memory does not grow with the number of bins: 168 MB for 120 features at degree 2, and the
+    name of every batch.
 
     Args:
         num_features: ``K``.
@@ -34,7 +33,7 @@ class SufficientStats:
     Attributes:
         sums: ``[2, num_held]``, float64: of non-slip and slip, as ``ProductSums`` lays them out.
         count: ``[2]``, int64: number of bins.
-        seen_batches: names and digests of batches.
+        seen_batches: names of batches.
 
     Raises:
         ValueError: for no feature or another degree.
@@ -54,7 +53,7 @@ class SufficientStats:
         self._layout = ProductSums(num_features, degree)
         self.sums = torch.zeros(2, self._layout.num_held, dtype=torch.float64)
         self.count = torch.zeros(2, dtype=torch.int64)
-        self.seen_batches = SeenBatches()
+        self.seen_batches = set[str]()
 
     def __repr__(self) -> str:
         quiet, slip = self.count.tolist()
@@ -87,7 +86,7 @@ class SufficientStats:
                 allowed.
         """
         z, is_slip, weights = self._checked(batch_id, z, is_slip, weights)
-        self.seen_batches.add(batch_id, content_digest(z, is_slip, weights))
+        self.seen_batches.add(batch_id)
         for label, own in enumerate((~is_slip, is_slip)):
             self._layout.add_(self.sums[label], z[own], weights[own])
             self.count[label] += int(own.sum())
@@ -103,7 +102,12 @@ class SufficientStats:
             ours, theirs = getattr(self, name), getattr(other, name)
             if ours != theirs:
                 raise ValueError(f"cannot merge sums that differ in {name}: {ours} and {theirs}")
-        self.seen_batches.merge(other.seen_batches)
+        if both := sorted(self.seen_batches & other.seen_batches):
+            raise ValueError(
+                f"{len(both)} batches are in both statistics, such as {both[0]!r}; "
+                "merge each shard once"
+            )
+        self.seen_batches |= other.seen_batches
         self.sums += other.sums
         self.count += other.count
 
@@ -112,7 +116,7 @@ class SufficientStats:
         metadata = {
             "num_features": self.num_features,
             "degree": self.degree,
-            "batches": self.seen_batches,
+            "batches": sorted(self.seen_batches),
         }
         save_table(path, SUMS, metadata, {"sums": self.sums, "count": self.count})
 
@@ -127,7 +131,7 @@ class SufficientStats:
         metadata, tensors = load_table(path, SUMS)
         with reading(path):
             stats = cls(metadata["num_features"], metadata["degree"])
-            stats.seen_batches = SeenBatches(metadata["batches"])
+            stats.seen_batches = set(metadata["batches"])
             for name, value in tensors.items():
                 own = getattr(stats, name)
                 if (value.shape, value.dtype) != (own.shape, own.dtype):
@@ -176,6 +180,8 @@ class SufficientStats:
         self, batch_id: str, z: Tensor, is_slip: Tensor, weights: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The batch in float64 and bool, with weights."""
+        if batch_id in self.seen_batches:
+            raise ValueError(f"batch {batch_id!r} is in these statistics already; add it once")
         shapes = [tuple(each.shape) for each in (z, is_slip, weights) if each is not None]
         if z.ndim != 2 or z.shape[1] != self.num_features or {*shapes[1:]} != {(len(z),)}:
             raise ValueError(

@@ -622,7 +622,7 @@ class Decider:
         return _StreamRule(rule, threshold, self._latch_times, most)
 
 
-class StreamStatistic(NamedTuple):
+class _StreamStatistic(NamedTuple):
     """One entry per decision, in order, ``[*, m]`` each, dtype of the samples.
 
     Attributes:
@@ -640,7 +640,9 @@ class StreamStatistic(NamedTuple):
     statistic: Tensor
 
 
-def stream_statistic(detector: Scorer, settings: AlarmSettings, samples: Tensor) -> StreamStatistic:
+def stream_statistic(
+    detector: Scorer, settings: AlarmSettings, samples: Tensor
+) -> _StreamStatistic:
     """Every decision on whole recordings, differentiable in the raw samples.
 
     Gradients are those of the values: 0 through a feature that is clipped, through a channel that
@@ -696,4 +698,4 @@ def stream_statistic(detector: Scorer, settings: AlarmSettings, samples: Tensor)
         rows.append(torch.full_like(own, torch.nan).masked_scatter(valid, known))
     statistic = torch.stack(rows).reshape(llr.shape)
     llr = torch.where(found.is_valid, llr, torch.nan)
-    return StreamStatistic(found.score, llr, probability(llr, settings.slip_share), statistic)
+    return _StreamStatistic(found.score, llr, probability(llr, settings.slip_share), statistic)

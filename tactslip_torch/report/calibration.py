@@ -52,53 +52,33 @@ def calibration_table(rows: Rows, *, simulated: bool) -> str:
         simulated: whether any is.
     """
     groups = list(dict.fromkeys(row["group"] for row in rows))
-    names = [None, *(groups if len(groups) > 1 else ())]
     lines = []
-    for name in names:
+    for name in [None, *(groups if len(groups) > 1 else ())]:
         own = [row for row in rows if name in (None, row["group"])]
-        before, after = (pooled_outcome(row[when] for row in own) for when in ("before", "after"))
-        known = [
-            (
-                "balanced accuracy, %",
-                f"{style.grouped(after['slip_bins'])} slip, "
-                f"{style.grouped(after['other_bins'])} other bins",
-                *(style.percent(of["balanced_accuracy"], 1) for of in (before, after)),
-            ),
-            ("false alarms an hour", f"{after['hours']:.2f} h", *_rates(before, after)),
-            (
-                "slips found",
-                f"{after['slips']} slips",
-                *(str(of["found"]) for of in (before, after)),
-            ),
-            (
-                "too early",
-                f"{after['slips']} slips",
-                *(str(of["early"]) for of in (before, after)),
-            ),
-            (
-                "delay, ms (median)",
-                f"{after['found']} slips",
-                *(
-                    "-" if of["delay_ms"] is None else f"{of['delay_ms']:.0f}"
-                    for of in (before, after)
-                ),
-            ),
-        ]
-        is_known = (
-            after["balanced_accuracy"] is not None,
-            after["hours"] > _LEAST_H,
-            *[bool(after["slips"])] * 3,
+        before, after = (
+            _cells(pooled_outcome(row[when] for row in own)) for when in ("before", "after")
         )
         lines += [
             {"left out": name or "all", "": what, "before": old, "after": new, "of": of}
-            for (what, of, old, new), shown in zip(known, is_known, strict=True)
-            if shown
+            for (what, (_, old)), (of, new) in zip(before.items(), after.values(), strict=True)
+            if {old, new} != {"-"}
         ]
     return style.marked(simulated, style.table(lines, num_left=2, merged=1))
 
 
-def _rates(*outcomes: Mapping[str, Any]) -> list[str]:
-    return ["-" if of["per_hour"] is None else f"{of['per_hour']:.1f}" for of in outcomes]
+def _cells(of: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+    """Of a pooled outcome by row of the table: what it is of, and its value."""
+    bins = f"{style.grouped(of['slip_bins'])} slip, {style.grouped(of['other_bins'])} other bins"
+    slips, is_any = f"{of['slips']} slips", bool(of["slips"])
+    rate = of["per_hour"] if of["hours"] > _LEAST_H else None
+    delay = of["delay_ms"]
+    return {
+        "balanced accuracy, %": (bins, style.percent(of["balanced_accuracy"], 1)),
+        "false alarms an hour": (f"{of['hours']:.2f} h", "-" if rate is None else f"{rate:.1f}"),
+        "slips found": (slips, str(of["found"]) if is_any else "-"),
+        "too early": (slips, str(of["early"]) if is_any else "-"),
+        "delay, ms (median)": (f"{of['found']} slips", "-" if delay is None else f"{delay:.0f}"),
+    }
 
 
 @style.styled
@@ -110,50 +90,34 @@ def calibration_figure(report: Mapping[str, Any], path: str | Path) -> None:
             was looked for, and ``alarm`` where the alarm was.
         path: the PNG to write, replaced as a whole if it exists.
     """
-    bins, alarm = report.get("bins"), report.get("alarm")
-    panels = [name for name, given in (("bins", bins), ("alarm", alarm)) if given]
+    panels = {name: report[name] for name in ("bins", "alarm") if report.get(name)}
     title = "Calibration: before (dashed) and after (solid)"
-    width = 5.6 * len(panels)
-    figure = style.new_figure(width, 3.9, title, simulated=report["simulated"])
-    for axes, name in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
-        if name == "bins" and bins:
-            edges = np.asarray(bins["histogram"]["edges"])
-            for kind, colour in (("slip", style.PALETTE[1]), ("other", style.PALETTE[0])):
-                counts = np.asarray(bins["histogram"][kind], float)
-                label = "slip" if kind == "slip" else "no slip"
-                axes.stairs(
-                    counts / max(counts.sum(), 1),
-                    edges,
-                    fill=True,
-                    alpha=0.45,
-                    color=colour,
-                    label=label,
-                )
-            axes.axvline(0.0, color=style.INK, linestyle="--", linewidth=1.2)
-            axes.axvline(bins["threshold"], color=style.INK, linewidth=1.2)
+    figure = style.new_figure(5.6 * len(panels), 3.9, title, simulated=report["simulated"])
+    grid = np.ravel(figure.subplots(1, len(panels)))
+    for axes, (name, found) in zip(grid, panels.items(), strict=True):
+        if name == "bins":
+            title, ends = "Decision threshold", (0.0, found["threshold"])
+            edges, colours = found["histogram"]["edges"], (style.PALETTE[1], style.PALETTE[0])
+            for kind, label, colour in zip(
+                ("slip", "other"), ("slip", "no slip"), colours, strict=True
+            ):
+                counts = np.asarray(found["histogram"][kind], float)
+                fractions = counts / max(counts.sum(), 1)
+                look: dict[str, Any] = {"fill": True, "alpha": 0.45}
+                axes.stairs(fractions, edges, color=colour, label=label, **look)
             axes.set(xlabel="score of a bin, as it was", ylabel="fraction of bins")
-            axes.set_title("Decision threshold" + ("" if bins["is_set"] else " (not changed)"))
-            axes.legend(loc="best")
-        elif alarm:
-            curve = np.asarray(alarm["curve"], float).reshape(-1, 3)
-            axes.plot(curve[:, 0], curve[:, 1], color=style.PALETTE[0], label="counted")
-            confidence = f"{100 * alarm['confidence']:g} %"
-            axes.fill_between(
-                curve[:, 0],
-                curve[:, 1],
-                curve[:, 2],
-                color=style.PALETTE[0],
-                alpha=0.2,
-                linewidth=0,
-                label=f"up to the {confidence} bound",
-            )
-            axes.axhline(alarm["per_hour"], color=style.GREY, linewidth=1, label="wanted, at most")
-            axes.axvline(alarm["before"], color=style.INK, linestyle="--", linewidth=1.2)
-            axes.axvline(alarm["after"], color=style.INK, linewidth=1.2)
+        else:
+            title = f"Alarm, {found['hours']:.1f} h without slip"
+            ends, colour = (found["before"], found["after"]), style.PALETTE[0]
+            places, rates, bounds = np.asarray(found["curve"], float).reshape(-1, 3).T
+            axes.plot(places, rates, color=colour, label="counted")
+            label = f"up to the {100 * found['confidence']:g} % bound"
+            look = {"color": colour, "alpha": 0.2, "linewidth": 0}
+            axes.fill_between(places, rates, bounds, label=label, **look)
+            axes.axhline(found["per_hour"], color=style.GREY, linewidth=1, label="wanted, at most")
             axes.set(yscale="log", xlabel="threshold of the alarm", ylabel="false alarms an hour")
-            axes.set_title(
-                f"Alarm, {alarm['hours']:.1f} h without slip"
-                + ("" if alarm["is_set"] else " (not changed)")
-            )
-            axes.legend(loc="best")
+        for end, dash in zip(ends, ("--", "-"), strict=True):
+            axes.axvline(end, color=style.INK, linestyle=dash, linewidth=1.2)
+        axes.set_title(title + ("" if found["is_set"] else " (not changed)"))
+        axes.legend(loc="best")
     style.save(figure, path)

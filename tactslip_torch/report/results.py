@@ -386,7 +386,6 @@ def _selected_table(selected: Sequence[Mapping[str, str]]) -> str:
     return f"{style.table(rows, num_left=2, merged=1)}\n{said}"
 
 
-_COMPONENTS = ("raw", "A1", "A2", "A3", "A4", "D1", "D2", "D3", "D4")
 _DOMAIN_WORDS = {"time": "time domain", "freq": "frequency domain"}
 
 
@@ -394,12 +393,10 @@ _DOMAIN_WORDS = {"time": "time domain", "freq": "frequency domain"}
 def selected_features_figure(
     selected: Sequence[Mapping[str, str]], path: str | Path, *, simulated: bool
 ) -> None:
-    """Write where the selected features come from, the paper's counts beside.
+    """Write where the selected features come from: how many of each kind, component and so on.
 
     Panels are sensor kinds, signal components, fingers or statistics over channels, and
-    descriptors. For components and descriptors the paper prints no counts, so words and the order
-    of its ranking stand in. Features of another hand than the paper's stand alone, without the
-    panels that would have one bar. What the paper published is hatched.
+    descriptors; to the left, those with several bars.
 
     Args:
         selected: one mapping per feature, at least one, with ``channel``, ``component``,
@@ -410,97 +407,56 @@ def selected_features_figure(
     """
     title = f"Where the {len(selected)} selected features come from"
     figure = style.new_figure(12.0, 8.4, title, simulated=simulated)
-    is_papers = _is_of_papers_hand(selected)
-    by_kind = published.SELECTED_BY_KIND if is_papers else {}
-    by_finger = published.SELECTED_BY_FINGER if is_papers else {}
-    kinds = [feature["kind"] for feature in selected]
-    colours = style.kind_colours([*by_kind, *sorted(set(kinds))])
-    domains = dict(zip(_DOMAIN_WORDS.values(), (style.PURPLE, style.GREEN), strict=True))
-    components = [feature["component"] for feature in selected]
-    of_domain = [_DOMAIN_WORDS[feature["domain"]] for feature in selected]
+    kinds, components, descriptors, domains = (
+        [feature[key] for feature in selected]
+        for key in ("kind", "component", "descriptor", "domain")
+    )
     is_pooled = any(feature.get("statistic") for feature in selected)
-    apart = "of each channel" if is_pooled and not is_papers else None
+    apart = "of each channel" if is_pooled else None
     places = [feature.get("statistic") or apart or feature["finger"] for feature in selected]
-    where = "statistic over channels" if is_pooled else "finger"
-
-    layers = {"sensor kind": kinds, "signal component": of_domain, where: kinds}
-    names = {"sensor kind": kinds, "signal component": components, where: places}
-    left = [name for name, of in names.items() if is_papers or len(set(of)) > 1]
-    left = left or ["signal component"]
-    orders = {
-        "sensor kind": colours,
-        "signal component": [c for c in _COMPONENTS if is_papers or c in components],
-        where: by_finger.get("SG", {}),
+    of_kind = style.kind_colours(sorted(set(kinds)))
+    of_domain = dict(zip(_DOMAIN_WORDS, (style.PURPLE, style.GREEN), strict=True))
+    panels = {
+        "sensor kind": (0.5, kinds, kinds, of_kind),
+        "signal component": (1.1, components, domains, of_domain),
+        "statistic over channels" if is_pooled else "finger": (1.0, places, kinds, of_kind),
     }
-    of_paper = {"sensor kind": {name: {name: n} for name, n in by_kind.items()}, where: by_finger}
-    heights = [{"sensor kind": 0.5, "signal component": 1.1}.get(name, 1.0) for name in left]
+    left = [name for name, (_, values, *_) in panels.items() if len(set(values)) > 1]
+    left = left or ["signal component"]
+    heights = [panels[name][0] for name in left]
     grid = figure.add_gridspec(len(left), 2, width_ratios=[1.15, 1], height_ratios=heights)
-    panels = {name: figure.add_subplot(grid[row, 0]) for row, name in enumerate(left)}
-    titles = [f"({letter}) {name}" for letter, name in zip("abcd", [*left, ""], strict=False)]
-    for (name, axes), panel_title in zip(panels.items(), titles, strict=False):
-        pairs = zip(layers[name], names[name], strict=True)
-        hues = domains if name == "signal component" else colours
-        is_told = is_papers or name == "signal component"  # else in the legend of all panels
-        _counts(
-            axes, panel_title, pairs, orders[name], hues, of_paper.get(name), with_legend=is_told
-        )
-
-    descriptor = figure.add_subplot(grid[:, 1])
-    ranks = dict.fromkeys(published.DESCRIPTORS_NEVER, "-") if is_papers else {}
-    ranked = published.DESCRIPTORS_RANKED if is_papers else ()
-    ranks = {name: str(rank) for rank, name in enumerate(ranked, 1)} | ranks
-    described = [feature["descriptor"] for feature in selected]
-    what = f"{titles[-1]}descriptor{'  [rank in the paper]' if is_papers else ''}"
-    pairs = zip(kinds, described, strict=True)
-    shown = _counts(descriptor, what, pairs, ranks, colours, with_legend=is_papers)
-    if not is_papers:
-        handles = [Patch(color=colour, label=kind) for kind, colour in colours.items()]
-        style.legend_below(figure, handles, 6)
-    if is_papers:
-        said = f"paper: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
-        panels["signal component"].set_xlabel(said)
-        style.lanes(descriptor, [f"{style.words(name)}  [{ranks[name]}]" for name in shown])
-        descriptor.set_xlabel("features; the paper never selects [-]")
+    for row, name in enumerate(left):
+        _, values, layers, colours = panels[name]
+        axes = figure.add_subplot(grid[row, 0])
+        _counts(axes, f"({'abc'[row]}) {name}", zip(layers, values, strict=True), colours)
+        if name == "signal component":
+            handles = [
+                Patch(color=of_domain[d], label=_DOMAIN_WORDS[d]) for d in of_domain if d in domains
+            ]
+            look: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
+            axes.legend(handles=handles, ncols=2, borderaxespad=0.3, handlelength=1.4, **look)
+    title = f"({'abcd'[len(left)]}) descriptor"
+    axes = figure.add_subplot(grid[:, 1])
+    _counts(axes, title, zip(kinds, descriptors, strict=True), of_kind)
+    handles = [Patch(color=colour, label=kind) for kind, colour in of_kind.items()]
+    style.legend_below(figure, handles, 6)
     style.save(figure, path, dpi=180)
 
 
 def _counts(
-    axes: Axes,
-    title: str,
-    pairs: Iterable[tuple[str, str]],
-    order: Iterable[str],
-    colours: Mapping[str, str],
-    of_paper: Mapping[str, Mapping[str, int]] | None = None,
-    *,
-    with_legend: bool = True,
-) -> list[str]:
-    """Counts of (layer, name) pairs as stacked bars, the paper's hatched below each; the names."""
+    axes: Axes, title: str, pairs: Iterable[tuple[str, str]], colours: Mapping[str, str]
+) -> None:
+    """Counts of (layer, name) pairs as stacked bars, a lane for each name, layers by colour."""
     counts = Counter(pairs)
-    names = list(dict.fromkeys([*order, *sorted({name for _, name in counts})]))
-    ours = {layer: {name: counts[layer, name] for name in names} for layer in colours}
-    aside, height = (0.2, 0.36) if of_paper else (0.0, 0.6)
-    for shown, at, hatch in ((ours, -aside, ""), (of_paper or {}, aside, "////")):
-        ends = dict.fromkeys(names, 0)
-        for layer, by_name in shown.items():
-            look: dict[str, Any] = {"color": colours[layer], "label": layer}
-            if hatch:
-                look = {"fc": "white", "ec": colours[layer], "label": f"{layer}, paper"}
-            if not (has := [name for name in names if by_name.get(name)]):
-                continue
-            lefts, widths = [ends[name] for name in has], [by_name[name] for name in has]
-            lanes_at = [names.index(name) + at for name in has]
-            axes.barh(lanes_at, widths, height, left=lefts, hatch=hatch, **look)
-            ends |= {name: ends[name] + by_name[name] for name in has}
-        for lane, end in enumerate(ends.values() if shown else ()):
-            axes.text(end, lane + at, f" {end}", va="center", color=style.GREY)
+    names = sorted({name for _, name in counts}, key=lambda name: (name != "raw", name))
+    for lane, name in enumerate(names):
+        widths = [counts[layer, name] for layer in colours]
+        style.stack(axes, lane, widths, colours.values())
+        axes.text(sum(widths), lane, f" {sum(widths)}", va="center", color=style.GREY)
     style.lanes(axes, list(map(style.words, names)))
     axes.set_title(title)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
     axes.margins(x=0.1)
-    place_of: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
-    if with_legend:
-        axes.legend(ncols=4, borderaxespad=0.3, handlelength=1.4, **place_of)
-    return names
 
 
 # Choice of the model -----------------------------------------------------------------------------
@@ -1025,7 +981,7 @@ def alarm_table(metrics: _Metrics) -> str:
     return style.marked(metrics["simulated"], _target_line(metrics), rows, budget)
 
 
-def scene_rows(metrics: _Metrics) -> list[_Row]:
+def _confounder_rows(metrics: _Metrics) -> list[_Row]:
     """False alarms and slips found in confounding scenes, by the detector's own rule.
 
     Behind it the false alarms of the paper's rule and of the other methods. A row for seen and
@@ -1055,8 +1011,8 @@ def scene_rows(metrics: _Metrics) -> list[_Row]:
 
 
 def _scenes_table(metrics: _Metrics) -> str:
-    """``scene_rows`` for the terminal."""
-    return style.marked(metrics["simulated"], style.table(scene_rows(metrics), num_left=2))
+    """``_confounder_rows`` for the terminal."""
+    return style.marked(metrics["simulated"], style.table(_confounder_rows(metrics), num_left=2))
 
 
 @style.styled

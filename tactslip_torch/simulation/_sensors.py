@@ -173,7 +173,7 @@ class _Vibrations:
         scene, grasp, grid = self._scene, self._grasp, self._grid
         of = scene.imperfections
         index = int(np.flatnonzero(grasp.element_of_channel == element)[0])
-        for start_s, end_s in partial_intervals(scene, scene.hand.channels[index].finger):
+        for start_s, end_s in _partial_intervals(scene, scene.hand.channels[index].finger):
             rows, envelope = grid.pulse(start_s, end_s, _PARTIAL_RAMP_S)
             holds = contact.slide[rows] == 0
             slip_v = np.where(holds, envelope, 0.0)
@@ -238,7 +238,7 @@ class _Front(NamedTuple):
     offset_v: Array
 
 
-def draw_front(scene: Scene) -> _Front:
+def _draw_front(scene: Scene) -> _Front:
     """Gains, noise floors and offsets: per session, and a little again per recording."""
     sensors, num = scene.sensors, len(scene.hand)
     session, rng = generator(*scene.session_key("front")), generator(*scene.key("f"))
@@ -336,7 +336,7 @@ def volts_of(
 ) -> list[Array]:
     """Volts of the channels asked for on the grid, ``[K, B]`` each."""
     history, _, now = grid.history
-    front, vibrations = draw_front(scene), _Vibrations(scene, grasp, grid)
+    front, vibrations = _draw_front(scene), _Vibrations(scene, grasp, grid)
     motion, handled = Motion(scene.slides, history), Handled(scene, grasp)
     volts = dict(zip(indices, _common_volts(scene, grid, indices), strict=True))
     elements = set(grasp.element_of_channel[indices].tolist()) & set(grasp.touching.tolist())
@@ -519,7 +519,7 @@ def _draw_knocks(scene: Scene) -> list[tuple[Array, float, float, float]]:
     return list(zip(sizes_v, times_s.tolist(), omegas.tolist(), decays.tolist(), strict=True))
 
 
-def machine_runs(scene: Scene) -> list[Interval]:
+def _machine_runs(scene: Scene) -> list[Interval]:
     """When the neighbouring machine turns, runs up or runs down; the last run may go on."""
     if scene.disturbances.machine_mv == 0:
         return []
@@ -532,7 +532,7 @@ def machine_runs(scene: Scene) -> list[Interval]:
     return runs
 
 
-def rotation_hz(scene: Scene) -> float:
+def _rotation_hz(scene: Scene) -> float:
     """The machine's rotation at full speed; the session's."""
     rng = generator(*scene.session_key("machine"))
     return float(log_uniform(rng, scene.disturbances.machine_hz))
@@ -548,7 +548,7 @@ def _machine_wave(scene: Scene, grid: Grid) -> Array:
     Raises:
         ValueError: if the rotation itself would be folded.
     """
-    wave, hertz, highest_hz = grid.zeros(), rotation_hz(scene), 0.45 * scene.sample_rate_hz
+    wave, hertz, highest_hz = grid.zeros(), _rotation_hz(scene), 0.45 * scene.sample_rate_hz
     if hertz >= highest_hz:
         raise ValueError(
             f"machine_hz must lie below {highest_hz:g} Hz at {scene.sample_rate_hz:g} samples a "
@@ -559,7 +559,7 @@ def _machine_wave(scene: Scene, grid: Grid) -> Array:
     phases = 2 * np.pi * rng.random(num)
     levels = np.where(_MACHINE_ORDERS * hertz < highest_hz, levels, 0.0)
     levels *= np.sqrt(2.0 / np.sum(levels**2))
-    for start_s, stop_s in machine_runs(scene):
+    for start_s, stop_s in _machine_runs(scene):
         rows = grid.overlapping(start_s, stop_s)
         since = np.clip(grid.time_s[rows] - start_s, 0.0, stop_s - start_s)
         left = stop_s - start_s - since
@@ -810,7 +810,7 @@ def _drift_factor(scene: Scene, what: Literal["share", "gain"], number: int, gri
     return _wandering(spread, generator(*scene.key(what), number), grid) if spread > 0 else 1.0
 
 
-def partial_intervals(scene: Scene, finger: str) -> list[Interval]:
+def _partial_intervals(scene: Scene, finger: str) -> list[Interval]:
     """When a finger slips or sticks on its own; intervals may overlap."""
     per_s = scene.imperfections.partial_slips_per_s
     return _at_random(scene, (*scene.key("partial slips"), finger), per_s, _PARTIAL_S)

@@ -88,10 +88,8 @@ class SampledBins:
             most = min(most, int(has.sum(0).min()))
         if num <= most:
             return self
-        joined, members = (
-            torch.zeros(most, 2, dtype=torch.float64),
-            [list[int]() for _ in range(most)],
-        )
+        joined = torch.zeros(most, 2, dtype=torch.float64)
+        members = [list[int]() for _ in range(most)]
         order = sorted(range(num), key=lambda group: (-float(counts[group].sum()), group))
         for group in order:
             of_class = joined[:, int(counts[group].argmax())].tolist()

@@ -349,51 +349,26 @@ def decision_threshold(scores: Tensor, is_slip: Tensor) -> float:
 
 
 def in_stretches(stream: Stream, timing: Timing, number: int) -> list[Stream]:
-    """A stream cut into so many stretches of equal length, in each of which rules begin anew."""
-    hop_s, num = timing.hop_s, len(stream.score)
+    """A stream without slip cut into so many of equal length, in each of which rules begin anew."""
+    num = len(stream.score)
     edges = [round(part * num / number) for part in range(number + 1)]
     per_bin = len(stream.onset_score) / max(num, 1)
     found = []
     for first, stop in pairwise(edges):
-        start_s = first * hop_s
-        end_s = start_s + (stop - first) * hop_s
+        start_s, end_s = first * timing.hop_s, stop * timing.hop_s
+        inside = ((max(a, start_s), min(b, end_s)) for a, b in stream.times.non_slip_s)
+        quiet = tuple((a - start_s, b - start_s) for a, b in inside if a < b)
         hops = slice(round(first * per_bin), round(stop * per_bin))
         found.append(
             Stream(
                 stream.recording,
-                _cut(stream.times, start_s, end_s),
+                Timeline(non_slip_s=quiet, duration_s=end_s - start_s),
                 stream.score[first:stop],
                 stream.is_valid[first:stop],
                 stream.onset_score[hops],
             )
         )
     return found
-
-
-def _cut(times: Timeline, start_s: float, end_s: float) -> Timeline:
-    """What is true of a stretch of a recording; slides that had begun before it are slip."""
-
-    def within(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
-        inside = [(max(a, start_s), min(b, end_s)) for a, b in stretches]
-        return tuple((a - start_s, b - start_s) for a, b in inside if a < b)
-
-    begun = [place for place, onset in enumerate(times.onsets_s) if start_s <= onset < end_s]
-    known = dict(enumerate(times.released_s))
-    slides = [times.sliding_s[place] for place in begun]
-    marked = times.annotated_onsets_s or times.onsets_s
-    before = [s for place, s in enumerate(times.sliding_s) if place not in begun]
-    return Timeline(
-        tuple(times.onsets_s[place] - start_s for place in begun),
-        tuple(marked[place] - start_s for place in begun),
-        tuple(times.speeds_mm_s[place] for place in begun),
-        tuple((a - start_s, min(b, end_s) - start_s) for a, b in slides),
-        slip_s=within([*times.slip_s, *before]),
-        non_slip_s=within(times.non_slip_s),
-        released_s=tuple(
-            (known[p][0] - start_s, known[p][1] - start_s) for p in begun if p in known
-        ),
-        duration_s=end_s - start_s,
-    )
 
 
 def _complement(stretches: Sequence[Stretch], duration_s: float) -> tuple[Stretch, ...]:

@@ -334,17 +334,17 @@ def group_scores(columns: Tensor, is_slip: Tensor, groups: Tensor) -> Tensor:
 
     ``|mean effect| / sqrt(within-class variance + variance of the effect + of the level)``, the
     last two between groups: a feature whose threshold moves from material to material is worth
-    less, which a t-test does not know. 0 for a constant feature.
+    less, which a t-test does not know. 0 for a constant feature. Groups of one class tell nothing;
+    if all are, the bins are one group.
 
     Shape:
         - columns: ``[N, F]``; is_slip: ``[N]``, bool; groups: ``[N]``, whole numbers
     """
     effects, levels, spreads = [], [], []
-    for group in groups.unique().tolist():
-        mine = groups == group
+    members = [groups == group for group in groups.unique().tolist()]
+    whole = [mine for mine in members if has_both_classes(is_slip[mine])]
+    for mine in whole or [torch.ones_like(is_slip)]:
         quiet, slip = columns[mine & ~is_slip], columns[mine & is_slip]
-        if not len(quiet) or not len(slip):
-            continue
         effects.append(slip.mean(0) - quiet.mean(0))
         levels.append((slip.mean(0) + quiet.mean(0)) / 2)
         spreads.append((slip.var(0, correction=0) + quiet.var(0, correction=0)) / 2)
