@@ -33,6 +33,13 @@ _PLACES = {"detect": "input", "stream": "source"}
 _GROUP = "own"
 
 
+def folder_keys(command: str) -> tuple[str, ...]:
+    """The keys that a folder as first argument of a command sets; none: it takes no folder."""
+    if command == "detect":
+        return (_PLACES[command],)
+    return {"data": ("root", "action")}.get(command, ("data.root",)) if command in _SECTIONS else ()
+
+
 def with_folder(command: str, arguments: Sequence[str]) -> list[str]:
     """The arguments of a command, a folder or file as the first of them made overrides.
 
