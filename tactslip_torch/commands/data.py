@@ -40,7 +40,7 @@ from tactslip_torch.report.recordings import (
     written_table,
 )
 from tactslip_torch.report.style import SIMULATED_LINE
-from tactslip_torch.runtime import __version__, in_processes
+from tactslip_torch.runtime import __version__, in_processes, runs_of
 from tactslip_torch.signals.filtering import ChannelFilter, frame_lengths
 
 _FIGURE = Path("outputs/data.png")
@@ -326,8 +326,7 @@ def _use_of(rule: LabelRule, times: Timeline, rate_hz: float, before: int, after
 
 def _spans(mask: NDArray[np.bool_], rate_hz: float) -> list[tuple[float, float]]:
     """Start and end of the true stretches, in seconds."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]))) / rate_hz
-    return [(float(start), float(end)) for start, end in edges.reshape(-1, 2)]
+    return [(start, end) for start, end in (runs_of(mask) / rate_hz).tolist()]
 
 
 def _levels(config: DictConfig, source: FileRecordings) -> list[Problem]:

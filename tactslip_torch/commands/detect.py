@@ -283,19 +283,16 @@ def _with_truth(
     """The entry with what is true of its alarms, and the events."""
     alarms = entry["alarms"]
     ends = [alarm["end_s"] for alarm in alarms]
-    watched = EventRecord(
+    watched = EventRecord.of(
+        truth,
         recording=entry["file"],
         material=entry["material"],
         scene=entry["scene"],
         duration_s=entry["duration_s"],
         alarms_s=tuple(alarm["alarm_s"] for alarm in alarms),
         onset_estimates_s=tuple(alarm["onset_s"] for alarm in alarms),
-        onsets_s=truth.onsets_s,
-        sliding_s=truth.sliding_s,
-        speeds_mm_s=truth.speeds_mm_s,
         first_positive_s=tuple(counts.first_positive_s),
         alarm_ends_s=tuple(math.inf if end is None else end for end in ends),
-        released_s=truth.released_s,
     )
     events = recording_events(watched, _RULES, LatencyParts(stream.look_ahead_s, stream.bin_s))
     known = plain(

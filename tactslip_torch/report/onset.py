@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from tactslip_torch.report import style
 from tactslip_torch.report.results import few_events
-from tactslip_torch.runtime import write_json
+from tactslip_torch.runtime import runs_of, write_json
 
 Array = NDArray[np.float64]
 Segments = Sequence[tuple[float, float]]
@@ -640,7 +640,5 @@ def _shade(axes: Axes, segments: Segments, name: str, **look: Any) -> None:
 
 def _spans(times: NDArray[np.floating], status: Array, end_s: float) -> list[tuple[float, float]]:
     """Segments in which a status is on; it holds from its time to the next, at last to the end."""
-    is_on = np.concatenate([[False], status >= 0.5, [False]])
-    edges = np.flatnonzero(is_on[1:] != is_on[:-1])
-    bounds = np.append(times, end_s)[edges].reshape(-1, 2)
+    bounds = np.append(times, end_s)[runs_of(status >= 0.5)]
     return [(float(start), float(end)) for start, end in bounds if end > start]
