@@ -22,7 +22,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from tactslip_torch.commands.own_folder import HAND_FILE, OF_HAND, folder_keys, with_folder
+from tactslip_torch.commands.own_folder import FOLDER_KEYS, HAND_FILE, OF_HAND, with_folder
 from tactslip_torch.commands.packaged import packaged_folder
 
 _COMMENTED = re.compile(r"( *)(?:- )?([\w@/]+):(?: +([^#\s].*?))?(?: +# (.*))?$")
@@ -199,7 +199,7 @@ def help_text(summary: str, line: CommandLine) -> str:
         if f"defaults.{name}" in about
     }
     required = [key.name for key in keys if key.value == "???"]
-    given = folder_keys(command)  # by the first argument
+    given = FOLDER_KEYS.get(command, [])
     words = [f"{name}=VALUE" for name in required if name not in given]
     folder = ["FOLDER" if set(given) & set(required) else "[FOLDER]"] if given else []
     lines = [" ".join(["usage: tactslip", command, *folder, *words, "[KEY=VALUE ...]"]), ""]

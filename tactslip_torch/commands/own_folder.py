@@ -30,14 +30,10 @@ _SECTIONS = {
 """Of each command that takes a folder, the sections of ``hand.yaml`` that it has."""
 _PLACES = {"detect": "input", "stream": "source"}
 """The key of commands that take a file or folder and need no labels."""
+FOLDER_KEYS = {name: ["data.root"] for name in _SECTIONS}
+FOLDER_KEYS |= {"data": ["root", "action"], "detect": ["input"]}
+"""The keys that a folder as first argument sets, by command."""
 _GROUP = "own"
-
-
-def folder_keys(command: str) -> tuple[str, ...]:
-    """The keys that a folder as first argument of a command sets; none: it takes no folder."""
-    if command == "detect":
-        return (_PLACES[command],)
-    return {"data": ("root", "action")}.get(command, ("data.root",)) if command in _SECTIONS else ()
 
 
 def with_folder(command: str, arguments: Sequence[str]) -> list[str]:
