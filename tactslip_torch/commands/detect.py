@@ -226,18 +226,18 @@ def _detect_in(
 
         def take(decisions: Decisions) -> None:
             of = {column: getattr(decisions, column).numpy() for column in columns}
-            times, is_valid, is_on = of["available_s"], of["is_valid"], of["is_on"]
+            score = of["onset_score"]
+            of["onset_score"] = np.where(score > NOTHING_YET, score, math.nan)
             alarms = [
                 {name: _cell(value) for name, value in asdict(alarm).items()}
                 for alarm in decisions.alarms
             ]
-            counts.add(times, of["llr"], is_valid, is_on, alarms)
-            score = np.where(of["onset_score"] > NOTHING_YET, of["onset_score"], math.nan)
-            traces.add_decisions(times, of["probability"], is_on, is_valid, score)
+            counts.add(of, alarms)
+            traces.add_decisions(of)
             for log in logs if len(decisions.number) else ():
                 log.decisions(decisions)
             if write:
-                lost = [" ".join(decisions.names_lost(i)) for i in range(len(times))]
+                lost = [" ".join(decisions.names_lost(i)) for i in range(len(score))]
                 named = of | {"channels_lost": np.array(lost, object)}
                 write(zip(*(map(_cell, values.tolist()) for values in named.values()), strict=True))
             for event in stream.take_events():
