@@ -30,7 +30,7 @@ def on_files(files: Any, config: Any) -> Any:
             content = {"content": _markdown(path)} if is_page else {"abs_src_path": ROOT / path}
             files.append(File.generated(config, _uri(path), **content))
         if is_page:
-            linked = (_target(path, link) for link in LINK.findall(_markdown(path)))
+            linked = dict.fromkeys(_target(path, link) for link in LINK.findall(_markdown(path)))
             paths += [new for new in linked if (ROOT / new).is_file() and new not in paths]
     return files
 

@@ -32,7 +32,8 @@ PAGES = {
 }
 RUN = [name for name in PAGES if name.startswith("docs/") or name == "README.md"]
 ALL = "\n".join(text for name, text in PAGES.items() if not name.endswith("troubleshooting.md"))
-IN_ORDER = ("docs/quickstart.md", "docs/your_hand.md")  # pages whose commands follow one another
+# pages whose commands follow one another
+IN_ORDER = ("docs/quickstart.md", "docs/your_hand.md", "docs/deploy.md")
 BANNED = re.compile(
     r"\b(houses?|rooms?|rungs?|knobs?|ledgers?|rivals?|judg\w+|verdicts?|heard|fools?|never met"
     r"|promis\w+|stand-ins?|behind the fit|(?:reference|design|findings|physics|style)\.md)\b",
