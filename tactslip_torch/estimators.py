@@ -329,8 +329,8 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             X: windows.
             y: any two labels.
             groups: of each row, such as its material, recording or day: a choice is evaluated on
-                groups that it was not fitted to. ``None`` and NaN are a group too. Groups of one
-                label are put together, so that each part that is left out has both. In
+                groups that it was not fitted to. ``None`` and NaN are a group too. More than ten
+                are put together, and so are groups of one label where no two have both. In
                 ``cross_val_score`` they come by ``params={"groups": groups}``; with metadata
                 routing after ``set_fit_request(groups=True)``.
 
@@ -566,30 +566,15 @@ def _groups(y: Array, groups: Any) -> tuple[Tensor, tuple[str, ...]]:
     if groups.dtype == object:  # None, NaN and words have no order
         groups = np.array(["none" if str(each) in _MISSING else str(each) for each in groups])
     values, index = np.unique(groups, return_inverse=True)
-    names = [str(value).replace("|", "/") for value in values]
     has = np.zeros((len(values), 2), bool)
     has[index, of_class] = True
-    of_one = [np.flatnonzero(has[:, label] & ~has[:, 1 - label]) for label in (0, 1)]
-    num_joined = min(_FOLDS, *map(len, of_one))
-    num_whole = int(has.all(1).sum())
-    if len(values) > 1 and num_whole + num_joined < 2:
+    if len(values) > 1 and has.sum(0).min() < 2:
         raise ValueError(
             "validation leaves out groups and needs two parts that have both labels; of the "
-            f"{len(values)} groups {num_whole} have both, {len(of_one[0])} only the smaller label, "
-            f"{len(of_one[1])} only the larger; give groups that have both, or groups=None for "
-            "blocks of rows"
+            f"{len(values)} groups {has[:, 0].sum()} have the smaller label, {has[:, 1].sum()} the "
+            "larger; give groups that have both, or groups=None for blocks of rows"
         )
-    if num_joined:
-        parts: list[list[int]] = [[] for _ in range(num_joined)]
-        for some in of_one:
-            for part, block in zip(parts, np.array_split(some, num_joined), strict=True):
-                part += block.tolist()
-        for part in parts:
-            index[np.isin(index, part)] = part[0]
-            names[part[0]] += f" and {len(part) - 1} more"
-        kept, index = np.unique(index, return_inverse=True)
-        names = [names[place] for place in kept]
-    return torch.from_numpy(index), tuple(names)
+    return torch.from_numpy(index), tuple(str(value).replace("|", "/") for value in values)
 
 
 def _fitted(

@@ -7,9 +7,7 @@ and check sums are looked at here; whether parts fit together, where they are pu
 from __future__ import annotations
 
 import json
-import math
 import os
-import stat
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -150,7 +148,7 @@ def _load(path: str | os.PathLike[str], most_bytes: int) -> dict[str, Any]:
     return content
 
 
-def _regular_file(path: str | os.PathLike[str], most_bytes: float = math.inf) -> Path:
+def _regular_file(path: str | os.PathLike[str], most_bytes: int) -> Path:
     """The path of a file that can be read from start to end: no folder, device or pipe.
 
     Opening a pipe would wait for whoever writes to it.
@@ -164,13 +162,11 @@ def _regular_file(path: str | os.PathLike[str], most_bytes: float = math.inf) ->
         ValueError: if it is no file, or longer than that.
     """
     path = Path(path)
-    try:
-        status = path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        raise FileNotFoundError(f"no file at {path}") from None
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or pipe"
+    if not path.exists():
+        raise FileNotFoundError(f"no file at {path}")
+    if not path.is_file():
+        kind = "a folder" if path.is_dir() else "a device or pipe"
         raise ValueError(f"{path} is {kind}, expected a file; copy it to a file first")
-    if status.st_size > most_bytes:
-        raise ValueError(f"{path} has {status.st_size} bytes, at most {most_bytes:.0f} can be read")
+    if (size := path.stat().st_size) > most_bytes:
+        raise ValueError(f"{path} has {size} bytes, at most {most_bytes:.0f} can be read")
     return path

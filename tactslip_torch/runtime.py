@@ -32,6 +32,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 import torch.distributed
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import forward_ad
 from tqdm.auto import tqdm
@@ -189,6 +190,17 @@ def are_unchanged(tensors: Sequence[Tensor], stamps: Sequence[tuple[Tensor, int 
         x is same and (torch.equal(x, was) if isinstance(was, Tensor) else x._version == was)
         for x, (same, was) in zip(tensors, stamps, strict=True)
     )
+
+
+def runs_of(is_true: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """First and stop of each run of true values, ``[T] -> [n, 2]``.
+
+    Example:
+        >>> runs_of(np.array([True, False, True, True]))
+        array([[0, 1],
+               [2, 4]])
+    """
+    return np.flatnonzero(np.diff(is_true, prepend=False, append=False)).reshape(-1, 2)
 
 
 def full_precision(x: Tensor) -> AbstractContextManager[object]:

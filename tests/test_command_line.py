@@ -168,6 +168,9 @@ EXAMPLES = [
     "line", [*TAKEN, *(pytest.param(line, marks=pytest.mark.slow) for line in EXAMPLES)]
 )
 def test_what_can_be_set_and_every_example_of_the_help_pass(line):
+    Path("FOLDER").mkdir(exist_ok=True)
+    for name in ("FOLDER/manifest.csv", "FILE"):
+        Path(name).touch()
     command, *rest = shlex.split(line.removeprefix("tactslip "))
     assert checked(command, rest).config
 

@@ -224,8 +224,8 @@ def test_slip_is_the_label_that_says_so_or_that_is_given(labels: tuple[Any, ...]
 
 
 GROUPS = {
-    "one row each": (np.arange(80), 5),
-    "one label each": (np.arange(80) // 4 * 2 + np.arange(80) % 2, 5),
+    "one row each": (np.arange(80), 10),
+    "one label each": (np.arange(80) // 4 * 2 + np.arange(80) % 2, 10),
     "some of one label": (np.where(np.arange(80) < 40, "both", np.arange(80) % 6), 4),
     "none": (np.array([None] * 8 + ["m1"] * 32 + ["m2"] * 40, object), 3),
     "nan": (np.array([np.nan] * 8 + [1.0] * 72), 2),

@@ -367,7 +367,8 @@ def traces_of(films, view=(0.0, 1.4), num_decisions=130):
     traces = Traces(names, RATE_HZ, HOP_S, view)
     traces.add_samples(films)
     score = np.where(times < 0.2, math.nan, 2.0 * slip)  # not before there is a floor
-    traces.add_decisions(times - 1e-9, 0.9 * slip + 0.05, slip, valid, score)
+    of = {"available_s": times - 1e-9, "probability": 0.9 * slip + 0.05, "is_on": slip}
+    traces.add_decisions(of | {"is_valid": valid, "onset_score": score})
     return traces
 
 

@@ -23,6 +23,7 @@ from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings
+from tactslip_torch.onset.rules import Budget
 from tactslip_torch.report.calibration import (
     calibration_figure,
     calibration_table,
@@ -213,22 +214,8 @@ def _calibrated(
     calibrator: Calibrator, recordings: Sequence[ScoredRecording]
 ) -> tuple[dict[str, Any], Change | None]:
     """What is reported, and what changes of the detector; ``None``: nothing is better."""
-    budget, report = None, dict[str, Any]()
-    if calibrator.per_hour is not None:
-        dispersion = calibrator.dispersion(recordings)
-        hours = sum(one.hours for one in recordings)
-        budget = calibrator.budget(dispersion)
-        best, rate = budget.bound(0, hours), calibrator.per_hour
-        if dispersion > 1.05:
-            line = (
-                f"false alarms come in bunches (variance of their counts {dispersion:.2g} times "
-                f"the mean): {hours:.3g} h can show {best:.3g} an hour at best"
-            )
-            if best > rate:
-                raise ValueError(
-                    f"{line}, not {rate:g}; give {best * hours / rate:.2g} h, or a larger per_hour"
-                )
-            print(line)
+    settings, report = calibrator.settings, dict[str, Any]()
+    budget = _bunched_budget(calibrator, recordings)
     num_slip = sum(int(one.is_slip.sum()) for one in recordings)
     moves_bins = 0 < num_slip < sum(len(one.is_slip) for one in recordings)
     change = calibrator.fit(recordings, budget, moves_bins=moves_bins)
@@ -250,41 +237,77 @@ def _calibrated(
             if budget is not None:
                 rows = _rows(calibrator, recordings, changes)
                 new = pooled_outcome(row["after"] for row in rows)
-    if budget is None and change.alarm != calibrator.settings and new["found"] < old["found"]:
-        report["alarm_stays"] = [old["found"], new["found"], new["slips"]]
-        change = change._replace(alarm=calibrator.settings)
-        changes = [each._replace(alarm=calibrator.settings) for each in changes]
-        rows = _rows(calibrator, recordings, changes)
     if budget is not None:
-        (counts,) = change.alarm.metadata["budget"]
-        hours, rate = counts["amount"], new["per_hour"] or 0.0
-        is_worse = rate > budget.limit and rate >= old["per_hour"]
-        is_set = math.isfinite(change.alarm.alarm_threshold) and not is_worse
-
-        def stated(threshold: float) -> float:
-            return calibrator.restated(change, threshold).alarm_threshold
-
-        report["alarm"] = {
-            "per_hour": budget.limit,
-            "confidence": budget.confidence,
-            "hours": hours,
-            "dispersion": budget.dispersion,
-            **{name: counts[name] for name in ("allowed", "alarms", "bound")},
-            "before": stated(calibrator.settings.alarm_threshold),
-            "after": stated(change.alarm.alarm_threshold),
-            "is_set": is_set,
-            "rate_before": old["per_hour"],
-            "rate_after": new["per_hour"],
-            "curve": [
-                [stated(at), each, budget.bound(round(each * hours), hours)]
-                for at, each in calibrator.curve(recordings, change)
-            ],
-        }
-        if not is_set:
-            change = change._replace(alarm=calibrator.settings)
+        rates = old["per_hour"], new["per_hour"] or 0.0
+        report["alarm"] = _alarm_report(calibrator, recordings, change, budget, *rates)
+        if not report["alarm"]["is_set"]:
+            change = change._replace(alarm=settings)
+    elif change.alarm != settings and new["found"] < old["found"]:
+        report["alarm_stays"] = [old["found"], new["found"], new["slips"]]
+        change = change._replace(alarm=settings)
+        changes = [each._replace(alarm=settings) for each in changes]
+        rows = _rows(calibrator, recordings, changes)
     report |= {"left_out_words": words, "left_out": rows}
     is_better = any(report[name]["is_set"] for name in ("bins", "alarm") if name in report)
     return report, change if is_better else None
+
+
+def _bunched_budget(calibrator: Calibrator, recordings: Sequence[ScoredRecording]) -> Budget | None:
+    """The budget of false alarms with the dispersion that they have; ``None``: no rate is set.
+
+    Raises:
+        ValueError: if they come in bunches, so that the recordings cannot show the rate.
+    """
+    if (rate := calibrator.per_hour) is None:
+        return None
+    dispersion = calibrator.dispersion(recordings)
+    hours = sum(one.hours for one in recordings)
+    budget = calibrator.budget(dispersion)
+    best = budget.bound(0, hours)
+    if dispersion > 1.05:
+        line = (
+            f"false alarms come in bunches (variance of their counts {dispersion:.2g} times "
+            f"the mean): {hours:.3g} h can show {best:.3g} an hour at best"
+        )
+        if best > rate:
+            raise ValueError(
+                f"{line}, not {rate:g}; give {best * hours / rate:.2g} h, or a larger per_hour"
+            )
+        print(line)
+    return budget
+
+
+def _alarm_report(
+    calibrator: Calibrator,
+    recordings: Sequence[ScoredRecording],
+    change: Change,
+    budget: Budget,
+    old: float,
+    new: float,
+) -> dict[str, Any]:
+    """What is reported of the alarm; ``old`` and ``new`` are rates on what was left out."""
+    (counts,) = change.alarm.metadata["budget"]
+    hours, is_worse = counts["amount"], new > budget.limit and new >= old
+
+    def stated(threshold: float) -> float:
+        return calibrator.restated(change, threshold).alarm_threshold
+
+    return {
+        "per_hour": budget.limit,
+        "confidence": budget.confidence,
+        "hours": hours,
+        "dispersion": budget.dispersion,
+        **{name: counts[name] for name in ("allowed", "alarms", "bound")},
+        "before": stated(calibrator.settings.alarm_threshold),
+        "after": stated(change.alarm.alarm_threshold),
+        "is_set": math.isfinite(change.alarm.alarm_threshold) and not is_worse,
+        "rate_before": old,
+        "rate_after": new,
+        "curve": [
+            [stated(at), each, budget.bound(round(each * hours), hours)]
+            for at, each in calibrator.curve(recordings, change)
+        ],
+    }
 
 
 def _rows(

@@ -22,7 +22,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from tactslip_torch.commands.own_folder import HAND_FILE, OF_HAND, with_folder
+from tactslip_torch.commands.own_folder import FOLDER_KEYS, HAND_FILE, OF_HAND, with_folder
 from tactslip_torch.commands.packaged import packaged_folder
 
 _COMMENTED = re.compile(r"( *)(?:- )?([\w@/]+):(?: +([^#\s].*?))?(?: +# (.*))?$")
@@ -198,8 +198,11 @@ def help_text(summary: str, line: CommandLine) -> str:
         for name, at in reversed(_groups(config.hydra).items())
         if f"defaults.{name}" in about
     }
-    required = [f"{key.name}=VALUE" for key in keys if key.value == "???"]
-    lines = [" ".join(["usage: tactslip", command, *required, "[KEY=VALUE ...]"]), ""]
+    required = [key.name for key in keys if key.value == "???"]
+    given = FOLDER_KEYS.get(command, [])
+    words = [f"{name}=VALUE" for name in required if name not in given]
+    folder = ["FOLDER" if set(given) & set(required) else "[FOLDER]"] if given else []
+    lines = [" ".join(["usage: tactslip", command, *folder, *words, "[KEY=VALUE ...]"]), ""]
     lines += [f"{command}: {summary}.", *(row for row in head if not row.startswith("tactslip "))]
     lines += ["", "examples:", *(f"  {row}" for row in head if row.startswith("tactslip "))]
     if groups:

@@ -40,7 +40,7 @@ from tactslip_torch.report.recordings import (
     written_table,
 )
 from tactslip_torch.report.style import SIMULATED_LINE
-from tactslip_torch.runtime import __version__, in_processes
+from tactslip_torch.runtime import __version__, in_processes, runs_of
 from tactslip_torch.signals.filtering import ChannelFilter, frame_lengths
 
 _FIGURE = Path("outputs/data.png")
@@ -225,22 +225,6 @@ def _inspect_all(
 # What training would use -------------------------------------------------------------------------
 
 
-class _Use(NamedTuple):
-    """What of a recording training would use.
-
-    Args:
-        num_slip: bins.
-        num_rest: bins of non-slip.
-        left_s: seconds in no bin, by the reason.
-        spans: start and end in seconds of the stretches of each kind, ``SPAN_KINDS`` of the report.
-    """
-
-    num_slip: int
-    num_rest: int
-    left_s: dict[str, float]
-    spans: dict[str, list[tuple[float, float]]]
-
-
 def _show_use(config: DictConfig, source: FileRecordings) -> None:
     """Print what of each file training would use, and draw it."""
     rule: LabelRule = instantiate(config.labels, _convert_="all")
@@ -272,7 +256,7 @@ def _show_use(config: DictConfig, source: FileRecordings) -> None:
             print(f"bins: {source.entry(recording).problem(one_line(error))}")
             return
         file = source.entry(recording).file
-        rows.append({"file": file, "duration_s": times.duration_s, **use._asdict()})
+        rows.append({"file": file, "duration_s": times.duration_s, **use})
     print("\n" + use_table(rows, _MOST_ROWS))
     path = _CHECK if config.output is None else Path(str(config.output))
     what = "SIMULATED recordings" if source.is_simulated else "Recordings"
@@ -281,8 +265,15 @@ def _show_use(config: DictConfig, source: FileRecordings) -> None:
     print(f"\npicture in {path}")
 
 
-def _use_of(rule: LabelRule, times: Timeline, rate_hz: float, before: int, after: int) -> _Use:
-    """What training would use of a recording, by its labels and what is missing."""
+def _use_of(
+    rule: LabelRule, times: Timeline, rate_hz: float, before: int, after: int
+) -> dict[str, Any]:
+    """What training would use of a recording, by its labels and what is missing.
+
+    Returns:
+        ``num_slip`` and ``num_rest`` bins; ``left_s``, seconds in no bin, by the reason; ``spans``,
+        the stretches of each kind in seconds.
+    """
     num_samples = round(times.duration_s * rate_hz)
     whole = replace(times, missing_s=())
     one = replace(rule, assign="last", bin_ms=1000 / rate_hz, hop_ms=None)  # sample by sample
@@ -316,18 +307,12 @@ def _use_of(rule: LabelRule, times: Timeline, rate_hz: float, before: int, after
         "missing": is_missing,
     }
     num_slip = int(bins.is_slip.sum())
-    return _Use(
-        num_slip,
-        len(bins.starts) - num_slip,
-        {reason: int(mask.sum()) / rate_hz for reason, mask in reasons.items()},
-        {kind: _spans(mask, rate_hz) for kind, mask in kinds.items()},
-    )
-
-
-def _spans(mask: NDArray[np.bool_], rate_hz: float) -> list[tuple[float, float]]:
-    """Start and end of the true stretches, in seconds."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]))) / rate_hz
-    return [(float(start), float(end)) for start, end in edges.reshape(-1, 2)]
+    return {
+        "num_slip": num_slip,
+        "num_rest": len(bins.starts) - num_slip,
+        "left_s": {reason: int(mask.sum()) / rate_hz for reason, mask in reasons.items()},
+        "spans": {kind: (runs_of(mask) / rate_hz).tolist() for kind, mask in kinds.items()},
+    }
 
 
 def _levels(config: DictConfig, source: FileRecordings) -> list[Problem]:

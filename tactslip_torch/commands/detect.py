@@ -226,18 +226,18 @@ def _detect_in(
 
         def take(decisions: Decisions) -> None:
             of = {column: getattr(decisions, column).numpy() for column in columns}
-            times, is_valid, is_on = of["available_s"], of["is_valid"], of["is_on"]
+            score = of["onset_score"]
+            of["onset_score"] = np.where(score > NOTHING_YET, score, math.nan)
             alarms = [
                 {name: _cell(value) for name, value in asdict(alarm).items()}
                 for alarm in decisions.alarms
             ]
-            counts.add(times, of["llr"], is_valid, is_on, alarms)
-            score = np.where(of["onset_score"] > NOTHING_YET, of["onset_score"], math.nan)
-            traces.add_decisions(times, of["probability"], is_on, is_valid, score)
+            counts.add(of, alarms)
+            traces.add_decisions(of)
             for log in logs if len(decisions.number) else ():
                 log.decisions(decisions)
             if write:
-                lost = [" ".join(decisions.names_lost(i)) for i in range(len(times))]
+                lost = [" ".join(decisions.names_lost(i)) for i in range(len(score))]
                 named = of | {"channels_lost": np.array(lost, object)}
                 write(zip(*(map(_cell, values.tolist()) for values in named.values()), strict=True))
             for event in stream.take_events():
@@ -283,19 +283,16 @@ def _with_truth(
     """The entry with what is true of its alarms, and the events."""
     alarms = entry["alarms"]
     ends = [alarm["end_s"] for alarm in alarms]
-    watched = EventRecord(
+    watched = EventRecord.of(
+        truth,
         recording=entry["file"],
         material=entry["material"],
         scene=entry["scene"],
         duration_s=entry["duration_s"],
         alarms_s=tuple(alarm["alarm_s"] for alarm in alarms),
         onset_estimates_s=tuple(alarm["onset_s"] for alarm in alarms),
-        onsets_s=truth.onsets_s,
-        sliding_s=truth.sliding_s,
-        speeds_mm_s=truth.speeds_mm_s,
         first_positive_s=tuple(counts.first_positive_s),
         alarm_ends_s=tuple(math.inf if end is None else end for end in ends),
-        released_s=truth.released_s,
     )
     events = recording_events(watched, _RULES, LatencyParts(stream.look_ahead_s, stream.bin_s))
     known = plain(

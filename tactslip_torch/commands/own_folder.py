@@ -30,6 +30,9 @@ _SECTIONS = {
 """Of each command that takes a folder, the sections of ``hand.yaml`` that it has."""
 _PLACES = {"detect": "input", "stream": "source"}
 """The key of commands that take a file or folder and need no labels."""
+FOLDER_KEYS = {name: ["data.root"] for name in _SECTIONS}
+FOLDER_KEYS |= {"data": ["root", "action"], "detect": ["input"]}
+"""The keys that a folder as first argument sets, by command."""
 _GROUP = "own"
 
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import yaml  # type: ignore[import-untyped,unused-ignore]
 
 if TYPE_CHECKING:
     from tactslip_torch.data.file_recordings import FileRecordings
@@ -133,22 +135,11 @@ def _lines(settings: Mapping[str, Any], place: str, reasons: Mapping[str, str]) 
 
 
 def _flow(value: Any) -> str:
-    """A value in one line of YAML; words that YAML takes for something else are in quotes."""
-    if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{_flow(name)}: {_flow(one)}' for name, one in value.items())}}}"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_flow, value))}]"
-    if isinstance(value, str) and _is_plain(value):
-        return value
-    return json.dumps(value, ensure_ascii=False)
-
-
-_NO_TEXT = re.compile(r"(?i)y|n|yes|no|on|off|true|false|null|nan|inf")
-
-
-def _is_plain(text: str) -> bool:
-    """Whether YAML reads a word as it stands."""
-    return bool(re.fullmatch(r"[A-Za-z][\w/-]*", text)) and not _NO_TEXT.fullmatch(text)
+    """A value in one line of YAML."""
+    plain = json.loads(json.dumps(value))  # tuples and numbers of NumPy are none in YAML
+    options = {"default_flow_style": True, "sort_keys": False, "allow_unicode": True}
+    text: str = yaml.safe_dump(plain, width=math.inf, **options)
+    return text.removesuffix("\n").removesuffix("\n...")
 
 
 # hand.png -----------------------------------------------------------------------------------------

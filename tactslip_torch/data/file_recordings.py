@@ -48,7 +48,7 @@ from tactslip_torch.data.recording import (
     scaled,
 )
 from tactslip_torch.hand import KNOWN_KINDS, Adapting, Channel, HandLayout
-from tactslip_torch.runtime import check_number, in_processes, setting, settings_in
+from tactslip_torch.runtime import check_number, in_processes, runs_of, setting, settings_in
 from tactslip_torch.signals.resampling import resample
 
 log = logging.getLogger(__name__)
@@ -363,15 +363,9 @@ def _gaps_on(clock: Clock) -> NDArray[np.bool_]:
     return is_missing
 
 
-def _runs_of(is_true: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Starts and ends of the runs of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_true, [False]])))
-    return edges[::2], edges[1::2]
-
-
 def _to_bridge(is_missing: NDArray[np.bool_], most: int) -> NDArray[np.bool_]:
     """Which missing samples of a channel, ``[T]``, lie in runs so short that they are bridged."""
-    starts, stops = _runs_of(is_missing)
+    starts, stops = runs_of(is_missing).T
     is_short = (stops - starts <= most) & (starts > 0) & (stops < len(is_missing))
     change = np.zeros(len(is_missing) + 1, dtype=np.int64)
     change[starts[is_short]], change[stops[is_short]] = 1, -1
@@ -430,7 +424,7 @@ def _with_missing(head: _Head, samples: Samples, reading: Reading) -> _Head:
             text = f"{name}{more} is not finite in {len(own)} samples, first at {first_s:.4f} s"
             if len(own) == samples.num_samples:
                 text = f"{name}{more} is not finite in any sample"
-    stretches = zip(*(edge.tolist() for edge in _runs_of(is_lost)), strict=True)
+    stretches = [(first, stop) for first, stop in runs_of(is_lost).tolist()]
     is_whole = not (broken or clock.gaps)
     return head._replace(missing=tuple(stretches), broken=text, is_whole=is_whole)
 

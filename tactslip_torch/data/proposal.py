@@ -829,13 +829,10 @@ def _propose_label_column(
     if over is None and len(numbers) == 2:
         over = sum(numbers) / 2
     if over is None:
-        is_few = len(numbers) <= _MOST_STATES
-        values = (
-            ", ".join(f"{number:g}" for number in numbers)
-            if is_few
-            else (f"numbers from {numbers[0]:g} to {numbers[-1]:g}")
-        )
-        default = f"{(numbers[0] + numbers[1]) / 2:g}" if is_few else ""
+        values, default = f"numbers from {numbers[0]:g} to {numbers[-1]:g}", ""
+        if len(numbers) <= _MOST_STATES:
+            values = ", ".join(f"{number:g}" for number in numbers)
+            default = f"{(numbers[0] + numbers[1]) / 2:g}"
         text = f"Above which value of column {label.name} is it slip? It holds {values}"
         draft.ask("over", text, "--over NUMBER", default)
         over = float(default or "nan")
@@ -948,23 +945,20 @@ def _propose_split(
     fields: Mapping[str, Mapping[str, str]], classes: Mapping[str, set[bool]], draft: Proposal
 ) -> None:
     """What is left out, one after the other, to estimate how good a detector is on new ones."""
-    by = "recording"
-    for name in ("material", "session"):
+    for by in ("material", "session"):
         groups: dict[str, set[bool]] = defaultdict(set)
         for file, known in classes.items():
-            if (value := fields.get(file, {}).get(name)) is not None:
+            if (value := fields.get(file, {}).get(by)) is not None:
                 groups[value] |= known
         num = sum(states == {True, False} for states in groups.values())
-        is_grouped = len({known.get(name) for known in fields.values()}) < len(fields)
+        is_grouped = len({known.get(by) for known in fields.values()}) < len(fields)
+        what = "object" if by == "material" else by
         if num >= _FEWEST_GROUPS and is_grouped:
-            by = name
+            reason = f"{num} {what}s have slip and non-slip"
             break
-    words = {"material": "object", "session": "session", "recording": "recording"}
-    reason = {
-        "material": f"{num} objects have slip and non-slip",
-        "session": f"{num} sessions have slip and non-slip",
-        "recording": f"fewer than {_FEWEST_GROUPS} objects or sessions have slip and non-slip",
-    }[by]
+    else:
+        by = what = "recording"
+        reason = f"fewer than {_FEWEST_GROUPS} objects or sessions have slip and non-slip"
     draft.set("split.by", by, f"what is left out for the estimate; {reason}")
     draft.set("split.folds", _FOLDS, "groups are joined to at most so many, each left out once")
-    draft.tell("estimate", f"one {words[by]} after the other is left out", reason)
+    draft.tell("estimate", f"one {what} after the other is left out", reason)

@@ -203,16 +203,14 @@ def leave_groups_out(
     return splits
 
 
-def everything(
-    recordings: Sequence[RecordingId], *, role: str = "test", name: str = "all"
-) -> list[Split]:
+def everything(recordings: Sequence[RecordingId], *, role: str = "test") -> list[Split]:
     """One fold in which every recording has the same role.
 
     Raises:
         ValueError: if there is no such role.
     """
     check_choice("split.role", role, ROLES)
-    return [Split(name, dict.fromkeys(sorted(recordings), role))]
+    return [Split("all", dict.fromkeys(sorted(recordings), role))]
 
 
 def confound(

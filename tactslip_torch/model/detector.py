@@ -30,9 +30,7 @@ from tactslip_torch.model.calibration import probability as stated
 from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_from_dict
 from tactslip_torch.model.prediction import (
     ChannelMask,
-    Nonfinite,
     Prediction,
-    check_nonfinite,
     predict_in_parts,
     without,
 )
@@ -227,16 +225,15 @@ class SlipDetector(nn.Module):
     def predict(
         self,
         bins: Tensor,
-        nonfinite: Nonfinite = "mask",
         given: torch.dtype | None = None,
         masked_channels: ChannelMask | None = None,
     ) -> Prediction:
         """Score filtered bins of a hand whose sensors may fail: a score, and whether it counts.
 
+        A channel with NaN or Inf counts as missing.
+
         Args:
             bins: in volts.
-            nonfinite: what to do about NaN and Inf. ``"mask"``: the channel counts as missing.
-                ``"raise"``: refuse.
             given: dtype of the samples that the bins were filtered from, float32 or float64, by
                 default theirs; that of the score, whose rounding a span must exceed (the raw
                 samples are not known here).
@@ -246,17 +243,15 @@ class SlipDetector(nn.Module):
             - bins: ``[*, C, n]``
 
         Raises:
-            ValueError: if the number of channels or samples is another, for another dtype, for a
-                dead channel that the hand does not have, or under ``"raise"`` for a NaN or Inf,
-                naming where it is.
+            ValueError: if the number of channels or samples is another, for another dtype, or for a
+                masked channel that the hand does not have.
         """
         self.pool.check(bins)
-        return self._predict_in_parts(bins, False, nonfinite, given, masked_channels)
+        return self._predict_in_parts(bins, False, given, masked_channels)
 
     def predict_raw(
         self,
         samples: Tensor,
-        nonfinite: Nonfinite = "mask",
         given: torch.dtype | None = None,
         masked_channels: ChannelMask | None = None,
     ) -> Prediction:
@@ -273,7 +268,7 @@ class SlipDetector(nn.Module):
             ValueError: as ``predict``.
         """
         self._check_raw(samples)
-        return self._predict_in_parts(samples, True, nonfinite, given, masked_channels)
+        return self._predict_in_parts(samples, True, given, masked_channels)
 
     def probability(self, samples: Tensor | NDArray[Any]) -> Tensor:
         """How probable slip is, by ``calibration``: of filtered bins, or of raw ones; else NaN.
@@ -342,7 +337,6 @@ class SlipDetector(nn.Module):
         self,
         x: Tensor,
         is_raw: bool,
-        nonfinite: Nonfinite,
         given: torch.dtype | None,
         masked_channels: ChannelMask | None,
     ) -> Prediction:
@@ -352,7 +346,6 @@ class SlipDetector(nn.Module):
                 f"given must be torch.float32 or torch.float64, got {dtype}; use torch.float32 for "
                 "samples of less"
             )
-        check_nonfinite(nonfinite, x, names)
         x = without(x, masked_channels, names)
         return predict_in_parts(lambda part: self._predict(part, is_raw, dtype), x)
 

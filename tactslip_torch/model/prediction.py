@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,9 +12,6 @@ from tactslip_torch.runtime import full_precision, is_concrete, thread_map
 
 ChannelMask = Sequence[str] | Tensor
 """Channels that are not to be listened to: their names, or a mask ``[C]``, bool."""
-
-Nonfinite = Literal["mask", "raise"]
-"""What to do about NaN and Inf: their channels count as missing, or they are refused."""
 
 _PART_BINS = 256  # that stay in a cache
 
@@ -45,18 +42,6 @@ class Prediction(NamedTuple):
             f"Prediction({num} bins: {slip} slip, {valid - slip} non-slip, "
             f"{num - valid} not valid; {lost} with lost channels)"
         )
-
-
-def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
-    """Hold samples ``[*, C, n]`` of the named channels against a policy.
-
-    Raises:
-        ValueError: for an unknown policy, or under ``"raise"`` for a NaN or Inf.
-    """
-    if policy not in get_args(Nonfinite):
-        raise ValueError(f"nonfinite must be 'mask' or 'raise', got {policy!r}")
-    if policy == "raise":
-        _refuse_nonfinite(samples, names, "repair the samples, or take nonfinite='mask'")
 
 
 def predict_in_parts(predict: Callable[[Tensor], Prediction], x: Tensor) -> Prediction:
@@ -113,26 +98,3 @@ def without(samples: Tensor, masked: ChannelMask | None, names: Sequence[str]) -
         return samples
     mask = _channel_mask(masked, names).to(samples.device)
     return samples.masked_fill(mask[:, None], torch.nan) if bool(mask.any()) else samples
-
-
-def _refuse_nonfinite(samples: Tensor, names: Sequence[str], advice: str) -> None:
-    """Raise if a sample is NaN or Inf.
-
-    Args:
-        samples: in any unit.
-        names: of the channels, for the message.
-        advice: what to do about it, the end of the message.
-
-    Shape:
-        - samples: ``[*, C, n]``
-
-    Raises:
-        ValueError: naming bin, channel and sample of the first one.
-    """
-    is_bad = ~samples.isfinite()
-    if not bool(is_bad.any()):
-        return
-    *bins, channel, sample = is_bad.nonzero()[0].tolist()
-    value = float(samples[(*bins, channel, sample)])
-    place = f"bin {', '.join(map(str, bins))}, " if bins else ""
-    raise ValueError(f"{place}channel {names[channel]}, sample {sample} is {value}; {advice}")

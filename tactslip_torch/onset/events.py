@@ -113,6 +113,12 @@ class EventRecord:
             if not all(before <= after for before, after in pairwise((-math.inf, *times))):
                 raise ValueError(f"{self.recording}: {name} must ascend, got {times[:4]}..")
 
+    @classmethod
+    def of(cls, truth: Any, **seen: Any) -> EventRecord:
+        """A record with the onsets, slides, speeds and releases of a recording or its timeline."""
+        names = ("onsets_s", "sliding_s", "speeds_mm_s", "released_s")
+        return cls(**{name: getattr(truth, name) for name in names}, **seen)
+
 
 def first_releases(
     onsets_s: Sequence[float], released_s: Sequence[tuple[float, float]]

@@ -21,11 +21,13 @@ from numpy.typing import NDArray
 
 from tactslip_torch.report import style
 from tactslip_torch.report.results import few_events
-from tactslip_torch.runtime import write_json
+from tactslip_torch.runtime import runs_of, write_json
 
 Array = NDArray[np.float64]
 Segments = Sequence[tuple[float, float]]
 """Start and end of each, in seconds."""
+Columns = Mapping[str, NDArray[Any]]
+"""Of decisions ``[m]``, by the names that ``onset.decisions.Decisions`` has for them."""
 
 REST, SLIP = style.BLUE, style.ORANGE
 _QUIET = "#B5D0E4"  # no slip, under marks
@@ -136,21 +138,15 @@ class Traces:
         self._num_samples += samples.shape[1]
         self._samples.add(samples[:, first:stop])
 
-    def add_decisions(
-        self,
-        available_s: Array,
-        probability: Array,
-        is_slip: Array,
-        is_valid: Array,
-        onset_score: Array,
-    ) -> None:
-        """Take the next decisions, each ``[m]``; without onset score it is not finite."""
+    def add_decisions(self, of: Columns) -> None:
+        """Take the next decisions; ``onset_score`` is NaN where there is none."""
+        available_s = of["available_s"]
         since_s = self.view[0] - self._hop_s  # the one before the view has the status there
         is_seen = (available_s > since_s) & (available_s <= self.view[1])
         if self._first_s is None and is_seen.any():
             self._first_s = float(available_s[is_seen][0])
         # what is on anywhere stays seen
-        columns = (probability, is_slip, 1 - is_valid, onset_score)
+        columns = (of["probability"], of["is_on"], 1 - of["is_valid"], of["onset_score"])
         self._decisions.add(np.stack(columns)[:, is_seen])
 
     def samples(self) -> tuple[NDArray[np.floating], Array]:
@@ -187,22 +183,16 @@ class DecisionCounts:
         self._ends_s: list[float] = []
         self._was_on = False
 
-    def add(
-        self,
-        available_s: Array,
-        llr: NDArray[np.floating],
-        is_valid: NDArray[np.bool_],
-        is_on: NDArray[np.bool_],
-        alarms: Sequence[Mapping[str, Any]],
-    ) -> None:
-        """Take the next decisions, each ``[m]``, and the alarms that they raised."""
+    def add(self, of: Columns, alarms: Sequence[Mapping[str, Any]]) -> None:
+        """Take the next decisions, and the alarms that they raised."""
+        available_s = of["available_s"]
         self.num_decisions += len(available_s)
-        self.num_invalid += int((~is_valid).sum())
+        self.num_invalid += int((~of["is_valid"]).sum())
         self._alarms += map(dict, alarms)
-        status = np.concatenate([[self._was_on], is_on])
+        status = np.concatenate([[self._was_on], of["is_on"]])
         self._ends_s += available_s[status[:-1] & ~status[1:]].tolist()
         self._was_on = bool(status[-1])
-        positive_s = available_s[llr > 0]
+        positive_s = available_s[of["llr"] > 0]
         for place, onset in enumerate(self._onsets_s):
             after = positive_s[positive_s >= onset]
             if math.isnan(self.first_positive_s[place]) and len(after):
@@ -640,7 +630,5 @@ def _shade(axes: Axes, segments: Segments, name: str, **look: Any) -> None:
 
 def _spans(times: NDArray[np.floating], status: Array, end_s: float) -> list[tuple[float, float]]:
     """Segments in which a status is on; it holds from its time to the next, at last to the end."""
-    is_on = np.concatenate([[False], status >= 0.5, [False]])
-    edges = np.flatnonzero(is_on[1:] != is_on[:-1])
-    bounds = np.append(times, end_s)[edges].reshape(-1, 2)
+    bounds = np.append(times, end_s)[runs_of(status >= 0.5)]
     return [(float(start), float(end)) for start, end in bounds if end > start]

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from tactslip_torch.report import published, style
 from tactslip_torch.report.onset import Array, Envelope, Segments, lane_height, median, span
+from tactslip_torch.runtime import runs_of
 
 Channels = Sequence[Mapping[str, str]]
 """Rows of ``name``, ``kind``, ``finger``, ``segment``, ``adapting`` where the kind does not say it,
@@ -408,13 +409,17 @@ def _legend(rows: Sequence[Recording], channels: Channels) -> list[Any]:
     ]
     if len({channel["segment"] for channel in channels} & set(_PALER)) > 1:
         handles.append(Line2D([], [], color="#CCCCCC", linewidth=2, label="paler: nearer the palm"))
-    if any(row.onsets_s for row in rows):
-        handles.append(Line2D([], [], label="onset of slip", **_ONSET))
-    if any(map(_slips, rows)):
-        handles.append(Patch(label="slip", **_SLIP))
-    if any(row.non_slip_s for row in rows):
-        handles.append(Patch(label="non-slip", **_NON_SLIP))
-    return handles
+    return handles + _marks(rows)
+
+
+def _marks(rows: Sequence[Recording]) -> list[Any]:
+    """What ``_mark`` draws in any recording, for a legend."""
+    marks = (
+        (any(row.onsets_s for row in rows), Line2D([], [], label="onset of slip", **_ONSET)),
+        (any(map(_slips, rows)), Patch(label="slip", **_SLIP)),
+        (any(row.non_slip_s for row in rows), Patch(label="non-slip", **_NON_SLIP)),
+    )
+    return [handle for is_there, handle in marks if is_there]
 
 
 # How a recording is read ------------------------------------------------------------------------
@@ -464,13 +469,7 @@ def reading_figure(recording: Recording, channels: Channels, path: str | Path, t
         _mark(axes, recording, view)
         _mark_missing(axes, is_missing, recording.sample_rate_hz)
     panels[-1].set_xlabel("time, s")
-    handles: list[Any] = []
-    if recording.onsets_s:
-        handles.append(Line2D([], [], label="onset of slip", **_ONSET))
-    if _slips(recording):
-        handles.append(Patch(label="slip", **_SLIP))
-    if recording.non_slip_s:
-        handles.append(Patch(label="non-slip", **_NON_SLIP))
+    handles = _marks([recording])
     if is_missing.any():
         handles.append(Patch(color=style.INK, label=f"missing: {is_missing.sum()} samples"))
     if handles:
@@ -480,11 +479,10 @@ def reading_figure(recording: Recording, channels: Channels, path: str | Path, t
 
 def _mark_missing(axes: Axes, is_missing: NDArray[np.bool_], sample_rate_hz: float) -> None:
     """A bar at the foot of a panel where samples are missing, wide enough to be seen."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_missing, [False]])))
     least = len(is_missing) / 400
     spans = [
         (start / sample_rate_hz, max(stop - start, least) / sample_rate_hz)
-        for start, stop in zip(edges[::2], edges[1::2], strict=True)
+        for start, stop in runs_of(is_missing).tolist()
     ]
     axes.broken_barh(
         spans, (0, 0.05), transform=axes.get_xaxis_transform(), color=style.INK, linewidth=0

@@ -23,6 +23,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tactslip_torch.runtime import runs_of
 from tactslip_torch.simulation._blocks import (
     Array,
     Flags,
@@ -217,8 +218,7 @@ def _powered(slide: Array, exponent: float) -> Array:
 
 def _runs(chosen: Flags) -> list[slice]:
     """The runs of rows that are chosen."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]])))
-    return [slice(int(low), int(high)) for low, high in edges.reshape(-1, 2)]
+    return [slice(*run) for run in runs_of(chosen).tolist()]
 
 
 # --- sensors --------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tactslip_torch.data.recording import Recording, RecordingId, Stretch
+from tactslip_torch.data.recording import MOMENTS, STRETCHES, Recording, RecordingId, Stretch
 from tactslip_torch.data.recording import Timeline as _Timeline
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import check_number
@@ -135,13 +135,8 @@ def simulate(
         samples=torch.from_numpy(volts).to(dtype),
         sample_rate_hz=scene.sample_rate_hz,
         material=scene.material,
-        speeds_mm_s=truth.speeds_mm_s,
-        onsets_s=truth.onsets_s,
-        sliding_s=truth.sliding_s,
-        annotated_onsets_s=truth.annotated_onsets_s,
-        non_slip_s=truth.non_slip_s,
         provenance=_provenance(scene),
-        released_s=truth.released_s,
+        **{name: getattr(truth, name) for name in (*MOMENTS, *STRETCHES)},
     )
 
 

@@ -233,19 +233,16 @@ def event_record(stream: Stream, decisions: Decisions) -> EventRecord:
     says_slip = available_s[np.flatnonzero(decisions.llr.numpy() > 0)]
     releases_s = first_releases(times.onsets_s, times.released_s)
     first = np.append(says_slip, math.nan)[np.searchsorted(says_slip, releases_s)]
-    return EventRecord(
+    return EventRecord.of(
+        times,
         recording=str(stream.recording),
         material=stream.recording.material,
         scene=stream.recording.scene,
         duration_s=times.duration_s,
         alarms_s=tuple(available_s[raised].tolist()),
         onset_estimates_s=tuple(decisions.onset_s.numpy()[raised].tolist()),
-        onsets_s=times.onsets_s,
-        sliding_s=times.sliding_s,
-        speeds_mm_s=times.speeds_mm_s,
         first_positive_s=tuple(first.tolist()),
         alarm_ends_s=tuple(np.append(available_s, math.inf)[ends].tolist()),
-        released_s=times.released_s,
     )
 
 

@@ -30,6 +30,7 @@ from tactslip_torch.onset.events import (
     pooled_metrics,
     recording_events,
 )
+from tactslip_torch.onset.rules import KOfN, latch
 from tactslip_torch.report.metrics import (
     bin_metrics,
     confusion_matrix,
@@ -39,8 +40,8 @@ from tactslip_torch.report.metrics import (
 )
 from tactslip_torch.training.datamodule import RecordingFeatures
 
-RULES: Mapping[str, tuple[int, int]] = MappingProxyType(
-    {"first_transition": (1, 1), "two_of_three": (2, 3)}
+RULES: Mapping[str, KOfN] = MappingProxyType(
+    {"first_transition": KOfN(1, 1), "two_of_three": KOfN(2, 3)}
 )
 """From decisions to alarms, each k of the last n: the paper's, every first slip bin after a
 non-slip one, and two of three. Either is armed again by a decision for which it does not hold."""
@@ -204,9 +205,9 @@ def events_by_rule(
         return {name: [] for name in RULES}
     return {
         name: [
-            recording_events(_watched(part, k, n, latency), EventRules(), latency) for part in parts
+            recording_events(_watched(part, rule, latency), EventRules(), latency) for part in parts
         ]
-        for name, (k, n) in RULES.items()
+        for name, rule in RULES.items()
     }
 
 
@@ -223,7 +224,7 @@ def event_numbers(
     }
 
 
-def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> EventRecord:
+def _watched(part: EvaluatedBins, rule: KOfN, latency: LatencyParts) -> EventRecord:
     """A recording as the detector saw it through an alarm of k of the last n decisions.
 
     It starts anew with every stroke and every unbroken stretch of bins of no stroke, whatever order
@@ -241,9 +242,10 @@ def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Even
     seen: list[tuple[float, float]] = []
     for rows in sorted(stretches, key=lambda rows: float(available_s[rows[0]])):
         hops_s = available_s[rows]
-        is_on = np.convolve(says_slip[rows], np.ones(n))[: len(rows)] > k - 0.5
-        raised = np.flatnonzero(is_on & ~np.append(False, is_on[:-1]))
-        off = np.append(np.flatnonzero(~is_on), len(rows))
+        statistic, _ = rule.scan_row(says_slip[rows].astype(float).tolist(), rule.start(), float)
+        alarm, is_on, _ = latch(statistic, 1.0, rearm=1, refractory=0)
+        raised = np.flatnonzero(alarm)
+        off = np.append(np.flatnonzero(np.logical_not(is_on)), len(rows))
         ends = np.append(hops_s, math.inf)[off[np.searchsorted(off, raised)]]
         alarms += zip(hops_s[raised].tolist(), ends.tolist(), strict=True)
         before = seen[-1][1] if seen else -math.inf  # a hop may be longer than a bin
@@ -252,22 +254,17 @@ def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Even
     for number, release_s in enumerate(first_releases(times.onsets_s, times.released_s)):
         is_later = says_slip & (stroke == number) & (available_s >= release_s)
         first.append(next(iter(available_s[is_later].tolist()), math.nan))
-    return EventRecord(
+    return EventRecord.of(
+        times,
         recording=str(bins.recording),
         material=bins.recording.material,
         scene=bins.recording.scene,
         duration_s=seen[-1][1],
         alarms_s=tuple(alarm for alarm, _ in alarms),
         onset_estimates_s=(),
-        onsets_s=times.onsets_s,
-        sliding_s=tuple(
-            (o, end) for o, (_, end) in zip(times.onsets_s, times.sliding_s, strict=True)
-        ),
-        speeds_mm_s=times.speeds_mm_s,
         first_positive_s=tuple(first),
         watched_s=tuple(seen),
         alarm_ends_s=tuple(end for _, end in alarms),
-        released_s=times.released_s,
     )
 
 

@@ -40,7 +40,6 @@ from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import PAPER_KERNEL, Head, Polynomial
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import (
     add_over_processes,
     bar,
@@ -138,7 +137,6 @@ class Fit(_Plan):
         pool: FeaturePool,
         channel_filter: ChannelFilter,
         metadata: Mapping[str, Any],
-        backend: BackendName | None = None,
     ) -> SlipDetector:
         """The detector with this machine.
 
@@ -146,9 +144,8 @@ class Fit(_Plan):
             pool: of the features of the bins, whole or a selection of one.
             channel_filter: of the bins.
             metadata: to be kept with it, JSON-able.
-            backend: of features; by default that of the pool.
         """
-        whole = FeaturePool(pool.hand, **pool.config(), backend=backend or pool.backend)
+        whole = FeaturePool(pool.hand, **pool.config(), backend=pool.backend)
         selection = self.selection
         return SlipDetector(
             whole,
