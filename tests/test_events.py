@@ -285,3 +285,17 @@ def test_the_same_recording_of_two_detectors_is_drawn_as_one():
 def test_what_does_not_fit_together_is_refused(changes, words):
     with pytest.raises(ValueError, match=words):
         replace(watched([1.1, 1.2]), **changes)
+
+
+def test_an_alarm_in_slip_that_nobody_saw_begin_is_not_false_and_the_time_not_quiet():
+    """As behind a gap inside a slide: the slide ends there, and what comes behind is slip still."""
+    alarms = (1.1, 3.4, 6.0)
+    slides, behind = ((1.0, 2.9),), ((3.2, 4.0),)
+    whole = events_of(watched(alarms, slides=slides))
+    assert whole.false_alarms_s == (3.4, 6.0)
+    events = events_of(watched(alarms, slides=slides, slip_s=behind))
+    assert events.false_alarms_s == (6.0,)
+    settled_s = 0.8 + RULES.settle_s
+    assert events.quiet_s == pytest.approx(whole.quiet_s - settled_s)
+    (onset,) = events.onsets
+    assert onset.outcome == "found"

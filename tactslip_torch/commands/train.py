@@ -185,7 +185,8 @@ def _set_alarm(
         }
         return alarm(detector, baselines, num_workers)
     if detector.calibration is None:
-        log.warning("%s, or these do not tell slip from non-slip", _NO_ALARM)
+        what = f"{detector.info['split']}: {_NO_ALARM}"
+        log.warning("%s, or these do not tell slip from non-slip", what)
     else:
         alarm(detector)
     return {}

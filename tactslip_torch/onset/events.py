@@ -81,6 +81,7 @@ class EventRecord:
             and an alarm then holds until the next.
         released_s: of each onset, when the first and when the last element of the skin let go; may
             be empty, and the onset then stands for the first release.
+        slip_s: stretches that are slip, begun nobody knows when.
 
     Raises:
         ValueError: if times do not ascend.
@@ -99,6 +100,7 @@ class EventRecord:
     watched_s: tuple[tuple[float, float], ...] = ()
     alarm_ends_s: tuple[float, ...] = ()
     released_s: tuple[tuple[float, float], ...] = ()
+    slip_s: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         ends = tuple(end for _, end in self.sliding_s)
@@ -115,8 +117,8 @@ class EventRecord:
 
     @classmethod
     def of(cls, truth: Any, **seen: Any) -> EventRecord:
-        """A record with the onsets, slides, speeds and releases of a recording or its timeline."""
-        names = ("onsets_s", "sliding_s", "speeds_mm_s", "released_s")
+        """A record with what is true of a recording, by itself or by its timeline."""
+        names = ("onsets_s", "sliding_s", "speeds_mm_s", "released_s", "slip_s")
         return cls(**{name: getattr(truth, name) for name in names}, **seen)
 
 
@@ -178,7 +180,8 @@ def recording_events(
     A slip has three instants: its first element lets go, half of the load has let go (the onset),
     its last element lets go. Its *window* reaches from ``early_s`` before the first release to
     ``settle_s`` behind the end of its slide; an alarm belongs to the last window that holds it, and
-    in none it is false. Of each onset exactly one is true:
+    in none it is false, unless it lies in a stretch of slip without an onset, which is no quiet time
+    either. Of each onset exactly one is true:
 
     - *early*: the last alarm before the first release is no more than ``early_s`` old and its
       status holds still;
@@ -203,6 +206,7 @@ def recording_events(
         (release - early, max(onset, _ns(end)) + settle)
         for release, onset, (_, end) in zip(releases, onsets, record.sliding_s, strict=True)
     ]
+    begun = [(_ns(start), _ns(end) + settle) for start, end in record.slip_s]
     spans = [(_ns(start), _ns(end)) for start, end in record.watched_s]
 
     def is_watched(time: int) -> bool:
@@ -250,16 +254,18 @@ def recording_events(
         events.append(event)
     quiet = 0
     for start, end in spans or [(0, _ns(record.duration_s))]:
-        for first, last in windows:
+        for first, last in sorted(windows + begun):
             quiet += max(0, min(first, end) - start)
             start = max(start, last)
         quiet += max(0, end - start)
+    in_none = [alarm for alarm in raised if alarm.window is None]
+    false = [a for a in in_none if not any(first <= a.at <= last for first, last in begun)]
     return RecordingEvents(
         record.recording,
         record.material,
         record.scene,
         tuple(events),
-        tuple(record.alarms_s[alarm.number] for alarm in raised if alarm.window is None),
+        tuple(record.alarms_s[alarm.number] for alarm in false),
         quiet / 1e9,
         latency,
     )
