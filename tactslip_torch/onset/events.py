@@ -180,8 +180,8 @@ def recording_events(
     A slip has three instants: its first element lets go, half of the load has let go (the onset),
     its last element lets go. Its *window* reaches from ``early_s`` before the first release to
     ``settle_s`` behind the end of its slide; an alarm belongs to the last window that holds it, and
-    in none it is false, unless it lies in a stretch of slip without an onset, which is no quiet time
-    either. Of each onset exactly one is true:
+    in none it is false, unless it lies in slip without an onset, which is no quiet time either. Of
+    each onset exactly one is true:
 
     - *early*: the last alarm before the first release is no more than ``early_s`` old and its
       status holds still;
@@ -259,7 +259,7 @@ def recording_events(
             start = max(start, last)
         quiet += max(0, end - start)
     in_none = [alarm for alarm in raised if alarm.window is None]
-    false = [a for a in in_none if not any(first <= a.at <= last for first, last in begun)]
+    false = [a for a in in_none if not any(at <= a.at <= last for at, last in begun)]
     return RecordingEvents(
         record.recording,
         record.material,
