@@ -353,3 +353,14 @@ def test_an_empty_folder_has_no_template(tmp_path):
         write_template(tmp_path, "{material}{trial}")
     with pytest.raises(FileNotFoundError, match="no folder at"):
         write_template(tmp_path / "nowhere", "{material}{trial}")
+
+
+def test_a_set_that_names_no_scenes_is_counted_by_its_objects(tmp_path, capsys):
+    own = tmp_path / "own"
+    for name in ("cup", "box"):
+        table(own / f"{name}_1.csv", samples(1), names=("t", *HAND.names))
+    words = ["data=named", "data.pattern='{material}_{trial}'"]
+    converted(own, tmp_path / "out", *words)
+    printed = capsys.readouterr().out
+    assert "object  recordings" in printed
+    assert "paper" not in printed

@@ -111,6 +111,8 @@ def _grouped(key: str, rows: Rows, cells: Callable[[Rows], Mapping[str, object]]
 def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
     """How many recordings of each scene are in files, how long, how large, how many made now.
 
+    Of an own set that names no scenes, of each object.
+
     Args:
         written: of each recording its ``line`` of the manifest, ``made``, ``duration_s`` and
             ``num_bytes``.
@@ -125,8 +127,10 @@ def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
             "MB": f"{sum(one['num_bytes'] for one in group) / 1e6:.1f}",
         }
 
-    rows = _grouped("scene", [{"scene": one["line"]["scene"], **one} for one in written], cells)
     simulated = any(one["line"]["simulated"] == "true" for one in written)
+    is_named = simulated or {one["line"]["scene"] for one in written} != {published.PAPER_SCENE}
+    title, key = ("scene", "scene") if is_named else ("object", "material")
+    rows = _grouped(title, [{title: one["line"][key], **one} for one in written], cells)
     return style.marked(simulated, rows, f"took {seconds:.1f} s")
 
 
