@@ -66,6 +66,9 @@ def test_the_page_reads_what_the_package_writes(tmp_path, ending):
 
 
 def test_the_page_reads_the_packed_sample_recording():
+    probe = ["node", "-e", "new DecompressionStream('deflate-raw')"]
+    if shutil.which("node") and subprocess.run(probe, capture_output=True, check=False).returncode:
+        pytest.skip("node before 20.12 does not unpack deflate-raw, as browsers do")
     told = read_by_the_page(RECORDING)
     found = np.array(told["volts"], np.float32).reshape(-1, 24)
     np.testing.assert_array_equal(found, sample_recording().samples.T)
