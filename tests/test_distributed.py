@@ -83,13 +83,13 @@ def test_folds_are_learned_in_uneven_shares(cache, tmp_path):
 
 
 def test_what_another_process_cannot_read_is_named(tmp_path, capfd):
-    broken = "+data.broken=A/2"  # the second of the training recordings
+    broken = "+data.broken=A/1"  # one that trains and is the second process's
     first, second = together(2, *TINY, "cache=off", broken, f"hydra.run.dir={tmp_path / 'run'}")
     second.join(300)
     first.kill()  # which waits for the other, unless it is told by who started both
     first.join()
     assert second.exitcode == 2
-    line = r"error in process 1: A/2: channel SG1, sample 2000 \(1\.0000 s\) is nan; repair"
+    line = r"error in process 1: A/1: channel SG1, sample 2000 \(1\.0000 s\) is nan; repair"
     assert re.search(line, capfd.readouterr().err)
 
 

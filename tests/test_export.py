@@ -62,7 +62,7 @@ def test_a_model_says_of_itself_what_its_sidecar_says(detector, exported):
         assert {name: metadata[name] for name in said} == said
         worst_sd = metadata["check"]["worst_sd"]
         assert 0 < worst_sd < 1e-3
-        assert f"{worst_sd:.1e} score deviations" in summary(path)
+        assert f"{worst_sd:.1e} of their spread" in summary(path)
     sidecar = exported[1].with_name("stream.onnx.json").read_text()
     lines = [line.strip(" ,") for line in sidecar.splitlines()]
     for name, value in read_sidecar(exported[1]).items():  # a scalar a line: for hosts in C

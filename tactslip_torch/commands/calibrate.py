@@ -353,10 +353,17 @@ def _tell(report: Mapping[str, Any]) -> None:
             print(
                 f"alarm threshold {round(alarm['after'], 9):.4g} "
                 f"({round(alarm['before'], 9):.4g} before): at most "
-                f"{alarm['bound']:.3g} false alarms an hour with a confidence of "
-                f"{alarm['confidence']:g} in use like these recordings, which have "
-                f"{alarm['alarms']} in {alarm['hours']:.3g} h"
+                f"{alarm['bound']:.3g} false alarms an hour ({alarm['per_hour']:g} were asked for) "
+                f"with a confidence of {alarm['confidence']:g} in use like these recordings, which "
+                f"have {alarm['alarms']} in {alarm['hours']:.3g} valid h"
             )
+            kept = [at for at, _, bound in alarm["curve"] if bound <= alarm["per_hour"]]
+            if kept and min(kept) < 0 <= alarm["after"] < 1e-9:
+                print(
+                    "note: it is not set below 0, where decisions say no slip; "
+                    f"threshold={min(kept):.3g} of detect and stream holds the rate too, and "
+                    "raises more alarms, earlier"
+                )
         else:
             print(
                 f"alarm stays: on what was left out another has {alarm['rate_after']:.3g} false "

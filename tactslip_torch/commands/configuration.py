@@ -254,6 +254,7 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
     """
     typed = list(arguments)
     arguments = with_folder(command, arguments)
+    has_hand = list(arguments) != typed
     if "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("RANK", "0") != "0":
         nowhere = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
         arguments = [*nowhere, *arguments]
@@ -279,7 +280,7 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
     for name in config:
         if str(name) not in known.union(_groups(config.hydra), presets(), ("hydra",)):
             raise ValueError(_no_key(command, str(name), config))
-    if list(arguments) != typed:  # of a hand.yaml
+    if has_hand:
         for own in keys_of(command, config):
             if not own.description and own.name.partition(".")[0] in OF_HAND:
                 raise ValueError(f"{HAND_FILE}: {_no_key(command, own.name, config)}")

@@ -15,6 +15,8 @@ from typing import Any
 import yaml  # type: ignore[import-untyped,unused-ignore]
 from hydra.core.config_store import ConfigStore
 
+from tactslip_torch.commands.packaged import packaged_folder
+
 HAND_FILE = "hand.yaml"
 """How the recordings of its folder are read and labelled; written by ``tactslip setup``."""
 _MANIFEST = "manifest.csv"
@@ -53,6 +55,9 @@ def with_folder(command: str, arguments: Sequence[str]) -> list[str]:
         return list(arguments)
     folder = Path(first)
     if not folder.exists():
+        top = packaged_folder("conf", "train.yaml") / f"{command}.yaml"
+        if re.search(rf"(?m)^(?:  - )?{re.escape(first.partition('.')[0])}:", top.read_text()):
+            return list(arguments)  # a key without its value, which is told so
         raise ValueError(f"no folder at {first}; give a folder of recordings, or KEY=VALUE")
     if command in _PLACES:
         return [f"{_PLACES[command]}={_quoted(first)}", *rest]

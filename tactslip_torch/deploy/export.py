@@ -126,8 +126,9 @@ def summary(path: Path) -> str:
     """One line about a model: size and error."""
     metadata = read_sidecar(path)
     return (
-        f"{path}: {metadata['onnx_bytes'] / 1000:.0f} kB, {metadata['precision']}, within "
-        f"{metadata['check']['worst_sd']:.1e} score deviations of torch in float64 (simulated slip)"
+        f"{path}: {metadata['onnx_bytes'] / 1000:.0f} kB, {metadata['precision']}, scores "
+        f"within {metadata['check']['worst_sd']:.1e} of their spread of torch's in float64, on a "
+        "simulated slip"
     )
 
 

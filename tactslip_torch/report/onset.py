@@ -329,8 +329,8 @@ def onsets_summary(content: Mapping[str, Any], seconds: float) -> str:
     ]
     if invalid:
         lines.append(
-            f"NOTE: {100 * invalid / number:.1f} % of the decisions are not valid: too few "
-            "channels are alive; such decisions raise no alarm"
+            f"NOTE: {100 * invalid / number:.1f} % of the decisions are not valid: samples "
+            "are missing, or too few channels are alive; such decisions raise no alarm"
         )
     if events := content["events"]:
         delay = events["delay_ms"]

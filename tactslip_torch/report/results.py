@@ -171,10 +171,13 @@ def _comparison_lines(metrics: _Metrics) -> list[str]:
             continue
         is_behind = len(sure) == len(known) and all(own["high"] < 0 for own in sure.values())
         begin = "the detector is ahead of every baseline" if is_behind else "no baseline is ahead"
-        lines.append(
+        line = (
             f"{begin} on {role} recordings: the detector has {own_score} % balanced, {named}, the "
             f"best of them, {score} ({between})"
         )
+        if float(differences[best]["value"]) > 0:
+            line += f"; it is higher, which so few do not make sure: {_ADVICE[best]}"
+        lines.append(line)
     return ["\n".join(lines)] if lines else []
 
 
@@ -810,7 +813,8 @@ def few_events(numbers: Mapping[str, Any]) -> str:
         numbers: of ``pooled_metrics``.
     """
     slips, hours = numbers["num_onsets"], numbers["quiet_hours"]
-    counts, wanted = [f"{hours:.1f} h without slip"], [f"{FEWEST_HOURS} h"]
+    quiet = f"{hours:.1f} h" if hours >= 0.1 else f"{60 * hours:.1f} min"
+    counts, wanted = [f"{quiet} without slip"], [f"{FEWEST_HOURS} h"]
     if slips:
         counts.insert(0, f"{slips} slip{'s' * (slips != 1)}")
         wanted.insert(0, str(FEWEST_SLIPS))
