@@ -153,7 +153,7 @@ def test_the_command_leaves_what_the_detector_can_give(capsys, tmp_path, detecto
     lines = capsys.readouterr().out.splitlines()
     files = [str(tmp_path / name) for name in ("model.onnx", "stream.onnx")]
     assert [line.split(":")[0] for line in lines] == files
-    assert all("kB, float32, within" in line for line in lines)
+    assert all("kB, float32, scores within" in line for line in lines)
     command(model, tmp_path, "graph=stream", "precision=float64", f"output={out}")
     assert sorted(path.name for path in out.iterdir()) == ["stream.onnx", "stream.onnx.json"]
     assert read_sidecar(out / "stream.onnx")["precision"] == "float64"

@@ -224,7 +224,8 @@ def test_slips_and_hours_too_few_for_a_rate_are_told():
     enough, few = events_of(quiet_s=7200.0), events_of()
     assert results.few_events(enough | {"num_onsets": 30}) == ""
     assert results.few_events(few | {"num_onsets": 12}) == (
-        "12 slips and 1.2 min without slip: too few for a rate; 30 and 1 h are wanted"
+        f"12 slips and {few['quiet_hours'] * 60:.1f} min without slip: too few for a rate; 30 and "
+        "1 h are wanted"
     )
     quiet = without_onsets(720.0)
     text = results.events_table(metrics_of(simulated=False, events={"test": {"a": quiet}}))
