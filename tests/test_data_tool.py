@@ -364,3 +364,17 @@ def test_a_set_that_names_no_scenes_is_counted_by_its_objects(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "object  recordings" in printed
     assert "paper" not in printed
+
+
+def test_warnings_that_many_recordings_have_are_shown_a_few_times_and_counted(tmp_path, capsys):
+    own = tmp_path / "own"
+    for number in range(9):
+        made = samples(number)
+        made[0, 100 + number] = torch.nan
+        table(own / f"cup_{number}.csv", made, names=("t", *HAND.names))
+    words = ["data=named", "data.pattern='{material}_{trial}'", "data.reading.gaps=missing"]
+    assert run("check", own, *words) == 0
+    printed = capsys.readouterr().out
+    lines = [line for line in printed.splitlines() if "is not finite in" in line]
+    assert len(lines) == 5
+    assert "warning: the same in 4 more recordings" in printed

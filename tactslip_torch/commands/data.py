@@ -10,6 +10,7 @@ what was finished before is kept. ``label_template`` writes a manifest to fill i
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -44,7 +45,8 @@ from tactslip_torch.runtime import __version__, in_processes, runs_of
 from tactslip_torch.signals.filtering import ChannelFilter, frame_lengths
 
 _FIGURE = Path("outputs/data.png")
-_SHOWN = 5  # rows of a template
+_SHOWN = 5  # rows of a template, warnings of a kind
+_WITH_DIGITS = re.compile(r"\S*\d\S*")  # names and numbers, by which warnings of a kind differ
 _LEVELS_S = 30.0  # of a recording, from which levels are taken
 _FEWEST = 8  # samples that a bin should have
 _CHECK = Path("outputs/check.png")
@@ -52,7 +54,10 @@ _MOST_ROWS = 60  # of a table or picture of recordings
 
 
 def check(config: DictConfig) -> int:
-    """Print every problem and warning, and what training would use; how many problems there are.
+    """Print every problem, some warnings of each kind, and what training would use.
+
+    Returns:
+        How many problems there are.
 
     Raises:
         ValueError: if the set cannot be looked at at all.
@@ -69,8 +74,16 @@ def check(config: DictConfig) -> int:
                 warnings += map(entry.problem, found.warnings)
     if config.model is not None and source.ids:
         warnings += _levels(config, source)
-    for line in (*(f"problem: {p}" for p in problems), *(f"warning: {w}" for w in warnings)):
-        print(line)
+    for problem in problems:
+        print(f"problem: {problem}")
+    alike: dict[str, list[Problem]] = {}
+    for warning in warnings:
+        alike.setdefault(_WITH_DIGITS.sub("#", warning.what), []).append(warning)
+    for several in alike.values():
+        for warning in several[:_SHOWN]:
+            print(f"warning: {warning}")
+        if more := len(several[_SHOWN:]):
+            print(f"warning: the same in {more} more recordings")
     if source.ids:
         print(f"channels: {', '.join(source.hand.names)}")
         _show_use(config, source)
