@@ -354,7 +354,7 @@ def test_samples_that_are_not_finite_are_like_a_gap(tmp_path):
     source = FileRecordings(tmp_path, reading={"gaps": "missing"})
     lost = ((0.0, 0.01), (0.5, 0.515), (1.5, 1.7))
     assert source.timeline(source.ids[0]).missing_s == lost
-    assert "b (and 1 more) is not finite in 5" in str(source.warnings[0])
+    assert "b (and 1 more channel) is not finite in 5" in str(source.warnings[0])
     bridged = FileRecordings(tmp_path, reading={"gaps": "bridge", "bridge_ms": 15.0})
     assert bridged.timeline(source.ids[0]).missing_s == (lost[0], lost[2])
     read = first(bridged)

@@ -420,7 +420,8 @@ def _with_missing(head: _Head, samples: Samples, reading: Reading) -> _Head:
         is_lost |= is_missing & ~_to_bridge(is_missing, most)
         if not text:
             name, first_s = head.hand.names[channel], on_clock[0] / clock.sample_rate_hz
-            more = f" (and {len(broken) - 1} more)" if len(broken) > 1 else ""
+            num = len(broken) - 1
+            more = f" (and {num} more channel{'s' * (num > 1)})" if num else ""
             text = f"{name}{more} is not finite in {len(own)} samples, first at {first_s:.4f} s"
             if len(own) == samples.num_samples:
                 text = f"{name}{more} is not finite in any sample"
