@@ -349,7 +349,7 @@ def broken_cells(root):
 
 def test_samples_that_are_not_finite_are_like_a_gap(tmp_path):
     content = broken_cells(tmp_path)
-    said = r"a\.csv: b \(and 1 more\) is not finite in 5 samples, first at 0\.0000 s; set "
+    said = r"a\.csv: b \(and 1 more channel\) is not finite in 5 samples, first at 0\.0000 s; set "
     refused(said + r"data\.reading\.gaps=missing to leave out", tmp_path)
     source = FileRecordings(tmp_path, reading={"gaps": "missing"})
     lost = ((0.0, 0.01), (0.5, 0.515), (1.5, 1.7))
