@@ -320,16 +320,16 @@ def reading_of(config: DictConfig, detector: SlipDetector) -> Reading:
     Raises:
         ValueError: for a key or value that is none.
     """
-    given = plain_section(config.reading)
-    if isinstance(given, dict):
-        given = {key: value for key, value in given.items() if value != _TRAINED}
+    section = plain_section(config.reading)
+    if not isinstance(section, dict):
+        return Reading.of(section)
+    given = {key: value for key, value in section.items() if value != _TRAINED}
     trained = detector.info.get("reading") or {}
-    known = asdict(Reading.of(trained))
-    for key, value in (given or {}).items():
-        if trained and value != known.get(key):
-            note = f"note: reading.{key}={value}; in training it was {known.get(key)}"
-            print(note, file=sys.stderr)
-    return Reading.of(trained | given if isinstance(given, dict) else given)
+    known, wanted = Reading.of(trained), Reading.of(trained | given)
+    for key in given if trained else ():
+        if getattr(wanted, key) != (was := getattr(known, key)):
+            print(f"note: reading.{key}={given[key]}; in training it was {was}", file=sys.stderr)
+    return wanted
 
 
 def settings_of(config: DictConfig, detector: SlipDetector) -> AlarmSettings:

@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
+from tactslip_torch.commands.own_folder import HAND_FILE
+
 if TYPE_CHECKING:
     from tactslip_torch.data.file_recordings import FileRecordings
     from tactslip_torch.data.proposal import Answers, Proposal, Question
 
-HAND_FILE, _PICTURE = "hand.yaml", "hand.png"
+_PICTURE = "hand.png"
 _IN_A_LINE = ("data.labels", "data.rename", "features.frames")
 """Settings whose keys are the user's words."""
 _WIDTH = 100

@@ -97,10 +97,9 @@ def run_experiment(experiment: Experiment, folder: Path) -> dict[str, Any]:
     with feature_cache(experiment.cache) as experiment.maker.cache:
         data = SlipDataModule(experiment.maker, folds, experiment.num_workers)
         of_folds = replace(experiment, export=None) if experiment.train_on_all else experiment
+        is_one = len(folds) == 1 and not experiment.train_on_all
         for data.fold in folds:
-            place = (
-                folder if of_folds is experiment and len(folds) == 1 else folder / data.fold.name
-            )
+            place = folder if is_one else folder / data.fold.name
             results[data.fold.name] = _run_fold(of_folds, data, place)
         if experiment.train_on_all:
             recordings = sorted({r for fold in folds for r in fold.having(*ROLES)})
