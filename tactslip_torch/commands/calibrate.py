@@ -144,7 +144,7 @@ def _labelled(
     found, trained, unlabelled = dict[RecordingId, Timeline](), 0, 0
     for one in source.ids:
         times = source.timeline(one)
-        if not (times.onsets_s or times.sliding_s or times.slip_s or times.non_slip_s):
+        if not times.has_stretches:
             if not (config.slip_free or source.is_simulated):
                 unlabelled += 1
                 continue

@@ -873,7 +873,7 @@ def _doubts(recording: _File) -> list[str]:
     """What is worth a look in a recording that can be read."""
     entry, head, times = recording
     doubts = []
-    if not (times.onsets_s or times.slip_s or times.non_slip_s):
+    if not times.has_stretches:
         doubts.append("has no label, so no bin is taken from it")
     if times.onsets_s and times.onsets_s[0] < _BEFORE_ONSET_S and not head.is_labelled:
         doubts.append(

@@ -116,7 +116,7 @@ def _contradictions(truth: Timeline) -> list[str]:
             if not (0 <= start < end or is_moment):
                 found.append(f"{name}: {start:g}-{end:g} must end behind its start, from 0 on")
     found = found or _overlaps(truth)
-    if truth.label and (truth.onsets_s or truth.slip_s or truth.non_slip_s):
+    if truth.label and truth.has_stretches:
         found.append(
             f"label {truth.label} says all of it, and onsets or stretches are given as well; "
             "give one of both"

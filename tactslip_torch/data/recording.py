@@ -85,6 +85,12 @@ class Timeline:
     released_s: tuple[Stretch, ...] = ()
     label: Label | None = None
     duration_s: float = 0.0
+
+    @property
+    def has_stretches(self) -> bool:
+        """Whether it says of some stretch that it is slip or that it is not."""
+        return bool(self.onsets_s or self.slip_s or self.non_slip_s)
+
     unlabelled_s: tuple[Stretch, ...] = ()
 
     def with_slides(self, duration_s: float, slide_s: float) -> Timeline:

@@ -175,7 +175,7 @@ def _comparison_lines(metrics: _Metrics) -> list[str]:
             f"{begin} on {role} recordings: the detector has {own_score} % balanced, {named}, the "
             f"best of them, {score} ({between})"
         )
-        if float(differences[best]["value"]) > 0:
+        if score != own_score and float(differences[best]["value"]) > 0:
             line += f"; it is higher, which so few do not make sure: {_ADVICE[best]}"
         lines.append(line)
     return ["\n".join(lines)] if lines else []
