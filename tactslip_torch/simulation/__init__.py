@@ -24,8 +24,10 @@ from tactslip_torch.simulation.simulate import (
     simulate,
     timeline,
 )
+from tactslip_torch.simulation.worlds import CONFOUNDERS, WorldRecordings
 
 __all__ = [
+    "CONFOUNDERS",
     "FIDELITIES",
     "MATERIALS",
     "SEEN_MATERIALS",
@@ -43,6 +45,7 @@ __all__ = [
     "SimulatedRecordings",
     "Stroke",
     "Timeline",
+    "WorldRecordings",
     "paper_scenes",
     "simulate",
     "timeline",
