@@ -156,8 +156,8 @@ class WorldRecordings(SimulatedRecordings):
             check_number(f"confounders.{kind}", num, least=0, whole=True)
             for number in range(num):
                 of = materials[number % len(materials)]
-                name = RecordingId(of, number // len(materials), kind)
-                self._scenes[name] = self._drawn(of, kind, number)
+                recording = RecordingId(of, number // len(materials), kind)
+                self._scenes[recording] = self._drawn(of, kind, number)
         self.ids = tuple(self._scenes)
 
     def _drawn(self, material: str, kind: str, number: int) -> Scene:
