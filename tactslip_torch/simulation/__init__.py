@@ -25,8 +25,10 @@ from tactslip_torch.simulation.simulate import (
     simulate,
     timeline,
 )
+from tactslip_torch.simulation.worlds import CONFOUNDERS, WorldRecordings
 
 __all__ = [
+    "CONFOUNDERS",
     "FIDELITIES",
     "MATERIALS",
     "SEEN_MATERIALS",
@@ -45,6 +47,7 @@ __all__ = [
     "SimulatedRecordings",
     "Stroke",
     "Timeline",
+    "WorldRecordings",
     "paper_scenes",
     "simulate",
     "timeline",

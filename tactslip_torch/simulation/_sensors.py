@@ -360,7 +360,8 @@ def _with_noise(scene: Scene, front: _Front, index: int, grid: Grid, volts: Arra
 
 
 def _converted(scene: Scene, volts: Array) -> Array:
-    """Volts of the converter: between the rails, in steps."""
+    """Volts of the converter: with the gain of all channels, between the rails, in steps."""
+    volts = scene.sensors.gain * volts
     rail_v = scene.sensors.rail_v
     step_v = 2.0 * rail_v / 2.0**scene.sensors.num_bits
     return np.asarray(np.clip(np.round(volts / step_v) * step_v, -rail_v, rail_v - step_v))
@@ -637,6 +638,7 @@ _SETTLE_S = 0.1  # how long a fast channel still shows a tap or grip that is ove
 _EVENT_SPREAD = 0.3  # how unevenly elements take part in a tap or grip (ours)
 _RINGING_S = 0.3  # how long the arm's ringing counts as handling after a stroke (ours)
 _MOST_CARRIED = 0.5  # of static friction, what a carried object may take
+_MOST_LOOSENED = 0.8  # of the load beyond what the shear needs, by which a grip may loosen (ours)
 _KNOCK_V_PER_N = (
     0.05  # first swing of a knock's modes at a fast channel, per newton of the peak (ours)
 )
@@ -682,7 +684,7 @@ class Handled:
 
     Attributes:
         taps: in order of time.
-        grips: the same.
+        grips: the same; those that loosen behind the others.
         carried: strokes in which an object of some mass moves with the hand.
 
     Raises:
@@ -692,7 +694,8 @@ class Handled:
     """
 
     def __init__(self, scene: Scene, grasp: Grasp) -> None:
-        self._scene, self._load_n, of = scene, grasp.load_n, scene.handling
+        self._scene, self._grasp, of = scene, grasp, scene.handling
+        self._load_n = grasp.load_n
         has_mass = of.carried_kg > 0
         self.carried = [stroke for stroke in scene.arm if has_mass and not stroke.slides]
         if self.carried:
@@ -701,6 +704,7 @@ class Handled:
         load = grasp.load_n / scene.contact.load_n
         self.taps = self._events("taps", of.taps_per_s, of.tap_n, tap_s, load)
         self.grips = self._events("grips", of.grips_per_s, of.grip_share, of.grip_s)
+        self.grips += self._loosenings()
 
     def _events(
         self, purpose: str, per_s: float, sizes: Interval, lengths_s: Interval, load: Any = 1.0
@@ -727,6 +731,21 @@ class Handled:
             start_s = float(latest[gap] - (reached[gap] - place_s))
             events.append(_Event(start_s, float(start_s + length_s), size * factor))
         return sorted(events, key=lambda event: event.start_s)
+
+    def _loosenings(self) -> list[_Event]:
+        """Grips of negative size, which leave of the load what the shear at that time needs."""
+        of, first_s = (
+            self._scene.handling,
+            min((s.start_s for s in self._scene.slides), default=math.inf),
+        )
+        events = self._events("loosenings", of.loosenings_per_s, of.loosening_share, of.grip_s)
+        held = [self._grasp.shear_after * (event.start_s > first_s) for event in events]
+        if self.carried:
+            held = [max(share, _MOST_CARRIED) for share in held]
+        return [
+            event._replace(size=-np.minimum(event.size, _MOST_LOOSENED * (1.0 - share)))
+            for event, share in zip(events, held, strict=True)
+        ]
 
     @property
     def is_idle(self) -> bool:
