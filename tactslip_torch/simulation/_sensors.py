@@ -875,21 +875,20 @@ def _partial_intervals(scene: Scene, finger: str) -> list[Interval]:
 # --- faults ---------------------------------------------------------------------------------------
 
 
-def recorded_channels(scene: Scene) -> list[int]:
-    """Whose signal stands in every row of the file: its own, unless cables are swapped."""
-    rows = {name: index for index, name in enumerate(scene.hand.names)}
-    recorded = list(range(len(rows)))
-    for one, other in scene.faults.swapped:
-        recorded[rows[one]], recorded[rows[other]] = rows[other], rows[one]
-    return recorded
+def recorded_channels(scene: Scene) -> tuple[list[int], dict[int, float]]:
+    """Whose signal stands in every row of the file, and the volts of rows that hold one value.
 
-
-def stuck_volts(scene: Scene) -> dict[int, float]:
-    """The rows that hold one value, and which: the converter's zero or its highest step."""
+    A row has its own channel's signal, unless cables are swapped; what is stuck has the converter's
+    zero or its highest step.
+    """
     sensors, names = scene.sensors, scene.hand.names
+    recorded = list(range(len(names)))
+    for one, other in scene.faults.swapped:
+        row, row_of_other = names.index(one), names.index(other)
+        recorded[row], recorded[row_of_other] = row_of_other, row
     highest_v = sensors.rail_v - 2.0 * sensors.rail_v / 2.0**sensors.num_bits
     dead = {names.index(name): 0.0 for name in scene.faults.dead}
-    return dead | {names.index(name): highest_v for name in scene.faults.saturated}
+    return recorded, dead | {names.index(name): highest_v for name in scene.faults.saturated}
 
 
 def losses(scene: Scene, num_samples: int) -> list[tuple[int, int]]:
@@ -951,7 +950,8 @@ class HandSignals:
         self.elements = tuple(dict.fromkeys((c.finger, c.segment) for c in scene.hand.channels))
         num, empty = len(self.elements), Grid(np.zeros(0, np.int64), scene.sample_rate_hz)
         self._end = math.ceil(scene.end_s * scene.sample_rate_hz - 1e-6)
-        self._held, self._stuck = held_samples(scene, self._end), stuck_volts(scene)
+        self._held = held_samples(scene, self._end)
+        self._recorded, self._stuck = recorded_channels(scene)
         self._front, self._is_slow = _draw_front(scene), _is_slow(scene)
         size = self._block_samples = empty.block_samples
         response = _highpass_response(scene.sensors.pvdf_highpass_hz, size, scene.sample_rate_hz)
@@ -1060,7 +1060,7 @@ class HandSignals:
         own = grasp.element_of_channel
         sensed_v = np.where(self._is_slow[:, None], slow_v[own], fast_v[own])
         volts = _converted(scene, self._noise_v[:, part] + self._gain[:, part] * sensed_v)
-        volts = volts[recorded_channels(scene)].T
+        volts = volts[self._recorded].T
         volts[:, list(self._stuck)] = list(self._stuck.values())
         held = self._held[self._count : self._count + len(volts)] - self._count
         volts = np.concatenate([self._last_v, volts])[np.maximum(held, -1) + 1]
