@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from pathlib import Path
 from statistics import mean
 from tempfile import TemporaryDirectory
@@ -30,7 +29,7 @@ from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from benchmarks.deployment import host
-from benchmarks.harness import Benchmark, Job
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.peers import others
 from benchmarks.real_sets import RealSet, read_set
 from benchmarks.tables import Report, Table, mean_sd, times
@@ -38,7 +37,6 @@ from benchmarks.timing import interleaved, on_threads
 from tactslip_torch import SlipClassifier
 from tactslip_torch.onset.events import Bootstrap
 from tactslip_torch.report import style
-from tactslip_torch.runtime import bar
 
 Array = NDArray[Any]
 OURS, CONSTANT = "SlipClassifier", "larger class"
@@ -59,7 +57,7 @@ class Real(Benchmark):
 
     Args:
         groups: of a set at most; ``None`` for all.
-        every: each so many-th window is taken.
+        every: one of so many windows is taken, drawn at random.
         seeds: of the methods that draw at random.
         inner: parts that the training groups are put into to choose a penalty, at most.
         penalties: C of logistic regression to choose from, strongest first.
@@ -243,20 +241,26 @@ def balanced_accuracy(counts: Tensor) -> Tensor:
 
 def _measured(of: RealSet, name: str, sizes: Real) -> dict[str, Any]:
     """Scores of every method, differences from ours with intervals, and costs; JSON-able."""
-    chosen = np.isin(of.group, np.unique(of.group)[: sizes.groups])
-    of = of.part(np.flatnonzero(chosen)[:: sizes.every])
+    chosen = np.flatnonzero(np.isin(of.group, np.unique(of.group)[: sizes.groups]))
+    of = of.part(np.sort(np.random.default_rng(0).permutation(chosen)[:: sizes.every]))
     of.check()
-    methods = methods_of(sizes)
-    counts: dict[str, Tensor] = {}
-    rows: dict[str, dict[str, Any]] = {method: {"auc": [], "cpu_s": []} for method in methods}
-    runs = [(m, s) for m, s in product(methods, sizes.seeds) if m in SEEDED or s == sizes.seeds[0]]
-    for method, seed in bar(runs, name, "run"):
-        scores, cpu_s = left_out_scores(of, methods[method], seed)
-        own = confusions(of, scores)[:, None]
-        counts[method] = torch.cat([*([counts[method]] if method in counts else []), own], 1)
-        rows[method]["cpu_s"] += cpu_s
-        if scores.shape[1] == 1:
-            rows[method]["auc"].append(float(roc_auc_score(of.classes()[1], scores[:, 0])))
+    truth, counts = of.classes()[1], dict[str, Tensor]()
+    rows: dict[str, dict[str, Any]] = {}
+    for method, fit in methods_of(sizes).items():
+        seeds = sizes.seeds if method in SEEDED else sizes.seeds[:1]
+        runs = [left_out_scores(of, fit, seed) for seed in seeds]
+        counts[method] = torch.stack([confusions(of, scores) for scores, _ in runs], 1)
+        each = balanced_accuracy(counts[method].sum(0)[:, None]).tolist()
+        say(f"{name}, {method}: {style.percent(mean(each))} %")
+        rows[method] = {
+            "balanced_accuracy": each,
+            "auc": [
+                float(roc_auc_score(truth, scores[:, 0]))
+                for scores, _ in runs
+                if scores.shape[1] == 1
+            ],
+            "cpu_s": [seconds for _, folds in runs for seconds in folds],
+        }
     groups = torch.from_numpy(of.trials()[1])
     draws = {
         "recordings": Bootstrap(len(groups), num=sizes.draws),
@@ -269,9 +273,7 @@ def _measured(of: RealSet, name: str, sizes: Real) -> dict[str, Any]:
         return balanced_accuracy(own) - balanced_accuracy(other)
 
     for method, found in counts.items():
-        each = balanced_accuracy(found.sum(0)[:, None]).tolist()
-        interval = draws["recordings"].statistic(balanced_accuracy, found)
-        rows[method] |= {"balanced_accuracy": each, "interval": interval}
+        rows[method]["interval"] = draws["recordings"].statistic(balanced_accuracy, found)
         both = torch.cat([ours, found], 1)
         rows[method]["lead"] = {n: drawn.statistic(lead, both) for n, drawn in draws.items()}
     return {"about": _about(of), "methods": rows, "cost": cost(of, sizes.rounds)}
