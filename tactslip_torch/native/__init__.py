@@ -204,9 +204,10 @@ class FeatureEngine(_Kept):
         num_channels: of bins.
         slow: indices of the channels that are described as they are.
         fast: indices of the channels whose branches and spectra are described.
-        wanted: channel, row, descriptor and column of every feature. Rows are the branches (0 for a
-            slow channel), their spectra, and one for band energy ratios, whose descriptor is the
-            number of the branch. Descriptors are numbered as ``enum Descriptor``.
+        wanted: channel, row, descriptor and column of every feature. Rows are the branches, their
+            spectra, one for band energy ratios, whose descriptor is the number of the branch, and
+            the bin itself, the only one of a slow channel. Descriptors are numbered as ``enum
+            Descriptor``.
         low: from a bin, or the approximation's coefficients of one level, to those of the next.
         high: from the same to the coefficients of details.
         out: from coefficients to branches A1, D1, A2, D2 and so on.
@@ -241,7 +242,7 @@ class FeatureEngine(_Kept):
                 f"the native engine has {MAX_BRANCHES // 2} levels at most, got {num_branches // 2}"
                 '; use backend="torch"'
             )
-        self._num_rows = 2 * num_branches + 1
+        self._num_rows = 2 * num_branches + 2
         bands = [self._matrices(group, 4, np.float64) for group in (low, high, out)]
         lines = [spectrum @ matrix for matrix in out]
         wanted = sorted(wanted)

@@ -1,7 +1,7 @@
 // Features of filtered bins, in the order and under the names of features/descriptors.py.
 //
 // Lanes run across (bin, channel) pairs: element k of every vector belongs to pair k of a group, so
-// a line of code reads like its formula. A row (a slow channel's bin, a branch of a fast channel or
+// a line of code reads like its formula. A row (a channel's bin, a branch of a fast channel or
 // its spectrum) is formed by products with given matrices, in double, and brought to order one
 // before it is described: row = centre + span * d, with d in double or float. One sort of d feeds
 // median, mode, iqr and entropy.
@@ -254,6 +254,13 @@ template <class T> struct Describe {
     D value = s.top / rms;
     return rms > 0 ? value : D{};
   }
+  static D rms(const Half& s) { return root(s.energy / s.n); }
+  // Between neighbours in time, before values are sorted; in the unit of d.
+  static V mean_abs_change(const V* d, int64_t n) {
+    V sum = {};
+    for (int64_t i = 1; i < n; ++i) sum += magnitude(d[i] - d[i - 1]);
+    return sum / (T)(n - 1);
+  }
   static D correlation(const Half& s) {
     D value = s.both / root(s.second * s.other);
     return (s.span > 0) & (s.other > 0) ? value : D{};
@@ -317,7 +324,7 @@ template <class T> struct Group : Describe<T> {
   D unknown[H];       // NaN for what is broken, if that is not told otherwise, or 0
   D is_constant[H], centre[H];
   D values[MAX_BRANCHES][H];
-  uint32_t need[2 * MAX_BRANCHES + 1];
+  uint32_t need[2 * MAX_BRANCHES + 2];
   double limit;
   void* out;  // features of the first of these bins
   bool out_is_float;
@@ -432,6 +439,8 @@ template <class T> struct Group : Describe<T> {
     }
   }
 
+  int64_t num_rows() { return 2 * num_branches + 2; }  // of a channel, the last of which is its bin
+
   // Features of the group's row to their columns.
   void write(int64_t row_number) {
     for (int i = 0; i < MAX_BRANCHES; ++i)
@@ -447,7 +456,7 @@ template <class T> struct Group : Describe<T> {
   }
 
   template <class X> void write(X* to, int64_t row_number, int start, int end) {
-    int64_t at = channel[start] * (2 * num_branches + 1) + row_number;
+    int64_t at = channel[start] * num_rows() + row_number;
     to += (bin[start] - first_bin) * plan.num_features;
     for (int64_t w = plan.first[at]; w < plan.first[at + 1]; ++w) {
       const double* from = (const double*)values[plan.descriptor[w]];
@@ -477,6 +486,11 @@ template <class T> struct Group : Describe<T> {
       if (wanted & 1u << ENERGY) values[ENERGY][h] = Base::energy(half);
       if (wanted & 1u << PEAK_FACTOR) values[PEAK_FACTOR][h] = Base::peak_factor(half);
       if (wanted & 1u << CORRELATION) values[CORRELATION][h] = Base::correlation(half);
+      if (wanted & 1u << RMS) values[RMS][h] = Base::rms(half);
+    }
+    if (wanted & 1u << MEAN_ABS_CHANGE) {
+      V change = Base::mean_abs_change(d, count);
+      for (int h = 0; h < H; ++h) values[MEAN_ABS_CHANGE][h] = halves[h].span * get(&change, h);
     }
     if (!(wanted & ORDERED)) return;
     sort(d, (int)count);
@@ -602,13 +616,21 @@ template <class T> struct Group : Describe<T> {
     write(row_number);
   }
 
-  void describe_slow() {
+  // The bin itself.
+  void describe_raw() {
+    int64_t row_number = num_rows() - 1;
+    if (!need[row_number]) return;
     for (int h = 0; h < H; ++h) memcpy(row[h], y[h], n * sizeof(D));
     other = V{};
-    describe_time(need[0], true, nullptr, 0);
+    describe_time(need[row_number], true, nullptr, row_number);
   }
 
-  void describe_fast() {
+  void describe_branches() {
+    uint32_t shares = need[2 * num_branches];
+    int64_t levels_wanted = 0;
+    for (int64_t b = 0; b < num_branches; ++b)
+      if (need[b] || need[num_branches + b] || shares) levels_wanted = b / 2 + 1;
+    if (!levels_wanted) return;
     for (int h = 0; h < H; ++h) {  // the bin itself, for correlation
       Extent e = extent(y[h], n);
       D span = e.high - e.low, factor = 1 / span;
@@ -618,10 +640,6 @@ template <class T> struct Group : Describe<T> {
     }
     other = V{};
     for (int64_t i = 0; i < n; ++i) other += raw[i] * raw[i];
-    uint32_t shares = need[2 * num_branches];
-    int64_t levels_wanted = 0;
-    for (int64_t b = 0; b < num_branches; ++b)
-      if (need[b] || need[num_branches + b] || shares) levels_wanted = b / 2 + 1;
     // coefficients, finest first; those of level m lie from `starts[m]` on
     int64_t starts[MAX_BRANCHES / 2 + 1] = {0};
     for (int64_t m = 0; m < levels_wanted; ++m)
@@ -683,10 +701,9 @@ template <class T> struct Group : Describe<T> {
 
   // What is wanted of any of the pairs' channels.
   void gather_needs() {
-    int64_t num_rows = 2 * num_branches + 1;
-    for (int64_t r = 0; r < num_rows; ++r) {
+    for (int64_t r = 0; r < num_rows(); ++r) {
       need[r] = 0;
-      for (int k = 0; k < num; ++k) need[r] |= plan.need[channel[k] * num_rows + r];
+      for (int k = 0; k < num; ++k) need[r] |= plan.need[channel[k] * num_rows() + r];
     }
   }
 };
@@ -889,10 +906,8 @@ template <class T> int run(const Plan& plan, const Machine* machine, const Bins&
           group.template read<float>();
         else
           group.template read<double>();
-        if (kind == 0)
-          group.describe_slow();
-        else
-          group.describe_fast();
+        group.describe_raw();
+        if (kind == 1) group.describe_branches();
       }
     }
     int64_t stride = plan.num_features ? plan.num_features : bins.bin_stride;

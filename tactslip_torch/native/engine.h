@@ -4,7 +4,7 @@
 
 enum Descriptor {
   MEAN, MEDIAN, MODE, RANGE, MEAN_DEVIATION, STD, CV, IQR, SKEWNESS, KURTOSIS, ENERGY, ENTROPY,
-  PEAK_FACTOR, CORRELATION, SPECTRAL_CENTROID, SPECTRAL_SPREAD, NUM_DESCRIPTORS
+  PEAK_FACTOR, CORRELATION, SPECTRAL_CENTROID, SPECTRAL_SPREAD, RMS, MEAN_ABS_CHANGE, NUM_DESCRIPTORS
 };
 constexpr int MAX_BRANCHES = 32;  // and at least NUM_DESCRIPTORS, whose place band energy ratios take
 
@@ -20,7 +20,7 @@ struct Plan {
   int64_t num_channels, num_samples, num_lines, num_branches;
   int64_t num_features, num_coefficients, num_slow, num_fast;
   const int64_t *slow, *fast;  // channels that are read
-  // of each channel and row: where its part of descriptor and column starts, and which bits it has
+  // of each channel and row (branches, their spectra, band energy ratios, the bin itself): where its part of descriptor and column starts, and which bits it has
   const int64_t *first, *descriptor, *column;
   const uint32_t* need;
   // from a bin, or an approximation's coefficients, to those one level coarser; to branches; to lines
