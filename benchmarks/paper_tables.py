@@ -1,9 +1,9 @@
 """The paper's choices, varied: ``python -m benchmarks.paper_tables [key=value ...]``.
 
-The paper sets bins of 50 ms "after trial-and-error", takes the 120 features of the largest t, leaves
-neighbourhood component analysis out as too costly, and shows one trial with its decisions and the
-signals of six materials. Here each of these is measured or drawn on the simulated hand, with the
-paper's recipe and split by cycle.
+The paper sets bins of 50 ms "after trial-and-error", takes the 120 features of the largest t,
+leaves neighbourhood component analysis out as too costly, and shows one trial with its decisions
+and the signals of six materials. Here each of these is measured or drawn on the simulated hand,
+with the paper's recipe and split by cycle.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ from pathlib import Path
 from statistics import mean
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from hydra.utils import instantiate
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -40,7 +42,7 @@ from tactslip_torch.report import style
 from tactslip_torch.signals.filtering import bins_at
 from tactslip_torch.simulation.scene import SEEN_MATERIALS
 from tactslip_torch.simulation.simulate import SimulatedRecordings
-from tactslip_torch.training.bins import BinSample, RecordingBins, SampledBins
+from tactslip_torch.training.bins import BinSample, SampledBins
 from tactslip_torch.training.choice import balanced_accuracy
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import feature_cache, feature_maker
@@ -173,7 +175,7 @@ class PaperTables(Benchmark):
     def tables(self, numbers: Report) -> dict[str, Table]:
         """By width, by number of features and ranking, what rankings cost, and one trial."""
         seeds = numbers["seeds"]
-        found = {
+        return {
             "The paper's choices": _choices(seeds),
             "Width of bins": _widths(seeds),
             "Number of features, test bins": _sizes(seeds, "test"),
@@ -181,7 +183,6 @@ class PaperTables(Benchmark):
             "What a ranking costs": _costs(seeds),
             "One trial, not segmented": Table(*seeds[0]["trial"]),
         }
-        return found
 
     def draw(self, numbers: Report, drawing: Figure, ending: str) -> None:
         """Balanced accuracy over the width of bins and over the number of features."""
@@ -284,15 +285,16 @@ class _Sampled(NamedTuple):
 
     def thinned(self, rows: int) -> _Sampled:
         """With at most so many bins of each material and class."""
-        strata = [(self.sample.stratum == one).nonzero()[:, 0] for one in range(2 * self.num_groups)]
-        kept = torch.cat([of[torch.linspace(0, len(of) - 1, min(rows, len(of))).long()]
-                          for of in strata])  # fmt: skip
-        part = torch.cat([torch.full((min(rows, len(of)),), len(of) / min(rows, len(of)))
-                          for of in strata])  # fmt: skip
-        weight = self.sample.weight[kept] * part
-        few = {name: getattr(self.sample, name)[kept] for name in ("is_slip", "group", "scene")}
-        sample = replace(self.sample, features=self.sample.features[kept], weight=weight, **few)
-        return self._replace(sample=sample, z=self.z[kept])
+        weight, kept = self.sample.weight.clone(), list[Tensor]()
+        for one in self.sample.stratum.unique():
+            places = (self.sample.stratum == one).nonzero()[:, 0]
+            kept.append(places[torch.linspace(0, len(places) - 1, min(rows, len(places))).long()])
+            weight[places] *= len(places) / len(kept[-1])
+        rest = torch.cat(kept)
+        names = ("features", "is_slip", "group", "scene")
+        few = {name: getattr(self.sample, name)[rest] for name in names}
+        sample = replace(self.sample, weight=weight[rest], **few)
+        return self._replace(sample=sample, z=self.z[rest])
 
     @property
     def num_groups(self) -> int:
@@ -415,7 +417,9 @@ def _widths(seeds: Sequence[Report]) -> Table:
     found = {role: _by_value([seed["widths"] for seed in seeds], "width", role) for role in ROLES}
     rows = []
     for place, first in enumerate(seeds[0]["widths"]):
-        of = {name: mean(seed["widths"][place][name] for seed in seeds) for name in ("bins", "cpu_s")}
+        of = {
+            name: mean(seed["widths"][place][name] for seed in seeds) for name in ("bins", "cpu_s")
+        }
         row = {"bin, ms": first["width"], "levels": first["level"], "features": first["pool"]}
         row |= {f"{ROLES[role]}, %": _spread(by[first["width"]]) for role, by in found.items()}
         row |= {"trained on, bins": f"{of['bins']:,.0f}", "fit, CPU s": number(of["cpu_s"])}
@@ -458,7 +462,8 @@ def _costs(seeds: Sequence[Report]) -> Table:
     gib = 8 * most**2 / 2**30
     why = f"extrapolated, as the square of the bins; one matrix of bins by bins is {gib:.1f} GiB"
     rows.append(last | {"bins": f"{most:,}", "CPU s": number(grown), "": why})
-    return Table(rows, "SIMULATED bins; one thread, mean over seeds, features of a bin not counted.")
+    note = "SIMULATED bins; one thread, mean over seeds; making the features is not counted."
+    return Table(rows, note)
 
 
 def _choices(seeds: Sequence[Report]) -> Table:
@@ -481,7 +486,9 @@ def _choices(seeds: Sequence[Report]) -> Table:
     return Table(rows, note)
 
 
-def _choice(what: str, unit: str, taken: Any, found: Mapping[Any, Any], role: str) -> dict[str, Any]:
+def _choice(
+    what: str, unit: str, taken: Any, found: Mapping[Any, Sequence[float]], role: str
+) -> dict[str, Any]:
     """A choice, the best one, and whether that is better in every seed."""
     taken = taken if taken in found else next(iter(found))
     means = {value: mean(of) for value, of in found.items()}
@@ -505,7 +512,8 @@ def _choice(what: str, unit: str, taken: Any, found: Mapping[Any, Any], role: st
 def _curve(axes: Axes, by_value: BySeed, label: str, colour: str) -> None:
     """Means over what is varied, and the range over seeds."""
     places, values = list(by_value), list(by_value.values())
-    axes.fill_between(places, list(map(min, values)), list(map(max, values)), color=colour, alpha=0.12)
+    low, high = list(map(min, values)), list(map(max, values))
+    axes.fill_between(places, low, high, color=colour, alpha=0.12)
     axes.plot(places, list(map(mean, values)), "o-", color=colour, label=label, markersize=4)
     axes.set_xscale("log")
     axes.set_xticks(places, [str(place) for place in places])
@@ -515,9 +523,8 @@ def _curve(axes: Axes, by_value: BySeed, label: str, colour: str) -> None:
 # ---------------------------------------------------------------------------------------- trial
 def _trial(data: SlipDataModule, fit: Fit, path: Path) -> tuple[list[dict[str, Any]], str]:
     """Decisions on all of a test recording: the figure, the rows of its table, and a note."""
-    maker, (name, *_) = data.maker, [
-        of for of in data.fold.having("test") if of.material == TRIAL_MATERIAL
-    ]  # fmt: skip
+    maker = data.maker
+    name = next(of for of in data.fold.having("test") if of.material == TRIAL_MATERIAL)
     recording, rate = maker.source.load(name), maker.source.sample_rate_hz
     length = maker.pool.bin_samples
     filtered = maker.channel_filter(recording.samples.double())
@@ -525,22 +532,16 @@ def _trial(data: SlipDataModule, fit: Fit, path: Path) -> tuple[list[dict[str, A
     features = maker.extractor(bins_at(filtered, starts, length)).float()
     says = fit.head(fit.selection(features)) >= 0
     begins, ends = starts / rate, (starts + length) / rate
-    rows, end = list[dict[str, Any]](), 0.0
+    rows, end, row = list[dict[str, Any]](), 0.0, dict[str, Any]()
     slides = zip(recording.speeds_mm_s, recording.sliding_s, strict=True)
     for speed, (start, stop) in slides:
         pause, slide = (begins >= end) & (ends <= start), (begins >= start) & (ends <= stop)
-        first = ends[(ends > start) & says]
-        rows.append(
-            {
-                "stroke": f"{speed:g} mm/s",
-                "bins before it": int(pause.sum()),
-                "called slip": int((pause & says).sum()),
-                "bins of slip": int(slide.sum()),
-                "found": int((slide & says).sum()),
-                "onset to the end of the first slip bin, ms": f"{1000 * (float(first[0]) - start):.0f}"
-                if len(first) else "-",
-            }
-        )  # fmt: skip
+        first = ends[(ends > start) & says].tolist()
+        row = {"stroke": f"{speed:g} mm/s", "bins before it": int(pause.sum())}
+        row |= {"called slip": int((pause & says).sum()), "bins of slip": int(slide.sum())}
+        row |= {"found": int((slide & says).sum())}
+        delay = f"{1000 * (first[0] - start):.0f}" if first else "-"
+        rows.append(row | {"onset to the end of the first slip bin, ms": delay})
         end = stop
     _draw_trial(maker, recording, filtered, says, str(name), path)
     note = (
@@ -555,19 +556,23 @@ def _draw_trial(
     maker: FeatureMaker, recording: Recording, filtered: Tensor, says: Tensor, name: str, path: Path
 ) -> None:
     """Fast channels below each other on the colour of each bin's decision, and the truth."""
-    rate, width_s = maker.source.sample_rate_hz, maker.pool.bin_samples / maker.source.sample_rate_hz
+    rate, width_s = (
+        maker.source.sample_rate_hz,
+        maker.pool.bin_samples / maker.source.sample_rate_hz,
+    )
     figure = style.new_figure(9.2, 5.2, f"One trial, {name}: decisions on bins", simulated=True)
     truth, axes = figure.subplots(2, 1, sharex=True, height_ratios=[1, 12])
     for place, is_slip in enumerate(says.tolist()):
         span = place * width_s, (place + 1) * width_s
         axes.axvspan(*span, color=SLIP if is_slip else PAUSE, alpha=0.45, linewidth=0)
     fast = [row for row, of in enumerate(maker.source.hand.channels) if of.kind == "PVDF"]
-    step = 1000 * float(filtered[fast].abs().quantile(0.999))
+    step = 1000 * float(np.quantile(filtered[fast].abs().numpy(), 0.998))
     times = torch.arange(filtered.shape[-1]) / rate
     for lane, row in enumerate(fast):
         axes.plot(times, 1000 * filtered[row] / step - lane, color=style.INK, linewidth=0.4)
     names = [maker.source.hand.names[row] for row in fast]
     axes.set_yticks([-lane for lane in range(len(fast))], names)
+    axes.set_ylim(-len(fast), 2)
     axes.set(xlabel="time, s", xlim=(0, float(times[-1])), title=f"PVDF, a lane is {step:.3g} mV")
     axes.grid(visible=False)
     truth.axvspan(0, float(times[-1]), color=PAUSE, linewidth=0)
@@ -576,7 +581,7 @@ def _draw_trial(
         truth.text((start + stop) / 2, 0.5, f"{speed:g} mm/s", ha="center", va="center")
         axes.axvline(start, color=style.VERMILION, linestyle="-.", linewidth=1.2)
     truth.set(yticks=[], ylabel="truth")
-    handles = [Patch(color=PAUSE, label="non-slip"), Patch(color=SLIP, label="slip")]
+    handles: list[Artist] = [Patch(color=PAUSE, label="non-slip"), Patch(color=SLIP, label="slip")]
     handles += [Line2D([], [], color=style.VERMILION, linestyle="-.", label="true onset")]
     style.legend_below(figure, handles, 3)
     style.save(figure, path)
