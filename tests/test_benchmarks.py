@@ -11,6 +11,7 @@ import torch
 
 from benchmarks.harness import Benchmark, between_markers
 from benchmarks.paper_tables import RIDGE, forward_order
+from benchmarks.real_sets import RealSet
 from benchmarks.tables import Table
 from benchmarks.timing import interleaved, paired_ratio
 
@@ -41,7 +42,7 @@ def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path, monkeypa
     monkeypatch.chdir(ROOT)
     arguments = ["--quick", "--out", str(tmp_path)]
     if name == "real":
-        arguments.append(f"data.root={_real_set(tmp_path / 'set')}")
+        arguments.append(str(_real_sets(tmp_path / "sets")))
     subject = _subject(name)()
     assert subject.run(arguments) == 0
     assert json.loads((tmp_path / f"{name}.json").read_text())["quick"]
@@ -111,17 +112,16 @@ def test_only_what_stands_between_the_markers_is_replaced() -> None:
         between_markers(text, "b", "new")
 
 
-def _real_set(root: Path) -> Path:
-    """A set of the layout of the BioTac SP one: slip is a vibration, stable touch is not."""
+def _real_sets(folder: Path) -> Path:
+    """Two sets: slip is a vibration; and its pitch, which is one of three words."""
     generator = np.random.default_rng(5)
-    header = ",".join(f"ff_e{place + 1}" for place in range(24))
-    for scene, pitch in {"n": 0.9, "cw": 1.4, "t": 0.0}.items():
-        folder = root / "csvs" / scene
-        folder.mkdir(parents=True)
-        for number, name in enumerate(("bottle", "brush", "pen") * 2):
-            times = np.arange(50 + 128 + 32)
-            counts = 2500 + 40 * generator.random((len(times), 24)) + 100 * number
-            counts[50:] += 60 * np.sin(pitch * times[50:, None] + np.arange(24)) * (pitch > 0)
-            rows = "\n".join(",".join(map(str, row)) for row in counts.round().astype(int))
-            (folder / f"{name}{number}.csv").write_text(f"{header}\n{rows}\n")
-    return root
+    folder.mkdir()
+    rows = [(f"e{place}", "electrode", "finger", "distal", "fast") for place in range(3)]
+    pitch = np.tile([0.0, 0.9, 1.4], 24)
+    wave = np.sin(pitch[:, None, None] * np.arange(32)) * np.ones((1, 3, 1))
+    x = (wave + 0.1 * generator.standard_normal(wave.shape)).astype(np.float32)
+    group, recording = np.repeat(["bottle", "brush", "pen"], 24), np.tile(["a", "b"], 36)
+    for name, y in (("slip", pitch > 0), ("pitch", np.tile(["none", "low", "high"], 24))):
+        numbers = np.array(100.0), np.array(rows), np.array("made here")
+        np.savez(folder / f"{name}.npz", **RealSet(x, y, group, recording, *numbers)._asdict())
+    return folder
