@@ -84,3 +84,20 @@ def test_wilsons_lower_end_stays_below_one_where_every_recording_is_right():
         stats.binomtest(90, 90).proportion_ci(method="wilson").low
     )
     assert number["high"] == number["value"] == 1.0
+
+
+def test_recordings_drawn_within_groups_leave_the_differences_between_groups_out():
+    """A mean that depends on the group alone is sure; each group is drawn by itself."""
+    groups = torch.tensor([0, 1, 1, 0, 0, 1, 1, 1])
+    within = Bootstrap(8, 0.95, 500, groups)
+
+    def mean(sums):
+        return sums[:, 0] / 8
+
+    by_group = within.statistic(mean, 3.0 + groups[:, None])
+    assert by_group["low"] == by_group["high"] == by_group["value"] == 3.625
+    whole = Bootstrap(8, 0.95, 500).statistic(mean, 3.0 + groups[:, None])
+    assert whole["low"] < 3.4 < 3.8 < whole["high"]
+    mirrored = torch.tensor([1.0, -1, -1, 1])  # cancels where both groups have the same draw
+    apart = Bootstrap(4, 0.95, 500, torch.tensor([0, 0, 1, 1])).statistic(mean, mirrored[:, None])
+    assert apart["low"] < 0 < apart["high"]

@@ -24,7 +24,7 @@ from tactslip_torch.features.sensing import (
 )
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernels import Head, KernelSum
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetEvidence
@@ -409,28 +409,15 @@ def scaled(features: Value, scaler: FeatureScaler) -> Value:
     return (features * slope + _float64(features, offset)).clamp(-1.0, 1.0)
 
 
-def machine(z: Value, head: Head, dtype: np.dtype[Any]) -> Value:
-    """The score of scaled features: ``[B, K] -> [B]``.
-
-    A quadratic form is computed in the dtype of scores. The sum over training bins
-    cancels, so it is float64 always.
-    """
-    if isinstance(head, KernelSum):
-        score = _kernel_sum(z, head)
-    else:
-        z = z.cast(dtype)
-        pull: Value = z.graph.constant(head.linear.double(), dtype)
-        if not head.is_linear:
-            pull = z @ head.quadratic.double() + pull
-        score = (pull * z).sum(1) + float(head.constant)
+def machine(z: Value, head: QuadraticForm, dtype: np.dtype[Any]) -> Value:
+    """The score of scaled features, in its dtype: ``[B, K] -> [B]``."""
+    z = z.cast(dtype)
+    pull: Value = z.graph.constant(head.linear.double(), dtype)
+    if not head.is_linear:
+        pull = z @ head.quadratic.double() + pull
+    score = (pull * z).sum(1) + float(head.constant)
     largest = float(np.finfo(dtype).max)
     return score.clamp(-largest, largest).cast(dtype)
-
-
-def _kernel_sum(z: Value, head: KernelSum) -> Value:
-    base = z @ head.support.T.double() + head.kernel.offset
-    values = base if head.kernel.degree == 1 else base * base
-    return (values @ head.beta[:, None].double()).squeeze(1)
 
 
 def _float64(like: Value, x: Tensor) -> Value:

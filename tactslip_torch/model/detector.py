@@ -27,7 +27,7 @@ from tactslip_torch.features.sensing import (
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Platt, calibration_from_dict
 from tactslip_torch.model.calibration import probability as stated
-from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_from_dict
+from tactslip_torch.model.kernels import QuadraticForm, collapse, kernel_from_dict
 from tactslip_torch.model.prediction import (
     ChannelMask,
     Prediction,
@@ -99,7 +99,7 @@ class SlipDetector(nn.Module):
         channel_filter: ChannelFilter,
         selected: Sequence[int],
         scaler: FeatureScaler,
-        head: Head,
+        head: QuadraticForm,
         info: Mapping[str, Any] | None = None,
         imputation: Tensor | None = None,
         pooling: ChannelPooling | None = None,
@@ -148,9 +148,8 @@ class SlipDetector(nn.Module):
         self._sensing, self._engine = sensing, None
 
     def __repr__(self) -> str:
-        pool, info, degree = self.pool, self.info, "kernel"
-        if isinstance(self.head, QuadraticForm):
-            degree = "linear" if self.head.is_linear else "quadratic"
+        pool, info = self.pool, self.info
+        degree = "linear" if self.head.is_linear else "quadratic"
         simulated, name = info.get("simulated"), info.get("name", "")
         name = name and f"{name}: "
         origin = f", trained on {'simulated' if simulated else 'real'} recordings"
@@ -461,7 +460,6 @@ class SlipDetector(nn.Module):
             **self.channel_filter.config(),
             "selected": list(self.selected),
             "pooling": None if self.pooling is None else self.pooling.to_dict(),
-            "kernel": self.head.kernel.to_dict() if isinstance(self.head, KernelSum) else None,
             "sensing": self.sensing.to_dict(),
             "info": dict(self.info),
         }
@@ -518,13 +516,11 @@ class SlipDetector(nn.Module):
             own = {key: value for key, value in state.items() if key.startswith(start)}
             return {key.removeprefix(start): value for key, value in own.items()}
 
-        kernel, hand = metadata.get("kernel"), HandLayout.from_rows(metadata["channels"])
-        head: Head
-        if kernel is None:
+        hand, pooling = HandLayout.from_rows(metadata["channels"]), metadata.get("pooling")
+        if (kernel := metadata.get("kernel")) is None:
             head = QuadraticForm(**part("head"))
-        else:
-            head = KernelSum(**part("head"), kernel=kernel_from_dict(kernel))
-        pooling = metadata.get("pooling")
+        else:  # an earlier version kept the sum over bins where these were fewer than columns
+            head = collapse(**part("head"), kernel=kernel_from_dict(kernel))
         return cls(
             FeaturePool(hand, **metadata["pool"]),
             ChannelFilter(

@@ -25,8 +25,6 @@ from torch import Tensor
 
 from tactslip_torch.model.kernels import (
     PAPER_KERNEL,
-    Head,
-    KernelSum,
     Polynomial,
     QuadraticForm,
     SolveReport,
@@ -43,7 +41,6 @@ _LARGEST_ERROR = 1e-2  # of a solution that is handed out
 _UNREPORTED_ERROR = 1e-3  # of a least-squares solution; a larger one is logged
 _EPS, _TINY = torch.finfo(torch.float64).eps, torch.finfo(torch.float64).tiny
 _GRAM_ROWS = 512
-_MOST_QUADRATIC = 1000  # features of a machine that always folds
 _LEAST_EIGENVALUE = 1e-6  # of I - H_gg; below, the rounding of the factor shows in the scores
 _CHUNK = 256  # bins in whole groups that are treated together, unless one group is larger
 
@@ -308,8 +305,8 @@ class TrainingBins:
 
 def fit_machine(
     bins: TrainingBins, penalty: float, kernel: Polynomial = PAPER_KERNEL, route: Route = "auto"
-) -> Head:
-    """Solve the kernel machine, and fold it into its quadratic form unless that is larger.
+) -> QuadraticForm:
+    """Solve the kernel machine, and fold it into its quadratic form.
 
     The primal takes two matrices of monomials by monomials (7381 for 120 features) whatever the
     number of bins; the dual takes two of bins by bins. ``solved`` of the machine says how it went.
@@ -333,20 +330,9 @@ def fit_machine(
         return solve_normal_equations(normal, moment, penalty, kernel, num_features)[0]
     gram = _gram_matrix(kernel, z)
     beta, report, _ = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
-    machine = _machine_of(z, beta, kernel)
-    machine.solved = report
-    if isinstance(machine, KernelSum):
-        log.info("%s of more features than bins: all %d bins are kept, %s", kernel, len(z),
-                 machine.cost)  # fmt: skip
-    return machine
-
-
-def _machine_of(support: Tensor, beta: Tensor, kernel: Polynomial) -> Head:
-    """A kernel sum, folded unless it has fewer numbers: more than 1000 features, and fewer bins."""
-    is_wide = support.shape[1] > max(_MOST_QUADRATIC, len(support))
-    if is_wide and kernel.degree == 2:
-        return KernelSum(support, beta, kernel)
-    return collapse(support, beta, kernel)
+    head = collapse(z, beta, kernel)
+    head.solved = report
+    return head
 
 
 def _is_dual(route: Route, kernel: Polynomial, num_bins: int, num_features: int) -> bool:
@@ -392,7 +378,7 @@ class _HeldOutFit(NamedTuple):
         scores: ``[N]``, each from the machine without the bin's group.
     """
 
-    head: Head
+    head: QuadraticForm
     scores: Tensor
 
 
@@ -450,7 +436,7 @@ class HeldOut:
         scores[self._order] = self._targets - residuals
         return _HeldOutFit(head, scores)
 
-    def _dual(self, penalty: float) -> tuple[Head, Tensor]:
+    def _dual(self, penalty: float) -> tuple[QuadraticForm, Tensor]:
         beta, report, factor = solve_symmetric(
             self._system, self._targets, penalty, self._weights, name="gram",
             most_condition=MOST_CONDITION,
@@ -469,11 +455,11 @@ class HeldOut:
                 within = slice(own.start - part.start, own.stop - part.start)
                 lower = torch.linalg.cholesky(inverse[within, within])
                 residuals[own] = torch.cholesky_solve(beta[own, None], lower)[:, 0]
-        head = _machine_of(self._z, beta, self._kernel)
+        head = collapse(self._z, beta, self._kernel)
         head.solved = report
         return head, residuals
 
-    def _primal(self, penalty: float) -> tuple[Head, Tensor]:
+    def _primal(self, penalty: float) -> tuple[QuadraticForm, Tensor]:
         kernel, z, roots = self._kernel, self._z, self._weights.sqrt()
         moment = kernel.sum_of_monomials(z, self._weights * self._targets)
         head, factor = solve_normal_equations(

@@ -1,4 +1,4 @@
-"""The kernel, its explicit features, and the heads that a sum over training bins becomes.
+"""The kernel, its explicit features, and the quadratic form that a sum over bins becomes.
 
 The paper's is the polynomial of degree 2 (section IV-E). Polynomials of degree 1 and 2 in K
 features have few monomials, so the sum over the training bins folds into one quadratic form of
@@ -289,70 +289,8 @@ class QuadraticForm(nn.Module):
         return score
 
 
-class KernelSum(nn.Module):
-    """``sum_i beta_i kernel(z, z_i)``: size and latency grow with the number of training bins.
-
-    Args:
-        support: ``[N, K]``, scaled training bins.
-        beta: ``[N]``, their output weights.
-        kernel: of the machine.
-
-    Attributes:
-        solved: how its numbers were solved for; ``None`` if read from a file or made by hand.
-
-    Raises:
-        ValueError: if shapes disagree.
-
-    Example:
-        >>> machine = KernelSum(torch.ones(1, 2), torch.ones(1), Polynomial(2, 1.0))
-        >>> machine(torch.tensor([[0.0, 0.0], [1.0, 0.0]]))
-        tensor([1., 4.])
-    """
-
-    support: Tensor
-    beta: Tensor
-
-    def __init__(self, support: Tensor, beta: Tensor, kernel: Polynomial) -> None:
-        super().__init__()
-        self.solved: SolveReport | None = None
-        if support.ndim != 2 or beta.shape != support.shape[:1]:
-            raise ValueError(
-                "expected support [N, K] and beta [N] with one N, got "
-                f"{tuple(support.shape)} and {tuple(beta.shape)}"
-            )
-        self.register_buffer("support", support.clone())
-        self.register_buffer("beta", beta.clone())
-        self.kernel = kernel
-
-    @property
-    def num_features(self) -> int:
-        """How many features it takes."""
-        return self.support.shape[1]
-
-    @property
-    def cost(self) -> _Cost:
-        """Multiply-adds a bin and bytes; both grow with the number of training bins."""
-        num_bins, num_features = self.support.shape
-        num_values = num_bins * (num_features + 1)
-        return _Cost(num_values, num_values * self.support.element_size())
-
-    def forward(self, z: Tensor) -> Tensor:
-        """The score; holds a kernel matrix of all bins given by all training bins.
-
-        Shape:
-            - z: ``[*, K]``
-            - output: ``[*]``
-        """
-        across = self.kernel(z[..., None, :], self.support)  # [*, 1, N]
-        return torch.matmul(across, self.beta).squeeze(-1)
-
-
-Head = QuadraticForm | KernelSum
-"""A quadratic form of fixed size, or the sum over training bins where that is smaller."""
-
-
 def collapse(support: Tensor, beta: Tensor, kernel: Polynomial = PAPER_KERNEL) -> QuadraticForm:
-    """Fold a kernel sum into its quadratic form.
+    """Fold ``sum_i beta_i kernel(z, z_i)`` into its quadratic form.
 
     Sums and result are in float64 whatever comes in: the terms are many and cancel. Differentiable
     in both tensors.

@@ -294,16 +294,27 @@ class Bootstrap:
         num_recordings: in the set.
         level: of the intervals, whose ends are percentiles.
         num: how many draws.
+        groups: if given, of each recording, ``[R]``: as many are drawn of each group as it has.
 
     Reference:
         Efron and Tibshirani (1993), An Introduction to the Bootstrap, chapters 8 and 13. Wilson
         (1927), J. Am. Stat. Assoc. 22, 209-212, and its form for a Poisson count.
     """
 
-    def __init__(self, num_recordings: int, level: float = _LEVEL, num: int = 1000) -> None:
+    def __init__(
+        self,
+        num_recordings: int,
+        level: float = _LEVEL,
+        num: int = 1000,
+        groups: Tensor | None = None,
+    ) -> None:
         generator = torch.Generator().manual_seed(0)
         shape = (num, num_recordings)
-        drawn = torch.randint(max(num_recordings, 1), shape, generator=generator)
+        group = torch.zeros(num_recordings) if groups is None else groups
+        drawn = torch.zeros(shape, dtype=torch.long)
+        for name in group.unique():
+            own = (group == name).nonzero()[:, 0]
+            drawn[:, own] = own[torch.randint(len(own), (num, len(own)), generator=generator)]
         self._ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
         self._z = float(torch.special.ndtri(self._ends[1]))
         self._times = torch.zeros(shape, dtype=torch.float64)  # how often each is in each draw

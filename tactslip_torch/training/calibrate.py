@@ -23,7 +23,7 @@ from tactslip_torch.data.labels import LabelRule, bins_of
 from tactslip_torch.data.recording import Stretch, Timeline
 from tactslip_torch.model.calibration import Platt, fit_platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernels import KernelSum, QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.onset.decisions import KEY, AlarmSettings
 from tactslip_torch.onset.events import EventRules, LatencyParts, OnsetEvent, recording_events
 from tactslip_torch.onset.rules import Budget, Cusum, KOfN, lowest_threshold
@@ -395,17 +395,8 @@ def _joined(recordings: Sequence[ScoredRecording], budget: Budget) -> BudgetScor
     )
 
 
-def _shifted(head: QuadraticForm | KernelSum, by: float) -> QuadraticForm | KernelSum:
+def _shifted(head: QuadraticForm, by: float) -> QuadraticForm:
     """The machine whose score is lower by so much."""
-    if isinstance(head, QuadraticForm):
-        made: QuadraticForm | KernelSum = QuadraticForm(
-            head.quadratic, head.linear, head.constant - by
-        )
-    else:  # at 0 the kernel has one value for all bins
-        zero = torch.zeros_like(head.support[:1])
-        weight = torch.full_like(head.beta[:1], -by / float(head.kernel(zero, zero)))
-        made = KernelSum(
-            torch.cat([head.support, zero]), torch.cat([head.beta, weight]), head.kernel
-        )
+    made = QuadraticForm(head.quadratic, head.linear, head.constant - by)
     made.solved = head.solved
     return made

@@ -20,7 +20,7 @@ from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
 from tactslip_torch.features.sensing import SILENT_FRACTION
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.kernels import Polynomial, QuadraticForm
+from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.events import first_releases
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
@@ -144,7 +144,6 @@ class OnsetTraining:
         weights = _weights(kinds, is_onset)
         bins = TrainingBins(scaler(columns), torch.from_numpy(is_onset), weights)
         head = fit_machine(bins, self.penalty / len(kinds), _KERNEL)
-        assert isinstance(head, QuadraticForm)
         return OnsetClassifier(evidence, scaler, head, float("inf"))
 
 

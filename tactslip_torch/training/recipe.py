@@ -37,7 +37,7 @@ from tactslip_torch.features.sensing import (
 )
 from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
-from tactslip_torch.model.kernels import PAPER_KERNEL, Head, Polynomial
+from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, QuadraticForm
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import (
@@ -111,7 +111,7 @@ class Fit(_Plan):
         head: the machine.
     """
 
-    head: Head = field(kw_only=True)
+    head: QuadraticForm = field(kw_only=True)
 
     @property
     def calibration(self) -> dict[str, Any] | None:
@@ -266,7 +266,7 @@ class _Recipe(ABC):
         else:
             add_over_processes(sums.sums, sums.count)
 
-        def solve() -> Head:
+        def solve() -> QuadraticForm:
             if sums is not None:
                 return sums.solve(plan.penalty, plan.kernel.offset, balance="none")
             columns = zip(*(kept[name] for name in sorted(kept)), strict=True)
