@@ -19,7 +19,6 @@ from torch import Tensor
 from tactslip_torch.features.descriptors import (
     COMMON_DESCRIPTORS,
     DESCRIPTORS,
-    SIMPLE_STATISTICS,
     SORTED,
     SPECTRUM_DESCRIPTORS,
     STEPPED,
@@ -31,7 +30,7 @@ from tactslip_torch.features.descriptors import (
     root,
     taken,
 )
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.names import SIMPLE_STATISTICS, FeatureName
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import ascending, is_traced
 from tactslip_torch.signals.wavelet import (

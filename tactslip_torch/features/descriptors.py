@@ -363,8 +363,6 @@ spectra; the last two, which the paper has not, of bins.
 COMMON_DESCRIPTORS = tuple(DESCRIPTORS)[:13]
 TIME_DESCRIPTORS = (*COMMON_DESCRIPTORS, "correlation")
 SPECTRUM_DESCRIPTORS = (*COMMON_DESCRIPTORS, "spectral_centroid", "spectral_spread")
-SIMPLE_STATISTICS = ("mean", "std", "rms", "range", "mean_abs_change")
-"""Descriptors of the filtered bin itself that every channel has, fast ones too; in volts."""
 SORTED = ("median", "mode", "iqr")
 """Descriptors of sorted values."""
 STEPPED = ("mode", "entropy")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tactslip_torch.features.descriptors import SIMPLE_STATISTICS
+SIMPLE_STATISTICS = ("mean", "std", "rms", "range", "mean_abs_change")
+"""Descriptors of the filtered bin itself that every channel has, fast ones too; in volts."""
 
 
 @dataclass(frozen=True)
