@@ -1,5 +1,6 @@
 """The simulated hand: scenes in, recordings with exact truth out."""
 
+from tactslip_torch.simulation._sensors import HandSignals
 from tactslip_torch.simulation.scene import (
     FIDELITIES,
     MATERIALS,
@@ -24,8 +25,10 @@ from tactslip_torch.simulation.simulate import (
     simulate,
     timeline,
 )
+from tactslip_torch.simulation.worlds import CONFOUNDERS, WorldRecordings
 
 __all__ = [
+    "CONFOUNDERS",
     "FIDELITIES",
     "MATERIALS",
     "SEEN_MATERIALS",
@@ -35,6 +38,7 @@ __all__ = [
     "Disturbances",
     "Dynamics",
     "Faults",
+    "HandSignals",
     "Handling",
     "Imperfections",
     "Material",
@@ -43,6 +47,7 @@ __all__ = [
     "SimulatedRecordings",
     "Stroke",
     "Timeline",
+    "WorldRecordings",
     "paper_scenes",
     "simulate",
     "timeline",

@@ -52,7 +52,6 @@ from tactslip_torch.simulation.scene import (
 _GROSS_FRACTION = 0.5
 """Of the arm's speed, above which an element of bristles slides grossly."""
 
-_SLIDE_RISE_S = 0.004  # with which an element that let go reaches the arm's speed (ours)
 _BURSTS = (1.0, -0.2)  # of letting go and of sticking again, over that of letting go (ours)
 _SETTLING_S = 0.25  # how long a stroke is integrated on behind its end, at most its pause (ours)
 _MOVING_FRACTION = 0.02  # of its highest speed, below which the arm counts as at rest (ours)
@@ -288,7 +287,7 @@ class _KinematicContact:
             rows = grid.overlapping(start_s, end_s)
             time_s = grid.time_s[rows]
             since = np.where((time_s >= start_s) & (time_s < end_s), time_s - start_s, 0.0)
-            slide[rows] -= np.expm1(-since / _SLIDE_RISE_S)
+            slide[rows] -= np.expm1(-since / self._scene.contact.slide_rise_s)
         normal_n = grasp.normal_n(element, motion.position_mm, motion.grid.time_s)
         friction_n = grasp.mu_s * normal_n * self._shear(element, motion)
         return ElementContact(normal_n, friction_n, slide, self._release_v(element, grid))

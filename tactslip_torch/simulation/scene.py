@@ -145,6 +145,8 @@ class Contact(_Parameters):
         texture_scale: factor on every material's texture (prior, ours).
         onset_pulse_v: first swing of a fast channel's burst when an element lets go, per newton of
             friction. On kinematic fidelity alone: see ``Dynamics.release_v_per_n``.
+        slide_rise_s: time constant with which an element that let go reaches the speed between
+            hand and object (ours): longer for a slip that fades in. On kinematic fidelity alone.
         runout: relative change of normal load along the travel.
         skin_resonance_hz: range of the skin's resonance, drawn per session.
         skin_damping: range of its damping ratio (prior, ours).
@@ -173,6 +175,7 @@ class Contact(_Parameters):
     friction_noise_low_share: float = 0.3
     texture_scale: float = 1.0
     onset_pulse_v: float = 0.5
+    slide_rise_s: float = 0.004
     runout: float = 0.04
     skin_resonance_hz: tuple[float, float] = (40.0, 100.0)
     skin_damping: tuple[float, float] = (0.1, 0.3)
@@ -187,7 +190,8 @@ class Contact(_Parameters):
             )
         loads = all(0 <= load < math.inf for _, load in self.finger_loads)
         self._require("finger_loads", loads, "finite and not negative")
-        self._require("recoil_s", self.recoil_s > 0, "positive")
+        for name in ("recoil_s", "slide_rise_s"):
+            self._require(name, getattr(self, name) > 0, "positive")
         self._require("friction_noise_low_share", self.friction_noise_low_share <= 1, "at most 1")
         self._require("runout", self.runout <= 1, "at most 1")
         self._require("relaxation", self.relaxation[1] <= 1, "at most 1")
@@ -218,6 +222,7 @@ class Sensors(_Parameters):
         pvdf_drift_mv: size of a fast channel's (pyroelectric) drift.
         warming_mv: how far a slow channel's zero moves over the recording as the hand warms up,
             with a sign and size of its own in every channel; a fast one moves a fiftieth of it.
+        gain: of the front end, on all that a channel has before its converter, noise included.
         num_bits: of the converter.
         rail_v: the converter's range is plus and minus this.
 
@@ -238,13 +243,15 @@ class Sensors(_Parameters):
     pvdf_offset_mv: float = 2.0
     pvdf_drift_mv: float = 1.0
     warming_mv: float = 0.0
+    gain: float = 1.0
     num_bits: int = 16
     rail_v: float = 5.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require("num_bits", 2 <= self.num_bits <= 32, "2 to 32")
-        self._require("rail_v", self.rail_v > 0, "positive")
+        for name in ("gain", "rail_v"):
+            self._require(name, getattr(self, name) > 0, "positive")
         wanted = "at least 2, for slower ones outlast a block of a quarter second"
         self._require("pvdf_highpass_hz", self.pvdf_highpass_hz >= 2, wanted)
 
@@ -305,9 +312,12 @@ class Handling(_Parameters):
             and falls back, never below what it was, so that a contact that sticks sticks on.
         grip_share: range of the rise over the load; log-uniform.
         grip_s: range of its duration with both ramps, which take a quarter each; log-uniform.
+        loosenings_per_s: changes of grip a second in which the normal load falls and rises back,
+            as long as ``grip_s``; never so far that a contact that sticks would slip.
+        loosening_share: range of the fall over the load, below 1; log-uniform.
 
     Raises:
-        ValueError: if a parameter is negative or not finite.
+        ValueError: if a parameter is negative or not finite, or a grip may let go of all load.
     """
 
     carried_kg: float = 0.2
@@ -317,6 +327,12 @@ class Handling(_Parameters):
     grips_per_s: float = 0.0
     grip_share: tuple[float, float] = (0.1, 1.0)
     grip_s: tuple[float, float] = (0.2, 1.0)
+    loosenings_per_s: float = 0.0
+    loosening_share: tuple[float, float] = (0.05, 0.5)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require("loosening_share", self.loosening_share[1] < 1, "below 1")
 
 
 @dataclass(frozen=True)
@@ -711,10 +727,15 @@ class Scene:
     def to_dict(self) -> dict[str, Any]:
         """The scene as plain JSON types, without loss: with its version, a cache key.
 
-        Imperfections are left out where there are none, as before there were any.
+        Imperfections, and parameters that came later, are left out where they change nothing, so
+        that recordings keep their keys.
         """
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         plain["hand"] = self.hand.to_rows()
+        for group, names in _ADDED.items():
+            for name in names:
+                if getattr(getattr(self, group), name) == getattr(_GROUPS[group](), name):
+                    del plain[group][name]
         if self.imperfections == Imperfections():
             del plain["imperfections"]
         return {**plain, "simulation_version": SIMULATION_VERSION}
@@ -788,6 +809,13 @@ _GROUPS: dict[str, Any] = {
     each.name: each.default_factory for each in fields(Scene) if is_dataclass(each.default_factory)
 }
 """The groups of parameters of a scene, by name."""
+
+_ADDED = {
+    "contact": ("slide_rise_s",),
+    "sensors": ("gain",),
+    "handling": ("loosenings_per_s", "loosening_share"),
+}
+"""Parameters that older keys of recordings do not have."""
 
 
 def _grouped(given: Mapping[str, Any]) -> dict[str, Any]:
