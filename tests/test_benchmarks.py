@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.harness import Benchmark, between_markers
+from benchmarks.paper_tables import RIDGE, forward_order
 from benchmarks.real_sets import RealSet
 from benchmarks.tables import Table
 from benchmarks.timing import interleaved, paired_ratio
@@ -75,6 +77,32 @@ def test_a_table_has_numbers_to_the_right_and_words_to_the_left() -> None:
     ]
     table = Table(rows)
     assert table.markdown().split("\n")[1] == "| --- | ---: | --- |"
+
+
+def test_forward_selection_takes_what_lessens_the_error_most() -> None:
+    """Against a solve of every candidate at every step, with features that repeat each other."""
+    generator = torch.Generator().manual_seed(3)
+    scales = torch.tensor([1.0, 0.2, 5.0, 0.1, 3.0, 1.0, 8.0]).double()
+    z = torch.randn(60, 7, generator=generator, dtype=torch.float64)
+    z[:, 5] = z[:, 0] + 0.01 * z[:, 1]
+    is_slip, weights = z[:, 0] + 0.5 * z[:, 2] - 0.4 * z[:, 4] > 0.2, torch.rand(60).double() + 0.5
+    z = z * scales
+    targets, part = torch.where(is_slip, 1.0, -1.0).double(), weights / weights.sum()
+
+    def error(taken: list[int]) -> float:
+        columns = torch.cat([torch.ones(60, 1), z[:, taken]], 1) * part.sqrt()[:, None]
+        ridge = RIDGE**0.5 * torch.eye(1 + len(taken)).double()[1:]
+        left, right = (
+            torch.cat([columns, ridge]),
+            torch.cat([targets * part.sqrt(), 0 * ridge[:, 0]]),
+        )
+        return float((left @ torch.linalg.lstsq(left, right).solution - right).square().sum())
+
+    expected = list[int]()
+    for _ in range(5):
+        rest = [place for place in range(7) if place not in expected]
+        expected.append(min(rest, key=lambda place: error([*expected, place])))
+    assert forward_order(z, is_slip, weights, 5).tolist() == expected
 
 
 def test_only_what_stands_between_the_markers_is_replaced() -> None:
