@@ -114,12 +114,12 @@ class ClosedLoop(Benchmark):
             for name, row in numbers["methods"].items()
         ]
         note = (
-            f"{numbers['lifts']} lifts. Percentages with 95 % of the bootstrap over lifts; *beside "
+            f"{numbers['lifts']} lifts. In brackets 95 % of the bootstrap over lifts; *beside "
             "the alarm*: dropped more than with the alarm at that delay, in the same lifts. *Slid* "
-            "and *peak grip*: median and, in brackets, 95 % quantile; grips are over the least that "
+            "and *peak grip*: median and, in brackets, 95 % quantile; grips over the least that "
             "the largest load needs. *Late*: from the begin of a slide to the first tightening in "
             "it, median. *False*: tightenings of a lift where no pad slid in the quarter second "
-            f"before. Of energy and CUSUM the thresholds are what {numbers['calibration']} lifts of "
+            f"before. Thresholds of energy and CUSUM are what {numbers['calibration']} lifts of "
             "seen materials without slip reach at most."
         )
         kinds = [
