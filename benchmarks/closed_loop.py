@@ -182,10 +182,10 @@ def _thresholds(detector: SlipDetector, num: int) -> dict[str, float]:
 
 
 def _by_cusum(detector: SlipDetector, threshold: float) -> AlarmSettings:
-    """An alarm by a CUSUM of the status alone, every hop."""
-    settings = AlarmSettings.of(detector)
-    rule = Cusum(evidence=HOP / detector.pool.bin_samples, ceiling=_CUSUM_CEILING * threshold)
-    return replace(settings, onset=None, hop_samples=HOP, rule=rule, threshold=threshold)
+    """An alarm by a CUSUM of the status alone, every other hop."""
+    settings, hop = AlarmSettings.of(detector), 2 * HOP
+    rule = Cusum(evidence=hop / detector.pool.bin_samples, ceiling=_CUSUM_CEILING * threshold)
+    return replace(settings, onset=None, hop_samples=hop, rule=rule, threshold=threshold)
 
 
 def _triggers(

@@ -11,10 +11,8 @@ both.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +30,7 @@ def _model_xml(shape: str, mass_kg: float) -> str:
     springs = "".join(
         f'<joint type="slide" axis="{axis}" stiffness="{n_m:g}" '
         f'damping="{2 * ratio * np.sqrt(n_m * _PAD_KG):.4f}"/>'
-        for axis, n_m, ratio in (("1 0 0", 4000.0, 2.0), ("0 0 1", 1500.0, 0.7))
+        for axis, n_m, ratio in (("1 0 0", 4000.0, 2.0), ("0 0 1", 1500.0, 1.5))
     )
 
     def finger(name: str, side: int) -> str:
@@ -104,12 +102,16 @@ class Gripper:
     def __init__(
         self, shape: str, mass_kg: float, mu_s: Array, mu_ratio: float, stribeck_mm_s: float
     ) -> None:
+        import mujoco  # of an extra
+
+        self._step = mujoco.mj_step
         self.model: Any = mujoco.MjModel.from_xml_string(_model_xml(shape, mass_kg))
         self.data: Any = mujoco.MjData(self.model)
         self._mu_s, self._mu_ratio, self._stribeck_mm_s = mu_s, mu_ratio, stribeck_mm_s
         self._bodies = np.array([self.model.body(name).id for name in _PADS])
         self._object = self.model.body("object").id
-        self._pad_of_geom = {self.model.geom(name).id: pad for pad, name in enumerate(_PADS)}
+        self._pad_of_geom = np.full(self.model.ngeom, -1)
+        self._pad_of_geom[[self.model.geom(name).id for name in _PADS]] = range(len(_PADS))
         self._pad_speeds = self.model.body_dofadr[self._bodies] + 1  # along the lift
         self._lift = int(self.model.jnt_dofadr[self.model.joint("lift").id])
         self._slip_mm_s = np.zeros(2 * _ROWS)
@@ -128,14 +130,13 @@ class Gripper:
         fall = np.exp(-((self._slip_mm_s / self._stribeck_mm_s) ** 2))
         ratio = self._mu_ratio + (1.0 - self._mu_ratio) * fall
         model.pair_friction[:, :2] = (self._mu_s * ratio)[:, None]
-        mujoco.mj_step(model, data)
+        self._step(model, data)
         normal_n, friction_n = np.zeros(2 * _ROWS), np.zeros(2 * _ROWS)
-        places = data.contact.efc_address
-        for geoms, at in zip(data.contact.geom.tolist(), places.tolist(), strict=True):
-            pad = self._pad_of_geom.get(geoms[0], self._pad_of_geom.get(geoms[1]))
-            if pad is not None and at >= 0:  # a contact's force follows its normal and tangents
-                normal_n[pad], *along_n = data.efc_force[at : at + 3].tolist()
-                friction_n[pad] = math.hypot(*along_n)
+        pads, at = self._pad_of_geom[data.contact.geom].max(axis=1), data.contact.efc_address
+        is_pad = (pads >= 0) & (at >= 0)
+        pads, at = pads[is_pad], at[is_pad]  # a contact's force: along its normal and two tangents
+        normal_n[pads] = data.efc_force[at]
+        friction_n[pads] = np.hypot(data.efc_force[at + 1], data.efc_force[at + 2])
         speed = data.qvel
         x, y, z = (data.xpos[self._bodies] - data.xpos[self._object]).T
         spin = data.xmat[self._object].reshape(3, 3) @ speed[-3:]

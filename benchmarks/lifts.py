@@ -8,19 +8,25 @@ and so do samples: a false alarm costs force, a tightening that comes late costs
 
 from __future__ import annotations
 
+import argparse
 import math
+import os
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, Protocol
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 from benchmarks.gripper import STEP_S, Array, Gripper, Pads
 from tactslip_torch import AlarmSettings, SlipDetector, StreamingDetector
+from tactslip_torch.report import style
 from tactslip_torch.simulation import (
     UNSEEN_MATERIALS,
     Contact,
@@ -42,6 +48,7 @@ _LAG_S = 0.01  # of the actuator behind its delay: a first-order lag
 _MARGIN = 1.5  # of the force that the controller takes over the one that the object should need
 _SLIDES_MM_S = 2.0  # of a pad
 _RECENT_S = 0.25
+_FILMED_HOPS, _FILM_SIZE = 10, (260, 170)  # a frame each 50 ms; height and width
 _PAUSE_S = 0.02  # of a slide that goes on
 
 
@@ -196,8 +203,8 @@ class Listening:
 class Reflex:
     """How much a grip is tightened: 1.5 times at a slip, 1.2 times each .15 s that it goes on.
 
-    By 1.15 times at what may be slip, at most each .3 s and up to 1.3 times in all. Never beyond 3
-    times what it was.
+    At what may be slip 1.15 times, at most each .3 s and up to 1.3 times in all; at a slip up to 3
+    times.
     """
 
     factor: float = 1.0
@@ -206,30 +213,34 @@ class Reflex:
 
     def tightens(self, time_s: float, level: int) -> bool:
         """Raise ``factor`` where this level calls for it now."""
-        if not level or time_s < self._next_s[level]:
+        most = 1.3 if level == 1 else 3.0
+        step = 1.15 if level == 1 else 1.2 if time_s < self._last_s + 0.3 else 1.5
+        if not level or time_s < self._next_s[level] or self.factor * 1.1 > most:
             return False
-        if level == 1 and self.factor * 1.15 > 1.3:
-            return False
-        goes_on = time_s - self._last_s < 0.3
-        step = 1.15 if level == 1 else 1.2 if goes_on else 1.5
         if level == 2:
             self._last_s = time_s
         self._next_s[level] = time_s + (0.3 if level == 1 else 0.15)
-        if self.factor == 3.0:
-            return False
-        self.factor = min(step * self.factor, 3.0)
+        self.factor = min(step * self.factor, most)
         return True
 
 
 # ----------------------------------------------------------------------------------------- loop
 def slides(pads: Pads) -> float:
-    """Fraction of the pads' force that slides."""
-    total = float(pads.normal_n.sum())
-    return float(pads.normal_n[pads.slip_mm_s > _SLIDES_MM_S].sum()) / max(total, 1e-9)
+    """Fraction of the pads' force that slides at the end of a hop, ``[HOP, 6]``."""
+    normal_n = pads.normal_n[-1]
+    sliding_n = normal_n[pads.slip_mm_s[-1] > _SLIDES_MM_S].sum()
+    return float(sliding_n / max(normal_n.sum(), 1e-9))
 
 
 class Sample(NamedTuple):
-    """What is shown of an instant: time, grip of a finger, force needed, slid, volts."""
+    """What is shown of a hop: time, grip of a finger, how far the object has slid, and samples.
+
+    Attributes:
+        time_s: of its end.
+        grip_n: of each finger.
+        slid_mm: so far.
+        volts: of the hand, ``[HOP, C]``.
+    """
 
     time_s: float
     grip_n: float
@@ -243,6 +254,7 @@ def run_lift(
     delay_s: float,
     *,
     factor: float = 1.0,
+    reach_mm: float = REACH_MM,
     seen: Callable[[Gripper, Sample], None] | None = None,
 ) -> dict[str, Any]:
     """Lift once, in a closed loop.
@@ -252,6 +264,7 @@ def run_lift(
         trigger: that a reflex obeys, from ``WATCHED_S`` on.
         delay_s: until the actuator begins to follow.
         factor: of the grip from the beginning.
+        reach_mm: slid, at which the lift is over.
         seen: is shown every hop.
 
     Returns:
@@ -270,34 +283,34 @@ def run_lift(
     gripper = Gripper(lift.shape, weight_n / 9.81, mu_s, grasp.mu_ratio, stribeck_mm_s)
     pad_of, fraction = _elements_of_pads(signals)
     stroke, reflex = lift.scene.arm[0], Reflex()
-    commands = deque([factor * grip_n] * (1 + round(delay_s / STEP_S)))
-    forces: list[Pads] = []
-    force_n, slid_mm, recent_s, grips_n = 0.0, 0.0, -math.inf, list[float]()
+    commands = deque([factor * grip_n] * round(delay_s / STEP_S))
+    force_n, slid_mm, grips_n = 0.0, 0.0, list[float]()
     begun_s = late_ms = None  # of the slide that goes on
-    ends_s = -math.inf
+    ends_s = recent_s = -math.inf
     false = {1: 0, 2: 0}
     volts = np.zeros((HOP, len(lift.scene.hand)))
-    for step in range(round(_END_S / STEP_S)):
-        time_s = step * STEP_S
-        closed = min(max((time_s - _CLOSING_S) / (_CLOSED_S - _CLOSING_S), 0.0), 1.0)
-        commands.append(grip_n * factor * reflex.factor * lift.raised(time_s))
-        force_n += (closed * commands.popleft() - force_n) * STEP_S / _LAG_S
-        height_m = 1e-3 * float(stroke.travel_mm(np.asarray(time_s)))
-        pads = gripper.step(force_n, height_m, lift.pull_n(time_s, most_n - weight_n))
-        forces.append(pads)
+    times_s = np.arange(round(_END_S / STEP_S), dtype=np.float64) * STEP_S
+    heights_m = 1e-3 * stroke.travel_mm(times_s)
+    closed = np.clip((times_s - _CLOSING_S) / (_CLOSED_S - _CLOSING_S), 0.0, 1.0)
+    for first in range(0, len(times_s), HOP):
+        felt = []
+        for step in range(first, first + HOP):
+            time_s = float(times_s[step])
+            commands.append(grip_n * factor * reflex.factor * lift.raised(time_s))
+            force_n += (closed[step] * commands.popleft() - force_n) * STEP_S / _LAG_S
+            pull_n = lift.pull_n(time_s, most_n - weight_n)
+            felt.append(gripper.step(force_n, heights_m[step], pull_n))
+        pads = Pads(*np.array(felt).swapaxes(0, 1))
         if time_s > WATCHED_S:
-            slid_mm += STEP_S * float(np.median(pads.slip_mm_s))
             grips_n.append(force_n)
-            recent_s = time_s if slides(pads) > 0 else recent_s
-            if slides(pads) > 0.5:
+            slid_mm += HOP * STEP_S * float(np.median(pads.slip_mm_s, axis=1).mean())
+            sliding = slides(pads)
+            recent_s = time_s if (pads.slip_mm_s > _SLIDES_MM_S).any() else recent_s
+            if sliding > 0.5:
                 begun_s = time_s if time_s > ends_s + _PAUSE_S else begun_s
                 ends_s = time_s
-        if len(forces) < HOP:
-            continue
         if listens or seen:
-            normal_n, friction_n, slip_mm_s, inertia_n = np.array(forces)[..., pad_of].swapaxes(
-                0, 1
-            )
+            normal_n, friction_n, slip_mm_s, inertia_n = (of[:, pad_of] for of in pads)
             normal_n, friction_n, inertia_n = (
                 fraction * force_n for force_n in (normal_n, friction_n, inertia_n)
             )
@@ -309,8 +322,7 @@ def run_lift(
                 late_ms = 1e3 * (time_s - begun_s)
         if seen:
             seen(gripper, Sample(time_s, force_n, slid_mm, volts))
-        forces = []
-        if slid_mm >= REACH_MM:
+        if slid_mm >= reach_mm:
             break
     need_n = most_n / (2 * float(mu_s.mean()))
     return {
@@ -336,3 +348,70 @@ def _elements_of_pads(signals: HandSignals) -> tuple[NDArray[np.int64], Array]:
     loads_n = signals.grasp.load_n
     sums = np.bincount(pad_of, loads_n, 6)[pad_of]
     return pad_of, np.where(sums > 0, loads_n / np.maximum(sums, 1e-9), 0.0)
+
+
+# --------------------------------------------------------------------------------------- picture
+class _Camera:
+    """Takes a picture of the gripper every few hops, and keeps all samples."""
+
+    def __init__(self) -> None:
+        self.images, self.samples = list[Any](), list[Sample]()
+        self._renderer: Any = None
+
+    def see(self, gripper: Gripper, sample: Sample) -> None:
+        """A hop."""
+        import mujoco  # of an extra
+
+        self.samples.append(sample)
+        if sample.time_s > _LIFT_S and len(self.samples) % _FILMED_HOPS == 0:
+            self._renderer = self._renderer or mujoco.Renderer(gripper.model, *_FILM_SIZE)
+            self._renderer.update_scene(gripper.data, "side")
+            self.images.append(self._renderer.render())
+
+
+def film(path: Path, lift: Lift, detector: SlipDetector) -> None:
+    """Write a moving picture of a lift without and with a reflex, at half of its speed."""
+    fast = list(detector.pool.hand.fast)
+    taken = [_Camera(), _Camera()]
+    triggers: list[Trigger] = [Never(), Listening(detector)]
+    for camera, trigger in zip(taken, triggers, strict=True):
+        run_lift(lift, trigger, 0.01, reach_mm=math.inf, seen=camera.see)
+    times_s = [sample.time_s for sample in taken[0].samples]
+    curves = [
+        ("grip, N", [[s.grip_n for s in of.samples] for of in taken]),
+        ("fast channels, mV", [[1e3 * s.volts[:, fast].std() for s in of.samples] for of in taken]),
+        ("slid, mm", [[min(s.slid_mm, REACH_MM) for s in of.samples] for of in taken]),
+    ]
+    frames = []
+    for place in range(len(taken[0].images)):
+        figure = style.new_figure(6.4, 3.4)
+        grid = figure.add_gridspec(3, 3, width_ratios=[1, 1, 1.6])
+        for column, title in enumerate(("no reflex", "tightened by the alarm")):
+            axes = figure.add_subplot(grid[:, column])
+            axes.imshow(taken[column].images[place])
+            axes.set_title(title, fontsize=9, color=(style.VERMILION, style.BLUE)[column])
+            axes.set_axis_off()
+        last = np.searchsorted(times_s, _LIFT_S) + _FILMED_HOPS * (place + 1)
+        for row, (title, both) in enumerate(curves):
+            axes = figure.add_subplot(grid[row, 2])
+            for values, colour in zip(both, (style.VERMILION, style.BLUE), strict=True):
+                axes.plot(times_s[:last], values[:last], color=colour, linewidth=1)
+            axes.set_title(title, fontsize=8, loc="left")
+            axes.set(xlim=(_LIFT_S, _END_S), ylim=(0, 1.05 * max(map(max, both))))
+            axes.tick_params(labelsize=7, labelbottom=row == 2)
+        figure.savefig(file := BytesIO(), format="png", dpi=100)
+        frames.append(Image.open(file).convert("RGB"))
+    length_ms = round(2e3 * _FILMED_HOPS * HOP * STEP_S)
+    first, *others = frames
+    options: dict[str, Any] = {"duration": length_ms, "loop": 0, "quality": 40, "method": 6}
+    first.save(path, save_all=True, append_images=others, **options)
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("MUJOCO_GL", "egl")  # draws without a screen
+    parser = argparse.ArgumentParser(description="A moving picture of one lift (WebP, simulated).")
+    parser.add_argument("out", type=Path, help="the file to write")
+    parser.add_argument("--number", type=int, default=0, help="of the lift")
+    parser.add_argument("--kind", default="gradual", choices=get_args(Kind), help="of its load")
+    given = parser.parse_args()
+    film(given.out, Lift(given.number, given.kind), SlipDetector.pretrained("paper24-sim"))
