@@ -32,7 +32,7 @@ from tactslip_torch.training.experiment import feature_cache, feature_maker
 from tactslip_torch.training.recipe import Recipe
 
 PAPERS_UNSEEN = frozenset({"iron", "cloth", "copper", "wood"})
-GIVEN = {"general": ("recipe.use=pooled", "recipe.num_features=null", "recipe.degree=1")}
+GIVEN = {"general": ("recipe.views=[pooled]",)}
 """What the whole choice of a recipe takes on this set; all of it takes longer."""
 
 
@@ -97,7 +97,7 @@ def evaluate_split(materials: Materials, recipe: Recipe, unseen: Sequence[str]) 
     """
     seen = sorted(set(materials.training) - set(unseen))
     bins = [materials.training[name] for name in seen]
-    fit = recipe.fit(bins, materials.pool, is_nested=False)
+    fit = recipe.fit(bins, materials.pool)
 
     def score(names: Sequence[str], roles: Sequence[str]) -> tuple[float | None, dict[str, Any]]:
         decided: list[tuple[torch.Tensor, ...]] = []

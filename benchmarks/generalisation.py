@@ -89,7 +89,7 @@ class Generalisation(Benchmark):
         "unseen4=[0] deploy=[] hard=[0] recipes=[general] levels_mv=[3.0] evaluated=1 overrides=["
         'data.cycles=2,split.train_fraction=0.5,"data.materials=[M1,M4,M6,iron]",'
         '"split.seen=[M1,M4,M6]","split.unseen=[iron]",recipe.sample_bins=20,num_workers=0,'
-        'recipe.use=pooled,recipe.degree=1,"recipe.penalties=[0.001,0.01]"]'
+        '"recipe.views=[pooled]","recipe.penalties=[1.0,10.0]"]'
     )
     charts: ClassVar = {"": ()}
     unseen4: tuple[int, ...] = (0, 1, 2, 3, 4)

@@ -134,9 +134,7 @@ def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> list[dict[str, s
     off = ["cache=off", *overrides]
     config = composed("train", off)
     recipe = General(
-        use="pooled",
-        num_features=None,
-        degree=1,
+        views="pooled",
         sample_bins=sizes.train_bins,
         descriptors=None,
     )
@@ -153,7 +151,7 @@ def _accuracies(sizes: Simulation, overrides: Sequence[str]) -> list[dict[str, s
         kept[level].setup()
     rows = []
     for level, data in kept.items():
-        fit = recipe.fit(data.training_bins(), data.maker.pool, is_nested=False)
+        fit = recipe.fit(data.training_bins(), data.maker.pool)
         row: dict[str, str] = {"balanced accuracy, %": f"trained on {level}"}
         for other, its in kept.items():
             made = list(its.features("test"))

@@ -38,7 +38,6 @@ from tactslip_torch.training.recipe import POOLING, Fit, General
 
 FRAMES: Mapping[str, int] = {"SG": 51, "PVDF": 11}
 """Savitzky-Golay frames of the paper's kinds of channels, samples at 2 kHz; others are as given."""
-_USES = ("channel", "pooled", "both")
 _FOLDS = 5  # of validation without groups
 _BLOCK = 50  # windows that lose the same channels in a second copy (``drop_channels``)
 _UNCALIBRATED = Platt(2.0, 0.0)  # (1 + score) / 2 in the middle, for targets of -1 and 1
@@ -115,7 +114,7 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             y: not used.
         """
         windows = self._lay_out(X)
-        pool, recipe = self._pool, self._recipe(num_features=None, degree=1)
+        pool, recipe = self._pool, self._recipe()
         places = recipe.allowed(pool).nonzero()[:, 0].tolist()
         self._layer: ChannelPooling | None = None
         self._columns = described = pool.select(places)
@@ -156,10 +155,16 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         return General(
             name="estimator",
             pooling=self.pooling,
-            use=_USES if self.use is None else self.use,
             descriptors=self.descriptors,
             **choices,
         )
+
+    def _views(self, wanted: str | Sequence[str]) -> tuple[str, ...]:
+        """The views that ``use`` leaves of those that are wanted."""
+        listed = (wanted,) if isinstance(wanted, str) else tuple(wanted)
+        if self.use not in ("channel", "pooled"):
+            return listed
+        return tuple(view for view in listed if (view == "pooled") == (self.use == "pooled"))
 
     def _read(self, X: Any, hand: HandLayout | None, *, may_miss: bool = False) -> Tensor:
         """Windows ``[N, C, T]``, float64 or float32; only where they ``may_miss``, with NaN."""
@@ -264,23 +269,23 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     """Slip or not, of windows ``[N, C, T]``.
 
-    A kernel ridge machine (extreme learning machine) on compressed and scaled columns. Both classes
-    weigh the same, however many windows they have. What is not set is chosen by leaving out groups:
-    which columns, how many, the degree, and C; of the choices within half a point of the best
-    balanced accuracy the simplest with the strongest penalty is taken. Without ``groups`` five
-    blocks of consecutive rows of each class are left out in turn; with fewer than two rows of a
-    class nothing is, and the first choice with the middle C is taken.
+    The mean of the scores of up to three kernel ridge machines, each on a view of the windows
+    (``recipe.General``). Both classes weigh the same, however many windows they have. Penalties,
+    the weights of the views and the threshold are chosen by leaving out groups. Without ``groups``
+    five blocks of consecutive rows of each class are left out in turn; with fewer than two rows of
+    a class nothing is, and views weigh alike, with the middle C.
 
     Args:
         sample_rate_hz: of the windows.
         hand: the channels, as ``TactileFeatures`` has them.
         features: in place of both, how windows are described; ``None``: by
             ``TactileFeatures(sample_rate_hz, hand)``.
-        num_features: how many columns; ``None``: all; or several to choose from.
-        degree: of the polynomial kernel, 1, 2 or both.
-        penalties: values of the paper's C to choose from; small ones are the strong penalties. Of
-            several, a grid whose end is best is extended.
-        drop_channels: with pooled columns: a second copy of every window is trained on, without up
+        views: some of ``simple``, ``channel`` and ``pooled``; those that do no good are dropped.
+        num_features: columns of each view, the best together; ``None``: all.
+        penalties: values of C to choose from; small ones are the strong penalties.
+        threshold: part of the validated shift of the threshold that is applied: ``zero``, ``half``
+            or ``full``.
+        drop_channels: of every window the view ``pooled`` is trained on a second copy, without up
             to this part of its channels, so that a broken one does little harm.
         slip_label: the label of ``y`` that is slip. ``None``: ``True``, 1 of 0 and 1 or of -1 and
             1, or the one whose name says slip (``"Slip"``, of ``"slip"`` and ``"non-slip"`` the
@@ -289,8 +294,9 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     Attributes:
         classes_: the two labels, ascending.
         slip_label_: the one that is slip.
-        penalty_: C.
-        validation_: one row for each choice: its balanced accuracy by group.
+        views_: the weight of each view, 0 of one that is dropped.
+        penalty_: C of the view that weighs most.
+        validation_: one row for each view and penalty: its balanced accuracy by group.
         detector_: the ``SlipDetector``, for streams, ONNX and the commands.
 
     Example:
@@ -308,18 +314,20 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         hand: HandLayout | None = None,
         *,
         features: TactileFeatures | None = None,
-        num_features: int | Sequence[int | None] | None = (None, 120),
-        degree: int | Sequence[int] = (1, 2),
+        views: str | Sequence[str] = General.views,
+        num_features: int | None = None,
         penalties: float | Sequence[float] = General.penalties,
+        threshold: str = General.threshold,
         drop_channels: float = 0.5,
         slip_label: Any = None,
     ) -> None:
         self.sample_rate_hz = sample_rate_hz
         self.hand = hand
         self.features = features
+        self.views = views
         self.num_features = num_features
-        self.degree = degree
         self.penalties = penalties
+        self.threshold = threshold
         self.drop_channels = drop_channels
         self.slip_label = slip_label
 
@@ -357,9 +365,10 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             )
         self.slip_label_ = self.classes_[_place_of_slip(self.classes_.tolist(), self.slip_label)]
         recipe = features._recipe(
+            views=features._views(self.views),
             num_features=self.num_features,
-            degree=self.degree,
             penalties=self.penalties,
+            threshold=self.threshold,
             drop_channels=self.drop_channels,
             sample_bins=max(len(windows), 2),
         )
@@ -477,6 +486,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     def _set(self, detector: SlipDetector, features: TactileFeatures) -> None:
         self.detector_, self._features = detector, features
+        self.views_: dict[str, float] = detector.info.get("views", {})
         self.penalty_: Any = detector.info.get("penalty")
         self.validation_: list[dict[str, Any]] = detector.info.get("validation", [])
 
@@ -592,4 +602,4 @@ def _fitted(
         for index, name in enumerate(names)
         for part, some in enumerate((group == index).nonzero()[:, 0].split(_BLOCK))
     ]
-    return recipe.fit(bins, pool, is_nested=False)
+    return recipe.fit(bins, pool)

@@ -62,7 +62,7 @@ def demo(folder: Path) -> None:
         f"              tactslip stream model={model} source={place} serve=true repeat=true\n"
         f"real          {real}\n"
         f"              tactslip setup {real}   looks at them, as at yours; then\n"
-        f"              tactslip train {real} recipe=pooled"
+        f"              tactslip train {real}"
     )
 
 

@@ -102,12 +102,10 @@ def _trained(
     with redirect_stdout(io.StringIO()):
         train(own, folder)
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    rows = metrics.get("validation")
-    if not rows:
+    if metrics.get("validated") is None:
         raise ValueError(
             f"recipe {recipe} has one choice and no validation; give several penalties"
         )
-    taken = next((row for row in rows if row.get("chosen")), None)
     detector = SlipDetector.load(folder / "detector.pt")
     rate, bin_samples = detector.pool.sample_rate_hz, detector.pool.bin_samples
     timing = time_in_fresh_process(folder / "detector.pt", config.calls)
@@ -117,7 +115,7 @@ def _trained(
             len(metrics["selected"]),
             precision,
             float(hop_ms),
-            float((taken or max(rows, key=lambda row: row["mean"]))["mean"]),
+            float(metrics["validated"]),
             1000 * detector.look_ahead / rate,
             1000 * bin_samples / rate,
             timing,

@@ -358,6 +358,11 @@ class FeaturePool(nn.Module):
             )
 
 
+def is_simple_of(pool: FeaturePool) -> Tensor:
+    """Which features of a pool are simple statistics of filtered bins, ``[F]``, bool."""
+    return torch.tensor([name.is_simple for name in pool.names])
+
+
 _NOISE_BINS = 128
 _MOVE = 1e-13  # of its size, by which each sample of noise is moved
 _LARGE = 1e-3  # of its spread, by which a feature may move with that

@@ -1,4 +1,6 @@
-"""Which features to keep: those that match, and the best by a t-test (paper section IV-D).
+"""Which features to keep: those that match, the best by a t-test, or the best together.
+
+The t-test is the paper's (section IV-D); forward selection is ours.
 
 Moments are gathered in passes over recordings and merge.
 """
@@ -195,3 +197,54 @@ def _attribute(hand: HandLayout, name: FeatureName, attribute: str) -> str:
     if attribute in ("kind", "finger"):
         return str(getattr(hand.channel(name.channel), attribute))
     return str(getattr(name, attribute))
+
+
+_LEFT = 1e-6  # of a column's square; what is below is explained by the columns before
+
+
+def forward_selection(
+    columns: Tensor, targets: Tensor, weights: Tensor, num: int, ridge: float = 1.0
+) -> list[int]:
+    """Columns that explain targets best together, best first: greedy least squares.
+
+    Each step takes the column that lowers the error of the ridge machine (with a free intercept) of
+    all taken so far the most, by orthogonalising the others to it. Ends early where nothing is left
+    to explain.
+
+    Args:
+        columns: of spread about 1.
+        targets: one or several of each bin.
+        weights: of bins.
+        num: of columns to take, at most.
+        ridge: added to the square of each column.
+
+    Shape:
+        - columns: ``[N, S]``, float64; targets: ``[N, R]``; weights: ``[N]``
+
+    Reference:
+        Chen, Billings and Luo (1989), International Journal of Control 50(5), 1873-1896.
+    """
+    root = weights.sqrt()[:, None]
+    share = weights / weights.sum()
+    x, t = (root * (each - share @ each) for each in (columns, targets))
+    square = x.square().sum(0) + ridge
+    whole, cross = square.clone(), x.mT @ t
+    taken, rows = list[int](), list[Tensor]()
+    for _ in range(min(num, columns.shape[1])):
+        gain = cross.square().sum(1) / square.clamp(min=1e-300)
+        gain = torch.where(square > _LEFT * whole, gain, -1.0)
+        gain[taken] = -1.0
+        best = int(gain.argmax())
+        if gain[best] <= 0:
+            break
+        row = x.mT @ x[:, best]
+        row[best] += ridge
+        if rows:
+            before = torch.stack(rows)
+            row -= before.mT @ before[:, best]
+        row /= square[best].sqrt()
+        taken.append(best)
+        rows.append(row)
+        cross -= row[:, None] * (cross[best] / row[best])
+        square -= row.square()
+    return taken

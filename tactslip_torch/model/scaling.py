@@ -85,13 +85,13 @@ class FeatureScaler(nn.Module):
         self.register_buffer("columns", None if columns is None else columns.clone())
 
     @classmethod
-    def fit(cls, features: Tensor, *, compress: bool = False, tail: float = 0.0) -> FeatureScaler:
+    def fit(cls, features: Tensor, *, compress: float = 0.0, tail: float = 0.0) -> FeatureScaler:
         """The scaler of training bins.
 
         Args:
             features: the bins, at least one, finite.
-            compress: by the median of ``|f|`` of each feature; its maximum where
-                the median is 0, 1 where that is 0 too.
+            compress: compression scale, as a part of the median of ``|f|`` of each feature (of its
+                maximum where the median is 0, of 1 where that is 0 too). 0: not compressed.
             tail: share of the bins at either end of a feature that may be clipped: the range
                 lies between the quantiles ``tail`` and ``1 - tail`` of the compressed values,
                 interpolated linearly as ``numpy.quantile`` does, and is that of all bins where
@@ -136,14 +136,14 @@ class FeatureScaler(nn.Module):
         return torch.where(is_constant, 0 * relative.clamp(0, 0), scaled)
 
 
-def _ranges_of(columns: Tensor, compress: bool, tail: float) -> tuple[Tensor, Tensor, Tensor]:
+def _ranges_of(columns: Tensor, compress: float, tail: float) -> tuple[Tensor, Tensor, Tensor]:
     """Minimum, maximum, compression scale of features ``[N, k]``, ``[k]`` each, with gradients."""
     ordered = ascending(columns.mT, len(columns))
     compression = torch.ones_like(ordered[:, 0])
     if compress:
         size = ascending(columns.mT.abs(), len(columns))
         middle, largest = _quantile(size, 0.5), size[:, -1]
-        compression = torch.where(
+        compression = compress * torch.where(
             middle > 0, middle, torch.where(largest > 0, largest, compression)
         )
         ordered = signed_log(ordered, compression[:, None])

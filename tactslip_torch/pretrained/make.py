@@ -41,7 +41,7 @@ SCENE = Scene(
     "wood", seed=7, session="sample", strokes=(Stroke(40.0, 40.0, pause_s=1.2),), tail_s=0.4
 )
 SETUP_REAL = ["--yes", "--units", "counts"]
-TRAIN_REAL = ["recipe=pooled", "baselines=false", "export=false"]
+TRAIN_REAL = ["baselines=false", "export=false"]
 _XELA = (
     "Recordings of two XELA uSkin fingers: github.com/imanlab/proactive-slip-control, data_set; "
     "converted to one table each."

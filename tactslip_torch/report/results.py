@@ -28,18 +28,18 @@ _NO_SPEED = {"0": "no slide", "nan": "speed not known"}
 BASELINES = {
     "best_pooled_number": "best pooled number",
     "logistic_regression": "logistic regression, same features",
-    "logistic_regression_simple": "logistic regression on mean, std, rms",
-    "random_forest_simple": "random forest on mean, std, rms",
+    "logistic_regression_simple": "logistic regression on simple statistics",
+    "random_forest_simple": "random forest on simple statistics",
 }
 """What baselines (``tactslip_torch.training.learner``) are called in tables."""
 _OF_SIMPLE = (
-    "try recipe.use=[channel], longer bins (labels.bin_ms) and recordings of more objects; where "
-    "it stays ahead, a classifier on mean, std and rms is the better one for this hand"
+    "try recipe.views=[simple], longer bins (labels.bin_ms) and recordings of more objects; where "
+    "it stays ahead, a classifier on simple statistics is the better one for this hand"
 )
 _ADVICE = {
-    "best_pooled_number": "try recipe.use=[pooled], few features (recipe.num_features=[10,30]) and "
-    "more recordings",
-    "logistic_regression": "try recipe.degree=[1], which is linear as well, and more recordings",
+    "best_pooled_number": "try recipe.views=[pooled], few features (recipe.num_features=20) and more "
+    "recordings",
+    "logistic_regression": "try recipe.views=[pooled], which is linear as well, and more recordings",
     "logistic_regression_simple": _OF_SIMPLE,
     "random_forest_simple": _OF_SIMPLE,
 }
@@ -466,28 +466,29 @@ def _counts(
 def _validation_table(metrics: _Metrics) -> str:
     """The mean balanced accuracy of choices and of their worst group.
 
-    Of a nested choice the best penalty of each structure, the chosen row, the worst group at its
-    own best threshold, and below what the choice itself scores on groups that it did not see.
+    Of views the best penalty and the chosen one of each, its weight, and below what is decided
+    without each group and evaluated on it.
 
     Args:
         metrics: the content of ``metrics.json``, with ``validation``.
     """
     choices = metrics["validation"]
-    is_nested = any("use" in row for row in choices)
     chosen = _chosen(choices)
-    best: dict[tuple[str, ...], Mapping[str, Any]] = {}
+    best: dict[str, Mapping[str, Any]] = {}
     for row in sorted(choices, key=lambda row: -row["mean"]):
         best.setdefault(_structure(row), row)
     rows: list[_Row] = []
-    shown = [row for row in choices if row in (chosen, best[_structure(row)])]
-    for row in shown if is_nested else choices:
+    has_views = any("view" in row for row in choices)
+    shown = [row for row in choices if row in chosen or row is best[_structure(row)]]
+    for row in shown if has_views else choices:
         scores = {group: s for group, s in row["balanced_accuracy"].items() if s is not None}
-        worst = min(scores, key=lambda group: scores[group])
-        titles = [*(["features"] if is_nested else []), "K", "kernel"]
-        cells: _Row = {"chosen": "*" if row is chosen else ""}
-        cells |= dict(zip(titles, _structure(row), strict=True))
+        worst = min(scores, key=lambda group: scores[group], default=None)
+        cells: _Row = {"chosen": "*" if row in chosen else ""}
+        if has_views:
+            cells |= {"view": row["view"], "weight": f"{row['weight']:.2f}"}
+        cells |= {"columns": row["num_features"], "degree": row["kernel"]["degree"]}
         cells |= {"C": f"{row['penalty']:g}", "validation %": style.percent(row["mean"])}
-        cells |= {"worst %": style.percent(scores[worst]), "group": worst}
+        cells |= {"worst %": style.percent(worst and scores[worst]), "group": worst or "-"}
         rows.append(cells)
     lines = [style.table(rows)]
     if nested := metrics.get("nested_validation"):
@@ -495,7 +496,7 @@ def _validation_table(metrics: _Metrics) -> str:
             f"{g} {style.percent(s)}" for g, s in nested["balanced_accuracy"].items()
         )
         lines.append(
-            "the choice itself, made without each group and evaluated on it: "
+            "what is decided without each group, evaluated on it: "
             f"{style.percent(nested['mean'])} % ({by_group})"
         )
     return style.marked(metrics["simulated"], *lines)
@@ -503,9 +504,7 @@ def _validation_table(metrics: _Metrics) -> str:
 
 @style.styled
 def validation_figure(metrics: _Metrics, path: str | Path) -> None:
-    """Write the balanced accuracy on left-out groups over C, one line for each structure.
-
-    Of a nested choice a colour is a kind of features, and a dash the rest.
+    """Write the balanced accuracy on left-out groups over C, one line for each view.
 
     Args:
         metrics: the content of ``metrics.json``, with ``validation``.
@@ -515,39 +514,33 @@ def validation_figure(metrics: _Metrics, path: str | Path) -> None:
     title = "Choice on training groups left out one at a time"
     figure = style.new_figure(8.4, 4.6, title, simulated=metrics["simulated"])
     axes = figure.subplots()
-    chosen = _chosen(choices)
     structures = list(dict.fromkeys(map(_structure, choices)))
-    is_nested = len({structure[:-2] for structure in structures}) > 1
-    kinds = ["".join(structure[:-2] if is_nested else structure) for structure in structures]
-    colours = style.colours_of(kinds)
-    rests = list(dict.fromkeys(structure[-2:] for structure in structures))
-    for kind, structure in zip(kinds, structures, strict=True):
-        rows = sorted(
-            (row for row in choices if _structure(row) == structure),
-            key=lambda row: float(row["penalty"]),
-        )
-        dash = ("-", "--", ":", "-.")[rests.index(structure[-2:]) % 4] if is_nested else "-"
-        penalties = [row["penalty"] for row in rows]
-        label = ", ".join([*structure[:-2], f"K = {structure[-2]}", structure[-1]])
-        means = [100 * row["mean"] for row in rows]
-        axes.plot(penalties, means, marker="o", ls=dash, color=colours[kind], label=label, lw=2)
-    axes.plot(chosen["penalty"], 100 * chosen["mean"], "*", color="black", ms=14, label="chosen")
+    colours = style.colours_of(structures)
+    for structure in structures:
+        rows = [row for row in choices if _structure(row) == structure]
+        rows.sort(key=lambda row: float(row["penalty"]))
+        penalties, means = zip(*((row["penalty"], 100 * row["mean"]) for row in rows), strict=True)
+        axes.plot(penalties, means, marker="o", color=colours[structure], label=structure, lw=2)
+    stars = [(row["penalty"], 100 * row["mean"]) for row in _chosen(choices)]
+    axes.plot(*zip(*stars, strict=True), "*", color="black", ms=14, ls="none", label="chosen")
     axes.set(xscale="log", xlabel="C", ylabel="balanced accuracy on the group left out, %")
-    axes.legend(handlelength=6.0, **style.UPPER_LEFT_OUTSIDE)
+    axes.legend(**style.UPPER_LEFT_OUTSIDE)
     style.save(figure, path)
 
 
-def _chosen(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """The row that was taken: the one that says so, else the first of the best mean."""
-    taken = next((row for row in rows if row.get("chosen")), None)
-    return taken or max(rows, key=lambda row: float(row["mean"]))
+def _chosen(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The rows that were taken: those that say so, else the first of the best mean."""
+    taken = [row for row in rows if row.get("chosen")]
+    return taken or [max(rows, key=lambda row: float(row["mean"]))]
 
 
-def _structure(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """What a choice is but for its penalty: kind of features if there are several, K, kernel."""
-    kernel = row["kernel"]
-    said = f"degree {kernel['degree']}, c {kernel['offset']:g}"
-    return (*([row["use"]] if "use" in row else []), str(row["num_features"] or "all"), said)
+def _structure(row: Mapping[str, Any]) -> str:
+    """What a choice is but for its penalty: view and weight, or degree and offset; columns."""
+    kernel, num = row["kernel"], row["num_features"] or "all"
+    if "view" in row:
+        weight = f"weight {row['weight']:.2f}" if row["weight"] else "dropped"
+        return f"{row['view']}, {weight}, {num} columns"
+    return f"degree {kernel['degree']}, c {kernel['offset']:g}, {num} columns"
 
 
 # Confounders: scenes that have motion without slip, or slip without motion ------------------------

@@ -3,9 +3,9 @@
 - ``best_pooled_number``: the statistic over channels of one descriptor that separates the classes
   best, and its threshold;
 - ``logistic_regression``: on the scaled columns of the detector;
-- ``logistic_regression_simple``: on mean, standard deviation and rms of each channel, and their
-  logarithms;
-- ``random_forest_simple``: on mean, standard deviation and rms of each channel.
+- ``logistic_regression_simple``: on the simple statistics of each channel (mean, standard deviation,
+  rms, range, mean absolute change), and their logarithms;
+- ``random_forest_simple``: on the simple statistics of each channel.
 
 ``best_pooled_number`` has the features that are made for the recipe.
 """
@@ -21,8 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.pool import FeaturePool, is_rounding
+from tactslip_torch.features.pool import FeaturePool, is_rounding, is_simple_of
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.training.bins import SampledBins
 from tactslip_torch.training.choice import has_both_classes
@@ -37,59 +36,6 @@ WIDE, WIDE_PENALTY = 256, 1e-2
 """With more columns than this, choosing would take longer than the detector's own validation: ``C``
 is fixed. On 672 pooled columns of the simulated hand 1e-3 to 1 differ by .3 points."""
 LOG_FLOOR = 1e-2  # of the training median of a magnitude, below which its logarithm levels out
-
-
-_BRANCHES = ("A1", "D1")
-_OF_SLOW, _OF_FAST = ("mean", "std", "energy"), ("mean", "std", "correlation")
-
-
-class SimpleStatistics:
-    """Mean, standard deviation and rms of each channel's filtered bin, out of pool features.
-
-    Of a fast channel the pool has wavelet branches alone. The first approximation and detail add up
-    to the bin, ``x = A1 + D1``, so ``mean(x) = mean(A1) + mean(D1)``, and with the correlation
-    ``r`` of each with ``x``, ``std(x) = r(A1) std(A1) + r(D1) std(D1)``.
-
-    Args:
-        pool: of the features.
-    """
-
-    def __init__(self, pool: FeaturePool) -> None:
-        self.num_samples = pool.bin_samples
-        names = self.names(pool)
-        self._slow = [pool.places(names["raw", d]) for d in _OF_SLOW]
-        self._fast = {d: [pool.places(names[b, d]) for b in _BRANCHES] for d in _OF_FAST}
-
-    @staticmethod
-    def names(pool: FeaturePool) -> dict[tuple[str, str], list[FeatureName]]:
-        """The features that are read, of all channels, by component and descriptor."""
-        names, hand = pool.hand.names, pool.hand
-        kinds = [("raw", d, hand.slow) for d in _OF_SLOW]
-        kinds += [(branch, d, hand.fast) for branch in _BRANCHES for d in _OF_FAST]
-        return {
-            (component, d): [FeatureName(names[c], component, "time", d) for c in channels]
-            for component, d, channels in kinds
-        }
-
-    def __call__(self, features: Tensor) -> Tensor:
-        """All means, then standard deviations, then rms, of slow channels and then of fast ones.
-
-        Standard deviations have ``n - 1`` in the denominator, rms ``n``.
-
-        Shape:
-            - features: ``[N, F]``, of the whole pool; output: ``[N, 3 C]``, float64, in the unit of
-              the samples
-        """
-        x, num = features.double(), self.num_samples
-        mean, std, energy = (x[:, places] for places in self._slow)
-        parts = {
-            d: torch.stack([x[:, places] for places in of]) for d, of in self._fast.items()
-        }  # [2, N, fast channels]
-        fast_mean = parts["mean"].sum(0)
-        fast_std = (parts["correlation"] * parts["std"]).sum(0).clamp(min=0.0)
-        fast_rms = (fast_mean.square() + fast_std.square() * ((num - 1) / num)).sqrt()
-        rms = (energy / num).sqrt()
-        return torch.cat([mean, fast_mean, std, fast_std, rms, fast_rms], 1)
 
 
 def _fit_regression(columns: Tensor, sample: SampledBins, *, with_logs: bool = False) -> Any:
@@ -206,8 +152,8 @@ class Baselines:
         from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # sklearn's own
 
         self._pooled = PooledNumber(pool, sample)  # refuses one class
-        self._statistics = SimpleStatistics(pool)
-        x = self._statistics(sample.features)
+        self._simple = is_simple_of(pool)
+        x = sample.features[:, self._simple].double()
         with warnings.catch_warnings(), threadpool_limits(1):  # small: threads would wait
             warnings.simplefilter("ignore")  # newton-cholesky falls back to lbfgs by itself
             self._others = {
@@ -229,7 +175,7 @@ class Baselines:
             - scaled: ``[N, K]``, columns of the detector
             - output: each ``[N]``, bool
         """
-        found, simple = {POOLED_NUMBER: self._pooled(features)}, self._statistics(features)
+        found, simple = {POOLED_NUMBER: self._pooled(features)}, features[:, self._simple].double()
         for name, made in self._others.items():
             x = (simple if name.endswith("_simple") else scaled.double()).numpy()
             predict = partial(_says_forest, made) if "forest" in name else made.predict

@@ -41,7 +41,6 @@ from tactslip_torch.native import BackendName, backend_of
 from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import Align, ChannelFilter, frame_lengths
 from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
-from tactslip_torch.training.baselines import SimpleStatistics
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule, training_origin
 from tactslip_torch.training.evaluation import merged_results
 from tactslip_torch.training.learner import SlipLearner
@@ -138,7 +137,6 @@ def _run_fold(experiment: Experiment, data: SlipDataModule, folder: Path) -> dic
         maker.channel_filter,
         experiment.recipe,
         with_baselines=experiment.with_baselines,
-        is_nested=not experiment.train_on_all,
     )
     trainer.fit(learner, datamodule=data)
     detector, started = learner.detector, time.perf_counter()
@@ -248,13 +246,8 @@ def feature_maker(
         arithmetic="native" if dtype == "float32" else "double",
         backend=backend,
     )
-    pool = pool.paper()  # a recipe takes no others
-    if recipe is not None and recipe.descriptors is not None:
-        wanted = {*recipe.descriptors, "range"}  # ranges tell which channels are silent
-        names = {name for name in pool.names if name.descriptor in wanted}
-        if with_baselines:
-            names.update(*SimpleStatistics.names(pool).values())
-        pool = pool.select([i for i, name in enumerate(pool.names) if name in names])
+    if recipe is not None:
+        pool = pool.select(recipe.wanted(pool, with_baselines).nonzero()[:, 0].tolist())
     return FeatureMaker(
         source,
         pool,

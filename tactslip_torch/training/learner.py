@@ -38,7 +38,6 @@ class SlipLearner(L.LightningModule):
         recipe: how the machine is made.
         detector: a finished one, to be evaluated only.
         with_baselines: fit baselines on the sample of training bins, to be evaluated beside.
-        is_nested: whether a nested validation also evaluates the recipe's choice itself.
 
     Attributes:
         detector: the result, after the training step.
@@ -62,7 +61,6 @@ class SlipLearner(L.LightningModule):
         detector: SlipDetector | None = None,
         *,
         with_baselines: bool = True,
-        is_nested: bool = True,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -73,7 +71,6 @@ class SlipLearner(L.LightningModule):
             self.recipe.allowed(pool)  # refused before any work
         self.detector = detector
         self.with_baselines = with_baselines
-        self.is_nested = is_nested
         self.baselines: Baselines | None = None
         self.metadata: dict[str, Any] = {}
         self.metrics: dict[str, Any] = {}
@@ -92,7 +89,7 @@ class SlipLearner(L.LightningModule):
     def training_step(self, batch: TrainingBins, batch_idx: int) -> None:
         """Fit to the training bins of this process and of those beside it."""
         started = time.perf_counter()
-        fit = self.recipe.fit(batch, self.pool, is_nested=self.is_nested, show=True)
+        fit = self.recipe.fit(batch, self.pool, show=True)
         fitted = time.perf_counter()
         self.seconds["fit"] = fitted - started
         self.log("penalty", fit.penalty, batch_size=1)

@@ -7,6 +7,7 @@ each reads its own recordings; the first one chooses and solves for all.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import logging
 import math
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from tactslip_torch.data.recording import PAPER_SCENE
 from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
-from tactslip_torch.features.pool import FeaturePool, is_rounding
+from tactslip_torch.features.pool import FeaturePool, is_rounding, is_simple_of
 from tactslip_torch.features.selection import (
     ClassMoments,
     checked_attributes,
@@ -39,6 +40,7 @@ from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, QuadraticForm
 from tactslip_torch.model.moments import SufficientStats
+from tactslip_torch.model.ridge import ClassSums
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import (
     add_over_processes,
@@ -51,79 +53,64 @@ from tactslip_torch.runtime import (
 )
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.bins import BinSample, RecordingBins, SampledBins, bin_keys
-from tactslip_torch.training.choice import (
-    CandidateBins,
+from tactslip_torch.training.choice import balanced_accuracy, platt_or_none
+from tactslip_torch.training.columns import VIEWS, FeatureSelection
+from tactslip_torch.training.views import (
+    THRESHOLDS,
     Choice,
-    FeatureSelection,
-    Structure,
-    balanced_accuracy,
-    choose_model,
-    platt_or_none,
+    View,
+    ViewBins,
+    ViewSettings,
+    choose_views,
+    dual_parts,
+    merged,
+    primal_parts,
 )
 
 log = logging.getLogger(__name__)
 
-FREE_CONSTANT = 1.0e6
-"""``c`` of degree 1, where it weighs the constant alone: so large, the penalty does not reach it.
-A penalised constant moves the threshold of a machine with few bins or a strong penalty."""
 POOLING = ("mean", "std", "min", "max")
 """Statistics over channels of the default."""
-MOST_DUAL_BINS = 2500
-"""Up to so many training bins a machine of degree 2 on all features is a candidate: it does not
-fold, so its cost grows with the bins."""
-MOST_SQUARE_BINS = 60_000
-"""Up to so many training bins degree 2 is a candidate beside degree 1: the 7,381 products of 120
-columns take some minutes of a processor for as many bins."""
 
 
 @dataclass(frozen=True)
-class _Plan:
-    """All that is decided before the solve."""
+class Fit:
+    """A machine, and how it was made.
+
+    Attributes:
+        selection: which features, how scaled; indices are those of the bins' features.
+        head: the machine.
+        imputation: scaled columns of lost channels.
+        sensing: spans of channels that work, of the training bins.
+        num_bins: how many bins are trained on; about, where classes are undersampled.
+        sample: of the training bins.
+        weights: of each bin by scene, non-slip and slip; of ``Paper`` the part that is trained on.
+        penalty: C; of several views that of the one that weighs most.
+        made: how it was made, for files, JSON-able.
+        validation: one row per candidate, with the balanced accuracy of each held-out group; those
+            that were taken have ``chosen``.
+        nested: balanced accuracy of the choice on groups that it did not see, if measured.
+        calibration: of held-out scores; ``None`` if there was nothing to choose.
+    """
 
     selection: FeatureSelection
-    kernel: Polynomial
-    penalty: float
+    head: QuadraticForm
     imputation: Tensor
     sensing: Sensing
     num_bins: int
     sample: SampledBins
     weights: dict[str, tuple[float, float]]
+    penalty: float
+    made: dict[str, Any]
     validation: list[dict[str, Any]]
     nested: dict[str, Any] | None = None
-
-
-@dataclass(frozen=True)
-class Fit(_Plan):
-    """A machine, and how it was made.
-
-    Attributes:
-        selection: which features, how scaled; indices are those of the bins' features.
-        kernel: of the machine.
-        penalty: the paper's ``C``.
-        imputation: mean of the scaled columns, both classes counting alike; for lost channels.
-        sensing: spans of channels that work, of the training bins.
-        num_bins: how many bins are trained on; about, where classes are undersampled.
-        sample: of the training bins.
-        weights: of each bin by scene, non-slip and slip; of ``Paper`` the part that is trained on.
-        validation: one row per candidate, with the balanced accuracy of each held-out group; the
-            one that was taken has ``chosen`` and the ``calibration`` of its held-out scores.
-        nested: balanced accuracy of the whole choice on groups that it did not see, if measured.
-        head: the machine.
-    """
-
-    head: QuadraticForm = field(kw_only=True)
-
-    @property
-    def calibration(self) -> dict[str, Any] | None:
-        """By held-out scores of the choice that was taken; None if there was nothing to choose."""
-        chosen = (row.get("calibration") for row in self.validation if row.get("chosen"))
-        return next(chosen, None)
+    calibration: dict[str, Any] | None = None
 
     @property
     def metadata(self) -> dict[str, Any]:
         """How the machine was made, for files, JSON-able."""
         return {
-            "kernel": self.kernel.to_dict(),
+            **self.made,
             "penalty": self.penalty if math.isfinite(self.penalty) else "inf",  # JSON has none
             "num_bins": self.num_bins,
             "validation": self.validation,
@@ -197,14 +184,13 @@ class _Recipe(ABC):
     def allowed(self, pool: FeaturePool) -> Tensor:
         """Which features of a pool may be selected, ``[F]``, bool.
 
-        Those that rounding decides, as some wavelets have them, never may, and neither may those
-        that the paper does not have.
+        Those that rounding decides, as some wavelets have them, never may.
 
         Raises:
             ValueError: if ``descriptors`` or ``feature_filter`` names what no feature has, or
                 nothing matches.
         """
-        mask = ~is_rounding(pool) & pool.is_paper
+        mask = ~is_rounding(pool) & self._offered(pool)
         if self.descriptors is not None:
             known = {*TIME_DESCRIPTORS, *SPECTRUM_DESCRIPTORS, "band_energy_ratio"}
             if unknown := [name for name in self.descriptors if name not in known]:
@@ -225,129 +211,91 @@ class _Recipe(ABC):
             )
         return mask
 
-    def fit(
-        self,
-        bins: Iterable[RecordingBins],
-        pool: FeaturePool,
-        *,
-        is_nested: bool = True,
-        show: bool = False,
-    ) -> Fit:
+    def _offered(self, pool: FeaturePool) -> Tensor:
+        """Features that the recipe may take at all, ``[F]``, bool."""
+        return pool.is_paper
+
+    def wanted(self, pool: FeaturePool, with_baselines: bool = True) -> Tensor:
+        """The features of a whole pool that training reads, ``[F]``, bool."""
+        mask, is_simple = pool.is_paper, is_simple_of(pool)
+        if self.descriptors is not None:
+            wanted = {*self.descriptors, "range"}  # ranges tell which channels are silent
+            mask &= torch.tensor([name.descriptor in wanted for name in pool.names])
+        return mask | is_simple if with_baselines else mask
+
+    @abstractmethod
+    def fit(self, bins: Iterable[RecordingBins], pool: FeaturePool, *, show: bool = False) -> Fit:
         """Choose a machine and fit it.
 
         Args:
             bins: training bins; they are gone through twice.
             pool: of their features, whole or a selection.
-            is_nested: whether a nested validation also evaluates the choice itself.
             show: progress bars.
 
         Raises:
             ValueError: if a class is absent, or a solve fails.
         """
-        statistics = self._statistics(pool)
-        with one_thread():  # a recording is small: threads would mostly wait
-            for some in bins:
-                statistics.update(some)
-        statistics = _merged(statistics)
-        plan: _Plan = from_first_process(lambda: self._plan(statistics, pool, is_nested, show))
-        size, degree, kept = plan.selection.size, plan.kernel.degree, {}
-        sums = None  # where bins are fewer than products, which may have no place in memory
-        if plan.num_bins > plan.kernel.num_monomials(size):
-            sums = SufficientStats(size, degree=degree)
-        with one_thread():
-            for some in bins:
-                part = self._weighted(plan, some)
-                if sums is None:
-                    kept[some.name] = part
-                else:
-                    sums.update(some.name, *part)
-        if sums is None:
-            kept = dict(itertools.chain(*(own.items() for own in gathered(kept))))
-        else:
-            add_over_processes(sums.sums, sums.count)
 
-        def solve() -> QuadraticForm:
-            if sums is not None:
-                return sums.solve(plan.penalty, plan.kernel.offset, balance="none")
-            columns = zip(*(kept[name] for name in sorted(kept)), strict=True)
-            return fit_machine(TrainingBins(*map(torch.cat, columns)), plan.penalty, plan.kernel)
-
-        return Fit(**vars(plan), head=from_first_process(solve))
-
-    @abstractmethod
-    def _statistics(self, pool: FeaturePool) -> BinSample | _Statistics:
-        """What the first look at training bins gathers."""
-
-    @abstractmethod
-    def _plan(self, statistics: Any, pool: FeaturePool, is_nested: bool, show: bool) -> _Plan:
-        """Choose by what was gathered."""
-
-    @abstractmethod
-    def _weighted(self, plan: _Plan, bins: RecordingBins) -> tuple[Tensor, Tensor, Tensor]:
-        """Scaled bins ``[N, K]``, classes and weights ``[N]`` that the machine is fitted to."""
-
-    def _planned(
+    def _sensing(
         self,
         pool: FeaturePool,
         sample: SampledBins,
         selection: FeatureSelection,
-        weight: Tensor,
         alive_fraction: float,
-        **chosen: Any,
-    ) -> _Plan:
-        """A plan of what was chosen, and of what a selection learns of the sample besides."""
+    ) -> Sensing:
+        """Of the channels that a selection reads."""
         channels = pool.hand.names
         used = sorted({channels.index(pool.names[i].channel) for i in selection.selected})
         num_counted = len(counted_channels(pool.hand, used, selection.pooling is not None))
-        sensing = Sensing.fit(
+        return Sensing.fit(
             SpanFeatures(pool.hand, pool.names, pool.bin_samples)(sample.features),
             self.min_alive or least_alive(num_counted, alive_fraction),
             most_stuck_samples(pool.sample_rate_hz, sample.longest_run),
         )
-        imputation = _class_mean(selection(sample.features), sample.is_slip, weight)
-        return _Plan(selection, imputation=imputation, sensing=sensing, sample=sample, **chosen)
 
 
 @dataclass(frozen=True)
 class General(_Recipe):
-    """Features of each channel, pooled over channels, or both, chosen by nested validation.
+    """Views of the same bins, a machine for each, and the mean of their scores (``views.py``).
 
-    Features are compressed by a signed logarithm and scaled by quantiles; classes weigh alike.
+    Classes weigh alike. Penalties, weights of views and threshold are chosen by leaving out groups
+    of a sample; the machines of degree 1 are then fitted to all training bins.
 
     Args:
         name: for tables.
-        penalties: the paper's ``C``. Of several values of this, ``use``, ``num_features`` and
-            ``degree`` validation chooses one; a grid that ends at its edge is extended.
+        penalties: values of C, with kernels whose mean diagonal is 1: small ones are the strong
+            penalties. Of several validation chooses one for each view.
         sample_bins: bins of each group and class that choices are made by.
         feature_filter: only features that match are used, such as ``{"kind": "SG", "descriptor":
             "mean"}``: of each attribute a value, or one of several.
-        descriptors: those that may be used; by default none that jumps with the last digit or needs
-            sorting; ``None``: all.
+        descriptors: those that the views ``channel`` and ``pooled`` may use; by default none that
+            jumps with the last digit or needs sorting; ``None``: all.
         min_alive: channels that must be alive for a valid decision, of the fast ones in use (of all
             in use, where nothing is pooled). ``None``: as many as the second copies have at least;
             half where nothing is pooled.
-        use: ``"channel"`` features, ``"pooled"`` ones or ``"both"``.
-        num_features: how many are selected, best first; ``None`` takes all.
-        degree: of the polynomial kernel, 1 or 2; of both, only 1 is a candidate for more than
-            60,000 training bins.
+        views: some of ``simple`` (statistics of the bin of each channel), ``channel`` (descriptors
+            of its branches and spectra) and ``pooled`` (statistics of those over channels).
+            Validation drops those that do no good.
+        num_features: columns of each view, the best together; ``None`` takes all.
+        threshold: part of the validated shift of the threshold that is applied, ``zero``, ``half``
+            or ``full``.
         pooling: statistics over the channels of a kind, as ``features.pooling`` has them.
-        tolerance: choices within so much of the best balanced accuracy are as good: of them, the
-            simplest machine with the strongest penalty is taken.
+        tolerance: of balanced accuracy, within which a stronger penalty is as good.
         scene_weights: weight of a kind of scene beside the paper's: of all its bins of a class
             together, as a part of the protocol's bins of that class. Scenes that are not named
             count bin by bin.
-        drop_channels: of every recording a second copy is trained on, from which up to this part
-            of the channels is left out at random. For pooled features.
+        drop_channels: of every bin the view ``pooled`` is trained on a second copy, from which up
+            to this part of the channels is left out at random.
 
     Raises:
         ValueError: for an unknown name or a number out of range.
     """
 
     name: str = "general"
-    penalties: float | Sequence[float] = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
-    use: str | Sequence[str] = ("channel", "pooled", "both")
-    num_features: int | Sequence[int | None] | None = (None, 120)
-    degree: int | Sequence[int] = (1, 2)
+    penalties: float | Sequence[float] = (0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
+    views: str | Sequence[str] = VIEWS
+    num_features: int | None = None
+    threshold: str = "zero"
     descriptors: Sequence[str] | None = (
         "mean",
         "range",
@@ -363,109 +311,181 @@ class General(_Recipe):
         "band_energy_ratio",
     )
     pooling: str | Sequence[str] | None = POOLING
-    tolerance: float = 0.005
+    tolerance: float = 0.002
     scene_weights: Mapping[str, float] = field(default_factory=dict)
     drop_channels: float = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for use in _several(self.use):
-            check_choice("recipe.use", use, ("channel", "pooled", "both"))
-        for num in _several(self.num_features):
-            if num is not None:
-                check_number("recipe.num_features", num, whole=True)
+        if not self.views_in_order:
+            raise ValueError(f"recipe.views must be some of {', '.join(VIEWS)}, got none")
+        for view in _several(self.views):
+            check_choice("recipe.views", view, VIEWS)
+        check_choice("recipe.threshold", self.threshold, tuple(THRESHOLDS))
+        if self.num_features is not None:
+            check_number("recipe.num_features", self.num_features, whole=True)
         for name in ("tolerance", "drop_channels"):
             if not 0 <= _numbers(f"recipe.{name}", getattr(self, name))[0] < 1:
                 raise ValueError(f"recipe.{name} must lie in [0, 1), got {getattr(self, name)!r}")
+        if not math.isfinite(self.penalties_ascending[-1]):
+            raise ValueError("recipe.penalties must be finite with recipe=general")
         for weight in self.scene_weights.values():
             check_number("recipe.scene_weights", weight)
-        if set(_several(self.use)) != {"channel"} and self.pooling is None:
+        if "pooled" in self.views_in_order and self.pooling is None:
             raise ValueError(
-                "recipe.use=pooled needs statistics over channels; set features.pooling=[mean, std]"
+                "recipe.views=[pooled] needs statistics over channels; set features.pooling=[mean, "
+                "std]"
             )
-        _ = self.kernels  # their own checks
 
     @property
-    def kernels(self) -> tuple[Polynomial, ...]:
-        """Kernels to choose from, the lower degree first."""
-        offset = PAPER_KERNEL.offset
-        return tuple(
-            Polynomial(degree, FREE_CONSTANT if degree == 1 else offset)
-            for degree in sorted(_several(self.degree))
-        )
+    def views_in_order(self) -> tuple[str, ...]:
+        """The views, each once, in the order of ``VIEWS``."""
+        return tuple(view for view in VIEWS if view in _several(self.views))
 
-    def _statistics(self, pool: FeaturePool) -> BinSample:
-        return BinSample(self.sample_bins)
+    def wanted(self, pool: FeaturePool, with_baselines: bool = True) -> Tensor:
+        """As ``_Recipe`` has it."""
+        return super().wanted(pool, with_baselines or "simple" in self.views_in_order)
 
-    def _weighted(self, plan: _Plan, bins: RecordingBins) -> tuple[Tensor, Tensor, Tensor]:
-        selection, is_slip = plan.selection, bins.is_slip
-        z, of_class = selection(bins.features), torch.tensor(plan.weights[bins.scene]).double()
-        if self.drop_channels == 0 or selection.pooling is None:
-            return z, is_slip, of_class[is_slip.long()]
-        is_lost = _dropped(bins.name, len(selection.pooling.hand), self.drop_channels)
-        fewer = selection(bins.features, is_lost.expand(len(z), -1))
-        return torch.cat([z, fewer]), is_slip.repeat(2), of_class[is_slip.long()].repeat(2) / 2
-
-    def _plan(self, statistics: BinSample, pool: FeaturePool, is_nested: bool, show: bool) -> _Plan:
-        sample = statistics.bins()
-        allowed = self.allowed(pool)
-        weights = self.weights(sample)
-        table = torch.tensor([weights[scene] for scene in sample.scene_names])
-        weight = sample.weight * table.double()[sample.scene, sample.is_slip.long()]
-        candidates = CandidateBins(sample, weight, pool, allowed, self.pooling)
-        num_bins = round(float(sample.weight.sum()))
-        structures, penalties = self._structures(num_bins), self.penalties_ascending
-        if (num_whole := len(candidates.whole_groups())) > 1:
-            how = {"is_nested": is_nested, "show": show}
-            choice = choose_model(candidates, structures, penalties, self.tolerance, **how)
-        else:
-            choice = Choice(structures[0], penalties[len(penalties) // 2])
-            log.warning(
-                "no recordings are left out to choose by: that needs two groups with slip and "
-                "non-slip, got %d of %s; C=%g is taken",
-                num_whole,
-                ", ".join(candidates.group_names),
-                choice.penalty,
-            )
-        selection = candidates.select(choice.structure)
-        is_pooled = selection.pooling is not None and self.drop_channels > 0
-        fraction = 1 - self.drop_channels if is_pooled else 0.5
-        return self._planned(
-            pool,
-            sample,
-            selection,
-            weight,
-            fraction,
-            kernel=choice.structure.kernel,
-            penalty=choice.penalty,
-            num_bins=num_bins,
-            weights=weights,
-            validation=choice.rows,
-            nested=choice.nested,
-        )
-
-    def _structures(self, num_bins: int) -> list[Structure]:
-        """All structures for a machine of so many training bins, the simplest first.
+    def allowed_by_view(self, pool: FeaturePool) -> dict[str, Tensor]:
+        """Which features each view may use, ``[F]``, bool.
 
         Raises:
-            ValueError: if there is none.
+            ValueError: as ``allowed``, or if a view has none.
         """
-        sizes = sorted(_several(self.num_features), key=lambda size: (size is not None, size or 0))
-        may_grow = num_bins <= MOST_DUAL_BINS
-        may_square = num_bins <= MOST_SQUARE_BINS or len(self.kernels) == 1
-        found = [
-            Structure(use, size, kernel)
-            for size, kernel, use in itertools.product(sizes, self.kernels, _several(self.use))
-            if kernel.degree == 1
-            or may_grow
-            or (may_square and size is not None and not self.scene_weights)
-        ]
-        if not found:
+        described, simple = self.allowed(pool), is_simple_of(pool)
+        if self.feature_filter is not None:
+            simple &= matching(pool.hand, pool.names, self.feature_filter)
+        masks = {view: simple if view == "simple" else described for view in self.views_in_order}
+        if none := [view for view, mask in masks.items() if not bool(mask.any())]:
             raise ValueError(
-                "no candidate is left: degree 2 needs recipe.num_features and no scene_weights; "
-                "add degree 1"
+                f"the view {none[0]!r} of recipe.views has no feature that matches "
+                "recipe.feature_filter; leave it out, or ask for others"
             )
-        return found
+        return masks
+
+    def settings(self) -> ViewSettings:
+        """How views are chosen."""
+        return ViewSettings(
+            self.views_in_order,
+            self.penalties_ascending,
+            self.tolerance,
+            self.threshold,
+            self.num_features,
+            self.pooling,
+        )
+
+    def fit(self, bins: Iterable[RecordingBins], pool: FeaturePool, *, show: bool = False) -> Fit:
+        """As ``_Recipe`` has it."""
+        found = BinSample(self.sample_bins)
+        with one_thread():  # a recording is small: threads would mostly wait
+            for some in bins:
+                found.update(some)
+        sample = _merged(found).bins()
+        weights = self.weights(sample)
+        chosen: tuple[ViewBins, Choice] = from_first_process(
+            lambda: self._chosen(sample, weights, pool, show)
+        )
+        drawn, choice = chosen
+        kept = [view for view, share in zip(choice.views, choice.weights, strict=True) if share]
+        sums = {view.name: ClassSums(2, view.selection.size) for view in kept if view.degree == 1}
+        with one_thread():
+            for some in bins:
+                self._add(sums, kept, some, weights, pool)
+        for each in sums.values():
+            add_over_processes(*each.tensors)
+
+        def solve() -> tuple[FeatureSelection, QuadraticForm]:
+            parts = {}
+            for view, penalty in zip(choice.views, choice.penalties, strict=True):
+                if view.name in sums:
+                    parts[view.name] = primal_parts(sums[view.name], penalty)
+                elif view in kept:
+                    parts[view.name] = dual_parts(view, drawn, penalty)
+            selection, (head,) = merged(choice, parts)
+            return selection, head
+
+        selection, head = from_first_process(solve)
+        assert selection.fill is not None  # of views
+        fraction = 1 - self.drop_channels if selection.pooling and self.drop_channels else 0.5
+        shares = dict(zip((v.name for v in choice.views), choice.weights, strict=True))
+        largest = max(range(len(choice.views)), key=choice.weights.__getitem__)
+        return Fit(
+            selection=selection,
+            head=head,
+            imputation=selection.fill,
+            sensing=self._sensing(pool, sample, selection, fraction),
+            num_bins=round(float(sample.weight.sum())),
+            sample=sample,
+            weights=weights,
+            penalty=choice.penalties[largest],
+            made={
+                "views": shares,
+                "penalties": dict(zip(shares, choice.penalties, strict=True)),
+                "threshold_shift": choice.shift,
+                "validated": None if math.isnan(choice.accuracy) else choice.accuracy,
+            },
+            validation=list(choice.rows),
+            nested=choice.nested,
+            calibration=next(iter(choice.calibration), None),
+        )
+
+    def choose(self, bins: ViewBins, pool: FeaturePool, show: bool = False) -> Choice:
+        """Views, penalties and weights by bins in memory, of two classes or more."""
+        return choose_views(bins, pool, self.allowed_by_view(pool), self.settings(), show)
+
+    def second_copies(self, name: str, num_bins: int, pool: FeaturePool) -> Tensor | None:
+        """Channels that second copies of bins are without, ``[N, C]``, bool; ``None``: no copies.
+
+        Args:
+            name: of their recording; that of a name is always the same.
+            num_bins: how many.
+            pool: of the hand.
+        """
+        if self.drop_channels == 0:
+            return None
+        return _dropped(name, num_bins, len(pool.hand), self.drop_channels)
+
+    def _chosen(
+        self,
+        sample: SampledBins,
+        weights: Mapping[str, tuple[float, float]],
+        pool: FeaturePool,
+        show: bool,
+    ) -> tuple[ViewBins, Choice]:
+        table = torch.tensor([weights[scene] for scene in sample.scene_names]).double()
+        weight = sample.weight * table[sample.scene, sample.is_slip.long()]
+        sample = sample.joined()
+        drawn = ViewBins(
+            sample.features,
+            sample.is_slip.long(),
+            sample.group,
+            sample.group_names,
+            weight / weight.mean(),
+            sample.stratum,
+            self.second_copies("sample", len(sample.is_slip), pool),
+        )
+        return drawn, self.choose(drawn, pool, show)
+
+    def _add(
+        self,
+        sums: Mapping[str, ClassSums],
+        views: Sequence[View],
+        bins: RecordingBins,
+        weights: Mapping[str, tuple[float, float]],
+        pool: FeaturePool,
+    ) -> None:
+        """Add the bins of a recording to the sums of the views of degree 1."""
+        labels = bins.is_slip.long()
+        weight = torch.tensor(weights[bins.scene]).double()[labels]
+        for view in views:
+            if view.name not in sums:
+                continue
+            u, own, each = view.units(bins.features), labels, weight
+            is_lost = self.second_copies(bins.name, len(u), pool)
+            if is_lost is not None and view.name == "pooled":
+                u = torch.cat([u, view.units(bins.features, is_lost)])
+                own, each = labels.repeat(2), weight.repeat(2) / 2
+            sums[view.name].update(u, own, each)
 
     def weights(self, sample: SampledBins) -> dict[str, tuple[float, float]]:
         """The weight of each bin of a scene, non-slip and slip, with both classes balanced.
@@ -542,22 +562,41 @@ class Paper(_Recipe):
             )
         return mask
 
-    def _statistics(self, pool: FeaturePool) -> _Statistics:
-        return _Statistics(len(pool.names), self.sample_bins)
-
-    def _weighted(self, plan: _Plan, bins: RecordingBins) -> tuple[Tensor, Tensor, Tensor]:
-        is_slip, fractions = bins.is_slip, torch.tensor(plan.weights[PAPER_SCENE]).double()
-        kept = bin_keys(bins.name, len(is_slip)) < fractions[is_slip.long()]
-        z = plan.selection(bins.features[kept])
-        return z, is_slip[kept], torch.ones(len(z), dtype=torch.float64)
-
-    def _plan(
-        self, statistics: _Statistics, pool: FeaturePool, is_nested: bool, show: bool
-    ) -> _Plan:
+    def fit(self, bins: Iterable[RecordingBins], pool: FeaturePool, *, show: bool = False) -> Fit:
+        """As ``_Recipe`` has it."""
+        statistics = _Statistics(len(pool.names), self.sample_bins)
+        with one_thread():  # a recording is small: threads would mostly wait
+            for some in bins:
+                statistics.update(some)
+        statistics = _merged(statistics)
         sample = statistics.sample.bins()
         counts = _class_counts(sample)
         fractions = min(counts) / counts[0], min(counts) / counts[1]
         weight = sample.weight * torch.tensor(fractions).double()[sample.is_slip.long()]
+        selection = self._selected(statistics, pool)
+        trained = TrainingBins(selection(sample.features), sample.is_slip, weight)
+        penalty, rows = from_first_process(lambda: self._penalty(trained, sample, show))
+        head = self._solved(bins, selection, fractions, penalty, 2 * min(counts))
+        chosen = (row.get("calibration") for row in rows if row.get("chosen"))
+        return Fit(
+            selection=selection,
+            head=head,
+            imputation=_class_mean(trained.features, sample.is_slip, weight),
+            sensing=self._sensing(pool, sample, selection, 0.5),
+            num_bins=2 * min(counts),
+            sample=sample,
+            weights={PAPER_SCENE: fractions},
+            penalty=penalty,
+            made={
+                "kernel": self.kernel.to_dict(),
+                "validated": max((float(row["mean"]) for row in rows), default=None),
+            },
+            validation=rows,
+            calibration=next(chosen, None),
+        )
+
+    def _selected(self, statistics: _Statistics, pool: FeaturePool) -> FeatureSelection:
+        """The features that the t-test ranks highest, scaled by their range."""
         places = self.allowed(pool).nonzero()[:, 0]
         size = min(self.num_features, len(places))
         if size < self.num_features:
@@ -566,21 +605,43 @@ class Paper(_Recipe):
             )
         best = places[rank_features(t_scores(statistics.moments)[places], size)].tolist()
         scaler = FeatureScaler(statistics.minimum[best].double(), statistics.maximum[best].double())
-        selection = FeatureSelection(tuple(best), scaler)
-        trained = TrainingBins(selection(sample.features), sample.is_slip, weight)
-        penalty, rows = self._penalty(trained, sample, show)
-        return self._planned(
-            pool,
-            sample,
-            selection,
-            weight,
-            0.5,
-            kernel=self.kernel,
-            penalty=penalty,
-            num_bins=2 * min(counts),
-            weights={PAPER_SCENE: fractions},
-            validation=rows,
-        )
+        return FeatureSelection(tuple(best), scaler)
+
+    def _solved(
+        self,
+        bins: Iterable[RecordingBins],
+        selection: FeatureSelection,
+        fractions: tuple[float, float],
+        penalty: float,
+        num_bins: int,
+    ) -> QuadraticForm:
+        """The machine of an undersampled set of bins, drawn by their keys."""
+        size, kept = selection.size, dict[str, tuple[Tensor, ...]]()
+        sums = None  # where bins are fewer than products, which may have no place in memory
+        if num_bins > self.kernel.num_monomials(size):
+            sums = SufficientStats(size, degree=self.kernel.degree)
+        with one_thread():
+            for some in bins:
+                share = torch.tensor(fractions).double()[some.is_slip.long()]
+                mine = bin_keys(some.name, len(some.is_slip)) < share
+                z, is_slip = selection(some.features[mine]), some.is_slip[mine]
+                if sums is None:
+                    kept[some.name] = z, is_slip
+                else:
+                    sums.update(some.name, z, is_slip, torch.ones(len(z), dtype=torch.float64))
+        if sums is None:
+            kept = dict(itertools.chain(*(own.items() for own in gathered(kept))))
+        else:
+            add_over_processes(sums.sums, sums.count)
+
+        def solve() -> QuadraticForm:
+            if sums is not None:
+                return sums.solve(penalty, self.kernel.offset, balance="none")
+            columns = zip(*(kept[name] for name in sorted(kept)), strict=True)
+            return fit_machine(TrainingBins(*map(torch.cat, columns)), penalty, self.kernel)
+
+        head: QuadraticForm = from_first_process(solve)
+        return head
 
     def _penalty(
         self, bins: TrainingBins, sample: SampledBins, show: bool
@@ -673,11 +734,13 @@ class _Statistics:
         self.maximum = torch.maximum(self.maximum, maximum) + 0.0
 
 
-def _dropped(recording: str, num: int, largest: float) -> Tensor:
-    """Channels that the second copy of a recording is without, ``[num]``, bool."""
-    keys = bin_keys(f"{recording}, channels", num + 1)
-    order = keys[1:].argsort()[: math.floor(float(keys[0]) * (math.floor(largest * num) + 1))]
-    return torch.zeros(num, dtype=torch.bool).index_fill(0, order, True)
+def _dropped(name: str, num_bins: int, num_channels: int, largest: float) -> Tensor:
+    """Channels that the second copies of bins are without, up to a part, ``[N, C]``, bool."""
+    seed = int.from_bytes(hashlib.blake2b(f"{name}, channels".encode(), digest_size=7).digest())
+    generator = torch.Generator().manual_seed(seed)
+    most = math.floor(largest * num_channels) + 1
+    num = (torch.rand(num_bins, 1, generator=generator) * most).floor()
+    return torch.rand(num_bins, num_channels, generator=generator).argsort(1).argsort(1) < num
 
 
 def _class_mean(z: Tensor, is_slip: Tensor, weight: Tensor) -> Tensor:
