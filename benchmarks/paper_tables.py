@@ -405,7 +405,12 @@ def forward_order(z: Tensor, is_slip: Tensor, weights: Tensor, num: int) -> Tens
 
 
 def _component_order(z: Tensor, is_slip: Tensor, dims: int, steps: int) -> Tensor:
-    """Features by the norm of their weights in scikit-learn's neighbourhood components."""
+    """Features by the norm of their weights in scikit-learn's neighbourhood components.
+
+    All features are scaled by one number, so that the mean squared distance of two bins is 2: at
+    larger ones a bin's nearest neighbour has all the weight, and no step is taken.
+    """
+    z = z / z.var(0).sum().sqrt()
     analysis = NeighborhoodComponentsAnalysis(n_components=dims, max_iter=steps, random_state=0)
     analysis.fit(z.numpy(), is_slip.numpy())
     norms = torch.from_numpy(analysis.components_).square().sum(0)
