@@ -312,6 +312,7 @@ BAD_SETTINGS = [
     (lambda: evidence_of(hop=0), "at least every 5 ms, got 0 samples .* at 2000 Hz"),
     (lambda: evidence_of(fast_compression=(1.0,) * 3), "expected 10 positive and finite scales"),
     (lambda: kept(dict, hand_of("F")), "expected 12 columns of evidence, got 72"),
+    (lambda: kept(lambda plain: plain.update(quadratic=[[1.0]])), "part of 72 columns, got 1"),
     (lambda: kept(lambda plain: plain.pop("mains_hz")), "of this version: 'mains_hz'"),
 ]
 

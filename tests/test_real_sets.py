@@ -2,8 +2,16 @@
 
 import numpy as np
 import pytest
+from sklearn.metrics import balanced_accuracy_score
 
-from benchmarks.real import left_out_scores, word
+from benchmarks.real import (
+    FLOOR,
+    SimpleStatistics,
+    balanced_accuracy,
+    confusions,
+    left_out_scores,
+    word,
+)
 from benchmarks.real_sets import RealSet, biotacsp, main, osu, read_set
 
 
@@ -105,6 +113,26 @@ def test_a_method_never_sees_the_group_that_it_scores(small):
     assert seen == [(names - {left}, 8, 7) for left in sorted(names)]
     np.testing.assert_array_equal(scores[:, 0], small.X[:, 0, 0])
     assert len(cpu_s) == 3
+
+
+@pytest.mark.parametrize("words", [None, ["low", "none", "high"]])
+def test_balanced_accuracy_is_scikit_learns(small, words, rng):
+    """Of a score at the threshold 0, and of the largest of three."""
+    of = small if words is None else small._replace(y=np.tile(words, 4))
+    scores = rng.standard_normal((12, 1 if words is None else 3))
+    decided = scores[:, 0] >= 0 if words is None else scores.argmax(1)
+    counts = confusions(of, scores)
+    assert counts.shape[0] == 6
+    expected = balanced_accuracy_score(of.classes()[1], decided)
+    assert balanced_accuracy(counts.sum(0)[None, None]).item() == pytest.approx(expected)
+
+
+def test_simple_statistics_of_a_ramp_with_floors_of_training_windows():
+    ramp = np.arange(4, dtype=np.float32)[None, None]
+    found = SimpleStatistics(with_logs=True).fit(np.stack([ramp[0], 3 * ramp[0]])).transform(ramp)
+    spread = np.array([np.sqrt(1.25), np.sqrt(3.5), 3.0, 1.0])
+    logs = np.log(spread + FLOOR * 2 * spread)  # the median of 1 and 3 is 2
+    np.testing.assert_allclose(found[0], [1.5, *spread, *logs])
 
 
 @pytest.mark.parametrize(

@@ -383,6 +383,8 @@ class OnsetClassifier:
         scaler = FeatureScaler(tensor("minimum"), tensor("maximum"))
         if len(scaler.minimum) != evidence.num_columns or num != evidence.num_columns:
             raise ValueError(f"expected {evidence.num_columns} columns of evidence, got {num}")
+        if len(quadratic) not in (0, num):
+            raise ValueError(f"expected a quadratic part of {num} columns, got {len(quadratic)}")
         return cls(evidence, scaler, head, float(plain["threshold"]), float(plain["lead_s"]))
 
 
