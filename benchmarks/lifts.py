@@ -48,7 +48,7 @@ _LAG_S = 0.01  # of the actuator behind its delay: a first-order lag
 _MARGIN = 1.5  # of the force that the controller takes over the one that the object should need
 _SLIDES_MM_S = 2.0  # of a pad
 _RECENT_S = 0.25
-_FILMED_HOPS, _FILM_SIZE = 10, (260, 170)  # a frame each 50 ms; height and width
+_FILMED_HOPS, _FILM_SIZE = 10, (230, 150)  # a frame each 50 ms; height and width
 _PAUSE_S = 0.02  # of a slide that goes on
 
 
@@ -370,7 +370,7 @@ class _Camera:
 
 
 def film(path: Path, lift: Lift, detector: SlipDetector) -> None:
-    """Write a moving picture of a lift without and with a reflex, at half of its speed."""
+    """Write a moving picture of a lift without and with a reflex, at half of its speed (WebP)."""
     fast = list(detector.pool.hand.fast)
     taken = [_Camera(), _Camera()]
     triggers: list[Trigger] = [Never(), Listening(detector)]
@@ -384,7 +384,7 @@ def film(path: Path, lift: Lift, detector: SlipDetector) -> None:
     ]
     frames = []
     for place in range(len(taken[0].images)):
-        figure = style.new_figure(6.4, 3.4)
+        figure = style.new_figure(6.4, 3.4, "One lift, half speed", simulated=True)
         grid = figure.add_gridspec(3, 3, width_ratios=[1, 1, 1.6])
         for column, title in enumerate(("no reflex", "tightened by the alarm")):
             axes = figure.add_subplot(grid[:, column])
@@ -399,11 +399,12 @@ def film(path: Path, lift: Lift, detector: SlipDetector) -> None:
             axes.set_title(title, fontsize=8, loc="left")
             axes.set(xlim=(_LIFT_S, _END_S), ylim=(0, 1.05 * max(map(max, both))))
             axes.tick_params(labelsize=7, labelbottom=row == 2)
+            axes.set_xlabel("s" if row == 2 else "", fontsize=7)
         figure.savefig(file := BytesIO(), format="png", dpi=100)
         frames.append(Image.open(file).convert("RGB"))
     length_ms = round(2e3 * _FILMED_HOPS * HOP * STEP_S)
     first, *others = frames
-    options: dict[str, Any] = {"duration": length_ms, "loop": 0, "quality": 40, "method": 6}
+    options: dict[str, Any] = {"duration": length_ms, "loop": 0, "quality": 25, "method": 6}
     first.save(path, save_all=True, append_images=others, **options)
 
 
@@ -411,7 +412,7 @@ if __name__ == "__main__":
     os.environ.setdefault("MUJOCO_GL", "egl")  # draws without a screen
     parser = argparse.ArgumentParser(description="A moving picture of one lift (WebP, simulated).")
     parser.add_argument("out", type=Path, help="the file to write")
-    parser.add_argument("--number", type=int, default=0, help="of the lift")
+    parser.add_argument("--number", type=int, default=12, help="of the lift")
     parser.add_argument("--kind", default="gradual", choices=get_args(Kind), help="of its load")
     given = parser.parse_args()
     film(given.out, Lift(given.number, given.kind), SlipDetector.pretrained("paper24-sim"))
