@@ -1043,14 +1043,15 @@ class HandSignals:
         normal_n, friction_n = (self._share[:, part] * force for force in (normal_n, friction_n))
         travel_mm = self._travel_mm + np.cumsum(slip_mm_s, axis=1) / scene.sample_rate_hz
         self._travel_mm = travel_mm[:, -1:]
-        root_load, slides = np.sqrt(normal_n), slip_mm_s > 0
-        levels_v = (np.where(slides, v, 0.0) for v in _levels_v(scene, grasp, slip_mm_s))
-        friction_v, texture_v = (root_load * level_v for level_v in levels_v)
-        friction_v = grasp.mu_ratio * grasp.mu_s * friction_v
-        lines = _lines(scene, grasp, slip_mm_s, travel_mm)
-        lines = np.einsum("epl,plek->ek", self._mixture, lines)
-        noises = self._sliding[:, :, part]
-        bands = _sliding_v(scene, grasp, friction_v, texture_v, noises, lines)
+        root_load, noises = np.sqrt(normal_n), self._sliding[:, :, part]
+        bands = np.zeros_like(noises)
+        if (slides := slip_mm_s > 0).any():
+            levels_v = (np.where(slides, v, 0.0) for v in _levels_v(scene, grasp, slip_mm_s))
+            friction_v, texture_v = (root_load * level_v for level_v in levels_v)
+            friction_v = grasp.mu_ratio * grasp.mu_s * friction_v
+            lines = _lines(scene, grasp, slip_mm_s, travel_mm)
+            lines = np.einsum("epl,plek->ek", self._mixture, lines)
+            bands += _sliding_v(scene, grasp, friction_v, texture_v, noises, lines)
         bands += root_load * self._local_v[:, :, part]
         bands[0] += scene.dynamics.release_v_per_n * inertia_n
         steadiness = np.minimum(slip_mm_s / _REFERENCE_MM_S, 1.0)
