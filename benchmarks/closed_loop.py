@@ -44,8 +44,8 @@ class ClosedLoop(Benchmark):
     Args:
         lifts: how many; a twelfth of them are loaded with 1.4 times the limit, shown apart.
         delays_ms: of the actuator.
-        calibration: lifts of seen materials without slip, with a grip raised by nobody's alarm,
-            in which neither energy nor CUSUM may reach its threshold.
+        calibration: lifts of lighter objects of seen materials, which do not slip, with a grip
+            raised by nobody's alarm, in which neither energy nor CUSUM may reach its threshold.
         detector: shipped one or file, trained on ``SEEN_MATERIALS``.
     """
 
@@ -172,7 +172,9 @@ def _thresholds(detector: SlipDetector, num: int) -> dict[str, float]:
     """What energy and CUSUM reach at most, in lifts without slip."""
     energy, cusum = -np.inf, -np.inf
     for number in range(num):
-        lift = Lift(10_000 + number, "steady", materials=SEEN_MATERIALS, tightens=True)
+        lift = Lift(
+            10_000 + number, "steady", mass=(0.4, 0.6), materials=SEEN_MATERIALS, tightens=True
+        )
         of_energy = Energy(list(detector.pool.hand.fast))
         of_cusum = Listening(detector, _by_cusum(detector, np.inf))
         for trigger in (of_energy, of_cusum):

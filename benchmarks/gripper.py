@@ -54,7 +54,8 @@ def _model_xml(shape: str, mass_kg: float) -> str:
     size = ".02 .02 .06" if shape == "box" else ".02 .06"
     return f"""<mujoco><option timestep="{STEP_S}" cone="elliptic" impratio="1000" solver="Newton"
         noslip_iterations="5" iterations="30" tolerance="1e-10" integrator="implicitfast"/>
-      <visual><headlight ambient=".4 .4 .4"/></visual>
+      <visual><headlight ambient=".5 .5 .5"/></visual>
+      <asset><texture type="skybox" builtin="flat" rgb1="1 1 1" width="8" height="8"/></asset>
       <worldbody><light pos="0 -.3 .6" dir="0 .4 -1"/><camera name="side" {_CAMERA}/>
         <geom type="plane" size=".3 .3 .01" pos="0 0 .04" friction=".1 .005 .0001"/>
         <body><joint name="lift" type="slide" axis="0 0 1" damping="1"/>
