@@ -54,7 +54,8 @@ def _model_xml(shape: str, mass_kg: float) -> str:
     size = ".02 .02 .06" if shape == "box" else ".02 .06"
     return f"""<mujoco><option timestep="{STEP_S}" cone="elliptic" impratio="1000" solver="Newton"
         noslip_iterations="5" iterations="30" tolerance="1e-10" integrator="implicitfast"/>
-      <visual><headlight ambient=".4 .4 .4"/></visual>
+      <visual><headlight ambient=".5 .5 .5"/></visual>
+      <asset><texture type="skybox" builtin="flat" rgb1="1 1 1" width="8" height="8"/></asset>
       <worldbody><light pos="0 -.3 .6" dir="0 .4 -1"/><camera name="side" {_CAMERA}/>
         <geom type="plane" size=".3 .3 .01" pos="0 0 .04" friction=".1 .005 .0001"/>
         <body><joint name="lift" type="slide" axis="0 0 1" damping="1"/>
@@ -116,17 +117,18 @@ class Gripper:
         self._lift = int(self.model.jnt_dofadr[self.model.joint("lift").id])
         self._slip_mm_s = np.zeros(2 * _ROWS)
 
-    def step(self, grip_n: float, lift_m: float, pull_n: float) -> Pads:
+    def step(self, grip_n: float, lift_m: float, pull_n: float, tap_n: float = 0.0) -> Pads:
         """One step of ``STEP_S``.
 
         Args:
             grip_n: of each finger.
             lift_m: height of the gripper above where it began.
             pull_n: that draws the object down beside its weight.
+            tap_n: that pushes it aside, along its faces that are free.
         """
         model, data = self.model, self.data
         data.ctrl[:] = grip_n, grip_n, lift_m
-        data.xfrc_applied[self._object, 2] = -pull_n
+        data.xfrc_applied[self._object, 1:3] = tap_n, -pull_n
         fall = np.exp(-((self._slip_mm_s / self._stribeck_mm_s) ** 2))
         ratio = self._mu_ratio + (1.0 - self._mu_ratio) * fall
         model.pair_friction[:, :2] = (self._mu_s * ratio)[:, None]

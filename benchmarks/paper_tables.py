@@ -96,7 +96,10 @@ class PaperTables(Benchmark):
     """
 
     title = "The paper's choices, varied"
-    about = "bin width, number of features, and how they are ranked, on the SIMULATED hand"
+    about = (
+        "bin width, number of features, and how they are ranked, on the SIMULATED hand, with the "
+        "paper's recipe and split by cycle, half of the paper's cycles"
+    )
     page = "docs/reproduction.md"
     drawn: ClassVar = {"trial.png": "_trial", "signals.png": "_signals"}
     charts: ClassVar = {"": [("Width of bins",), ("Number of features, test bins",)]}
@@ -108,42 +111,48 @@ class PaperTables(Benchmark):
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     widths_ms: tuple[int, ...] = (10, 20, 30, 50, 100, 200)
     sizes: tuple[int, ...] = (10, 20, 40, 60, 120, 240, 400, 600)
-    rows: int = 400
+    rows: int = 240
     choice_rows: int = 100
-    nca_rows: tuple[int, ...] = (50, 100, 200)
+    nca_rows: tuple[int, ...] = (25, 50, 100)
     nca_dims: int = 20
     nca_steps: int = 50
-    overrides: tuple[str, ...] = ()
+    overrides: tuple[str, ...] = ("data.cycles=14",)
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Every width, ranking and number on every seed; both figures on the first."""
         given = ["+exp=unseen4", "recipe=paper", *self.overrides, *job.overrides]
         given += ["features.memory_gib=1", f"data._target_={__spec__.name}.{Loaded.__name__}"]
-        found = []
+        seeds = list[dict[str, Any]]()
         for seed in self.seeds:
+            config = composed("train", [*given, f"seed={seed}"])
+            source: Loaded = instantiate(config.data, _convert_="all")
             folder = job.folder if seed == self.seeds[0] else None
-            make = partial(self._of_seed, [*given, f"seed={seed}"], folder)
-            found.append(resumed(job.folder / f"{seed}.json", [repr(self), *given], make))
-        return {"folder": str(job.folder), "seeds": found}
+            widths, more = list[dict[str, Any]](), dict[str, Any]()
+            for width_ms in self.widths_ms:
+                make = partial(self._of_width, config, source, width_ms, folder)
+                path, made_by = job.folder / f"{seed}-{width_ms}.json", [repr(self), *given]
+                widths.append(resumed(path, made_by, make))
+                more |= widths[-1].pop("more")
+            seeds.append({"widths": widths} | more)
+        return {"folder": str(job.folder), "seeds": seeds}
 
-    def _of_seed(self, given: Sequence[str], folder: Path | None) -> dict[str, Any]:
-        """Widths, then numbers of features at the paper's width; figures into a folder."""
-        config, widths, numbers = composed("train", given), [], {}
-        source: Loaded = instantiate(config.data, _convert_="all")
-        for width_ms in self.widths_ms:
-            with _data(config, source, width_ms) as data:
-                order, pool = _t_order(data, NUM_FEATURES), data.maker.pool
-                bins = _Sampled.of(data, round(self.rows * WIDTH_MS / width_ms), order)
-                machine = bins.machine(torch.arange(NUM_FEATURES), self.choice_rows)
-                about = {"width": width_ms, "level": pool.level, "pool": len(pool.names)}
-                widths.append(about | {"bins": len(bins.z)} | bins.scores(machine))
-                if width_ms == WIDTH_MS:
-                    numbers = self._numbers(data)
-                    if folder is not None:
-                        decide = partial(machine.says, columns=order)
-                        numbers["trial"] = _trial(data, decide, folder / "trial.png")
-                        _draw_signals(data.maker, folder / "signals.png")
-        return {"widths": widths, **numbers}
+    def _of_width(
+        self, config: DictConfig, source: Loaded, width_ms: int, folder: Path | None
+    ) -> dict[str, Any]:
+        """Bins of a width; at the paper's also numbers of features, and figures into a folder."""
+        with _data(config, source, width_ms) as data:
+            order, pool = _t_order(data, NUM_FEATURES), data.maker.pool
+            bins = _Sampled.of(data, round(self.rows * WIDTH_MS / width_ms), order)
+            machine = bins.machine(torch.arange(NUM_FEATURES), self.choice_rows)
+            about = {"width": width_ms, "level": pool.level, "pool": len(pool.names)}
+            found, more = {"bins": len(bins.z)} | bins.scores(machine), dict[str, Any]()
+            if width_ms == WIDTH_MS:
+                more = self._numbers(data)
+                if folder is not None:
+                    decide = partial(machine.says, columns=order)
+                    more["trial"] = _trial(data, decide, folder / "trial.png")
+                    _draw_signals(data.maker, folder / "signals.png")
+        return about | found | {"more": more}
 
     def _numbers(self, data: SlipDataModule) -> dict[str, Any]:
         """Balanced accuracy by ranking and number of features, and what a ranking costs."""
@@ -196,13 +205,18 @@ class PaperTables(Benchmark):
             curve = _by_value([seed["widths"] for seed in numbers["seeds"]], "width", role)
             _curve(by_width, curve, "paper's recipe", style.BLUE)
             by_width.axvline(WIDTH_MS, color=style.GREY, linestyle=":")
-            by_width.set(xlabel="width of a bin, ms", title=f"{ROLES[role]}, balanced accuracy, %")
+            by_width.set(
+                xlabel="width of a bin, ms; dotted: the paper's",
+                title=f"{ROLES[role]}, balanced accuracy, %",
+            )
             looks = zip(RANKINGS.items(), style.PALETTE, strict=False)
             for (ranking, words), colour in looks:
                 _curve(by_size, _of_ranking(numbers["seeds"], ranking, role), words, colour)
             by_size.axvline(NUM_FEATURES, color=style.GREY, linestyle=":")
-            by_size.set(xlabel="number of features", title=ROLES[role])
-        panels[0, 1].legend()
+            by_size.set(xlabel="number of features; dotted: the paper's", title=ROLES[role])
+        handles, labels = panels[0, 1].get_legend_handles_labels()
+        shade = Patch(color=style.GREY, alpha=0.25)
+        panels[0, 1].legend([*handles, shade], [*labels, "least to largest over seeds"])
 
 
 @contextmanager
@@ -315,7 +329,10 @@ class _Sampled(NamedTuple):
         members = [few.sample.group == group for group in range(self.num_groups)]
 
         def validation(penalty: float) -> float:
-            says = held_out.at(penalty).scores >= 0
+            try:
+                says = held_out.at(penalty).scores >= 0
+            except ValueError:  # close to singular: no candidate
+                return -1.0
             return mean(balanced_accuracy(says[of], few.is_slip[of]) or 0.0 for of in members)
 
         penalty = max(Paper().penalties_ascending, key=validation)
@@ -393,7 +410,12 @@ def forward_order(z: Tensor, is_slip: Tensor, weights: Tensor, num: int) -> Tens
 
 
 def _component_order(z: Tensor, is_slip: Tensor, dims: int, steps: int) -> Tensor:
-    """Features by the norm of their weights in scikit-learn's neighbourhood components."""
+    """Features by the norm of their weights in scikit-learn's neighbourhood components.
+
+    All features are scaled by one number, so that the mean squared distance of two bins is 2: at
+    larger ones a bin's nearest neighbour has all the weight, and no step is taken.
+    """
+    z = z / z.var(0).sum().sqrt()
     analysis = NeighborhoodComponentsAnalysis(n_components=dims, max_iter=steps, random_state=0)
     analysis.fit(z.numpy(), is_slip.numpy())
     norms = torch.from_numpy(analysis.components_).square().sum(0)
@@ -447,7 +469,8 @@ def _sizes(seeds: Sequence[Report], role: str) -> Table:
     ]
     note = (
         f"SIMULATED; balanced accuracy, mean (least to largest) over {len(seeds)} seeds; machines "
-        f"of degree 2 on {_bins(seeds, 'forward')} bins, as many of each material and class."
+        f"of degree 2 on {_bins(seeds, 'forward')} bins, as many of each material and class, C by "
+        "materials left out."
     )
     return Table(rows, note)
 
@@ -487,8 +510,9 @@ def _choices(seeds: Sequence[Report]) -> Table:
         what = f"ranking by t-test ({size} features)"
         rows.append(_choice(what, "", RANKINGS["t-test"], at, role))
     note = (
-        "SIMULATED; balanced accuracy, mean (least to largest) over seeds. Confirmed: no other "
-        f"value is better in every seed. As good: within {AS_GOOD} points of the best mean."
+        "SIMULATED; balanced accuracy, mean (least to largest) over seeds. Confirmed: yes, if it "
+        "has the best mean; no, if others are better in every seed (named); else open. As good: "
+        f"within {AS_GOOD} points of the best mean."
     )
     return Table(rows, note)
 
@@ -496,7 +520,7 @@ def _choices(seeds: Sequence[Report]) -> Table:
 def _choice(
     what: str, unit: str, taken: Any, found: Mapping[Any, Sequence[float]], role: str
 ) -> dict[str, Any]:
-    """A choice, the best one, and whether that is better in every seed."""
+    """A choice, the best value, and in how many seeds that is better."""
     taken = taken if taken in found else next(iter(found))
     means = {value: mean(of) for value, of in found.items()}
     best = max(means, key=means.__getitem__)
@@ -505,6 +529,12 @@ def _choice(
         value: [a - b for a, b in zip(of, found[taken], strict=True)] for value, of in found.items()
     }
     better = [f"{value}{unit}" for value, of in gained.items() if min(of) > 0]
+    num_better = sum(gain > 0 for gain in gained[best])
+    verdict = f"open: {best}{unit} is better in {num_better} of {len(gained[best])} seeds"
+    if better:
+        verdict = f"no: {', '.join(better)}"
+    elif best == taken:
+        verdict = "yes"
     return {
         "the paper's choice": what,
         "evaluated on": ROLES[role],
@@ -512,7 +542,7 @@ def _choice(
         "best": f"{best}{unit}",
         "best - the choice, points": _spread(gained[best], "+"),
         "first that is as good": f"{as_good}{unit}",
-        "confirmed": f"no: better in every seed {', '.join(better)}" if better else "yes",
+        "confirmed": verdict,
     }
 
 

@@ -353,7 +353,7 @@ class OnsetClassifier:
             **self.evidence.to_dict(),
             "minimum": self.scaler.minimum.tolist(),
             "maximum": self.scaler.maximum.tolist(),
-            "quadratic": self.head.quadratic.tolist(),
+            "quadratic": self.head.matrix.tolist(),
             "linear": self.head.linear.tolist(),
             "constant": float(self.head.constant),
             "threshold": self.threshold,
@@ -515,7 +515,7 @@ def _engine_of(classifier: OnsetClassifier, most_lost: int) -> OnsetEngine:
     width = (scaler.maximum - scaler.minimum).numpy()
     slope = np.divide(2.0, width, out=np.zeros_like(width), where=width > 0)
     offset = np.where(width > 0, -1.0, 0.0) - slope * scaler.minimum.numpy()
-    quadratic = np.empty((0, 0)) if head.is_linear else head.quadratic.numpy()
+    quadratic = np.empty((0, 0)) if head.is_linear else head.matrix.numpy()
     return OnsetEngine(
         fast=evidence.hand.fast,
         slow=evidence.hand.slow,
