@@ -37,9 +37,9 @@ _OF_SIMPLE = (
     "it stays ahead, a classifier on simple statistics is the better one for this hand"
 )
 _ADVICE = {
-    "best_pooled_number": "try recipe.views=[pooled], few features (recipe.num_features=20) and more "
-    "recordings",
-    "logistic_regression": "try recipe.views=[pooled], which is linear as well, and more recordings",
+    "best_pooled_number": "try recipe.views=[pooled], few columns (recipe.num_features=20) and "
+    "more recordings",
+    "logistic_regression": "try recipe.views=[pooled], linear as well, and more recordings",
     "logistic_regression_simple": _OF_SIMPLE,
     "random_forest_simple": _OF_SIMPLE,
 }

@@ -3,8 +3,8 @@
 - ``best_pooled_number``: the statistic over channels of one descriptor that separates the classes
   best, and its threshold;
 - ``logistic_regression``: on the scaled columns of the detector;
-- ``logistic_regression_simple``: on the simple statistics of each channel (mean, standard deviation,
-  rms, range, mean absolute change), and their logarithms;
+- ``logistic_regression_simple``: on the simple statistics of each channel (mean, standard
+  deviation, rms, range, mean absolute change), and their logarithms;
 - ``random_forest_simple``: on the simple statistics of each channel.
 
 ``best_pooled_number`` has the features that are made for the recipe.

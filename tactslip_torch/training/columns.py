@@ -89,7 +89,8 @@ class FeatureSelection:
         used, place = columns.unique(return_inverse=True)
         parts = (scaler.minimum, scaler.maximum, scaler.compression)
         minimum, maximum, compression = (p if p is None else p[index] for p in parts)
-        assert minimum is not None and maximum is not None
+        assert minimum is not None
+        assert maximum is not None
         own = FeatureScaler(minimum, maximum, compression, place)
         pooling, names = None, tuple(self.names[i] for i in used.tolist() if self.pooling is None)
         if self.pooling is not None:

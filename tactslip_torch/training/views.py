@@ -35,14 +35,14 @@ log = logging.getLogger(__name__)
 DEGREE = {"simple": 1, "channel": 2, "pooled": 1}
 SHARPNESS = 40.0
 """Of the weights of views, per unit of balanced accuracy."""
-NO_WORSE = 0.001
-"""A view is dropped where the balanced accuracy without it is at most so much lower."""
+NO_WORSE, LITTLE = 0.001, 0.1
+"""A view of less weight is dropped where balanced accuracy without it is at most so much lower."""
 MOST_KERNEL_BINS, MOST_CHOICE_BINS = 4000, 2000
 """A machine of degree 2 is fitted to so many bins, drawn by group and class, and chosen by so
 many."""
 MOST_FACTORS, LEFT_OUT = 32, 0.01
-"""Of a quadratic part at most so many factors are kept, the fewest that leave out so small a part of
-its spread."""
+"""Of a quadratic part so many factors are kept at most: the fewest that leave out so small a part
+of its spread."""
 _NO_SPREAD = 1e-9
 THRESHOLDS = {"zero": 0.0, "half": 0.5, "full": 1.0}
 """Part of the validated shift of the threshold that is applied."""
@@ -401,12 +401,10 @@ def _decided(helds: Sequence[Tensor], labels: Tensor, known: Tensor, tolerance: 
     def accuracy(some: set[int]) -> float:
         return _accuracy(_mean_score(helds, of(_shares(best, some)))[known], labels[known])
 
-    while len(kept) > 1:
-        without = {view: accuracy(kept - {view}) for view in kept}
-        worst = max(without, key=without.__getitem__)
-        if without[worst] < accuracy(kept) - NO_WORSE:
+    for view in sorted(kept, key=weights.__getitem__):
+        if weights[view] >= LITTLE or accuracy(kept - {view}) < accuracy(kept) - NO_WORSE:
             break
-        kept.remove(worst)
+        kept.remove(view)
         weights = _shares(best, kept)
     score = _mean_score(helds, of(weights))[known]
     shift = _best_shift(score[:, 0], labels[known]) if score.shape[1] == 1 else 0.0
