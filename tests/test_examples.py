@@ -35,7 +35,7 @@ def onset_run(paper, tmp_path_factory):
     detector, folder = copy.deepcopy(paper.detector), tmp_path_factory.mktemp("run")
     channels = detector.pool.hand.to_rows()
     source = SimulatedRecordings(cycles=1, materials=["M1", "M6"], channels=channels)
-    onset, _, _ = OnsetTraining()(source, source.ids, 0)
+    onset, _, _ = OnsetTraining(head="quadratic", epochs=1)(source, source.ids, 0)
     bins = AlarmSettings.of(detector)
     score = onset.score_recording(source.load(source.ids[0]).samples)
     joint = replace(bins, onset=replace(onset, threshold=float(score.quantile(0.995))))
