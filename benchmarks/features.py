@@ -1,4 +1,4 @@
-"""The whole pool of features beside its peers: ``python -m benchmarks.features``.
+"""All of the paper's features beside its peers: ``python -m benchmarks.features``.
 
 Seconds and errors of all features of simulated bins, by the package, by NumPy with PyWavelets, and
 by MiniRocket and TSFEL, which make other features of the same bins and so have no error.
@@ -21,6 +21,8 @@ from benchmarks.subjects import labelled_bins
 from benchmarks.tables import Table, times
 from benchmarks.timing import interleaved, on_threads
 from tactslip_torch import FeaturePool, HandLayout
+from tactslip_torch.features.pool import Arithmetic
+from tactslip_torch.native import BackendName
 
 HAND = HandLayout.paper24()
 
@@ -58,7 +60,7 @@ class Features(Benchmark):
         ways: dict[str, tuple[int, Callable[[], Any]]] = {
             "tactslip_torch, float64": (len(bins), partial(_pool(torch.float64), bins)),
             "tactslip_torch, float32": (len(bins), partial(_pool(torch.float32), bins.float())),
-            "reference, float64": (len(few), partial(FeaturePool(HAND, backend="torch"), few)),
+            "reference, float64": (len(few), partial(_pool(torch.float64, "torch"), few)),
             "NumPy and PyWavelets, batched": (len(few), partial(arrays.features, few.numpy(), 14)),
             "aeon MiniRocket, transform": (len(windows), partial(rocket.transform, windows)),
             "TSFEL, all features": (1, partial(others.tsfel_features(), few[0].numpy())),
@@ -88,13 +90,15 @@ def _error(found: Tensor, reference: Tensor) -> float:
     size = torch.maximum(reference[:num].abs(), reference.std(0, correction=0))
     distance = (found[:num].double() - reference[:num]).abs()
     relative = torch.where(distance == 0, 0.0, distance / size).nan_to_num(0.0, posinf=0.0)
-    steps = [str(name).endswith(("entropy", "mode")) for name in FeaturePool(HAND).names]
+    steps = [name.descriptor in ("entropy", "mode") for name in _pool(torch.float64).names]
     is_step = torch.tensor(steps)
     return float(max(relative[:, ~is_step].max(), relative[:, is_step].quantile(0.99)))
 
 
-def _pool(dtype: torch.dtype) -> FeaturePool:
-    return FeaturePool(HAND, arithmetic="native" if dtype == torch.float32 else "double")
+def _pool(dtype: torch.dtype, backend: BackendName = "auto") -> FeaturePool:
+    """The paper's features, which the peers have too."""
+    arithmetic: Arithmetic = "native" if dtype == torch.float32 else "double"
+    return FeaturePool(HAND, arithmetic=arithmetic, backend=backend).paper()
 
 
 if __name__ == "__main__":

@@ -350,7 +350,10 @@ class Benchmark(ABC):
             "machine": machine,
             "versions": versions(self.libraries),
             "settings": asdict(asked),
-            "overrides": [re.sub(r"root=.*", "root=FOLDER", text) for text in given.overrides],
+            "overrides": [
+                re.sub(r"root=.*", "root=FOLDER", text) if "=" in text else "FOLDER"
+                for text in given.overrides
+            ],
             "numbers": numbers,
         }
         keep_numbers(report, path)

@@ -107,7 +107,7 @@ class Latency(Benchmark):
     def _rocket(self) -> Score:
         bins, is_slip = labelled_bins(self.recordings)
         say("latency: MiniRocket")
-        scores = others.fit(bins.numpy(), is_slip.numpy(), num_kernels=self.num_kernels).score
+        scores = others.fit(bins.numpy(), is_slip.numpy(), num_kernels=self.num_kernels)
         filters = ChannelFilter(WINDOW_LENGTHS)
         return lambda samples: scores(filters.valid(samples.double()).float().numpy())
 

@@ -1,743 +1,392 @@
-"""Real recordings, ours and baselines: ``python -m benchmarks.real data.root=FOLDER``.
+"""Real recordings, ours and baselines: ``python -m benchmarks.real FOLDER``.
 
-On the BioTac SP set (``+exp=biotacsp_dos``), each object left out in turn. In one run, on the same
-windows and folds: the machine of three recipes, logistic regression on the features of the first,
-logistic regression and a random forest on simple statistics, and MiniRocket and MultiRocketHydra
-with ridge. All that is fitted or chosen is so inside the fold. Writes docs/real_data.md.
+Takes every set of ``benchmarks.real_sets`` in the folder. Each group is left out in turn, and all
+that is fitted or chosen is so on the others. Writes docs/real_data.md.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import cached_property, partial
-from itertools import groupby, islice, product, starmap
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from statistics import median
-from typing import Any, ClassVar, NamedTuple
+from statistics import mean
+from tempfile import TemporaryDirectory
+from time import process_time
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from omegaconf import DictConfig, OmegaConf
+from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.linear_model import LogisticRegression
-from sklearn.metrics import balanced_accuracy_score, roc_auc_score, roc_curve
+from sklearn.metrics import roc_auc_score
 from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.pipeline import Pipeline, make_pipeline
-from sklearn.preprocessing import FunctionTransformer, StandardScaler
+from sklearn.preprocessing import StandardScaler
+from torch import Tensor
 
-from benchmarks.harness import Benchmark, Job
+from benchmarks.deployment import host
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.peers import others
-from benchmarks.subjects import composed
-from benchmarks.tables import Report, Table, chart, limits, lines, listed, number, percent
-from benchmarks.timing import interleaved, on_threads, paired_ratio, timed
-from tactslip_torch import SlipDetector, StreamingDetector
-from tactslip_torch.commands.detect import detect
-from tactslip_torch.data.file_recordings import FileRecordings
-from tactslip_torch.data.recording import RecordingId, RecordingSource
-from tactslip_torch.data.splits import Split
-from tactslip_torch.runtime import bar
-from tactslip_torch.training.alarm import DebouncedAlarm
-from tactslip_torch.training.bins import RecordingBins
-from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.experiment import feature_maker
-from tactslip_torch.training.recipe import Recipe
+from benchmarks.real_sets import RealSet, read_set
+from benchmarks.tables import Report, Table, mean_sd, times
+from benchmarks.timing import interleaved, on_threads
+from tactslip_torch import SlipClassifier
+from tactslip_torch.onset.events import Bootstrap
+from tactslip_torch.report import style
 
 Array = NDArray[Any]
-RECIPES = ("general", "paper")
-"""Of ours; the first is the one that limits are for."""
-SCENES = {
-    "n": "north",
-    "s": "south",
-    "e": "east",
-    "w": "west",
-    "cw": "clockwise",
-    "aw": "anticlockwise",
-    "t": "stable touch",
-}
-"""What the set's folders mean."""
-_AIMS, _TIMES_FASTER = {"balanced_accuracy": 0.952, "auc": 0.99}, 10.0
-COVERAGE = 0.95
-HOP_MS = 40.0
-_AT_ONCE = 64
-_CORNER = 0.3
+OURS, CONSTANT = "SlipClassifier", "larger class"
+SEEDED = ("random forest", "MiniRocket and ridge")
+DRAWN = {"recordings": "recordings", "within": "recordings of each group"}
+FLOOR = 1e-3
+"""Added to a statistic before its logarithm is taken, in medians of training windows."""
+
+Scorer = Callable[[Array], Array]
+"""Scores ``[N]`` of windows ``[N, C, T]``, at least 0 for the class."""
+Fit = Callable[[RealSet, Array, int], Scorer]
+"""To training windows, to which of them are of the class, ``[N]``, bool, and a seed."""
 
 
 @dataclass(frozen=True)
 class Real(Benchmark):
-    """Every method on every object, left out of everything.
+    """Every method on every set, each group left out of everything.
 
     Args:
-        objects: how many at most; ``None`` for all.
-        each: recordings of each object and scene at most; ``None`` for all.
-        inner: groups that the training objects of a fold make to choose from, at most.
-        rocket_seeds: of the kernels of MiniRocket; MultiRocketHydra, which is slow, has the first.
-        rocket_kernels: of MiniRocket.
-        multi_rocket_kernels: of MultiRocket; it makes eight features of each.
-        hydra_groups: of Hydra's kernels, eight each, for every dilation.
-        trees: of a forest.
-        leaves: windows in a leaf of a tree at least, to choose from.
-        regression_penalties: C of logistic regression, to choose from.
+        groups: of a set at most; ``None`` for all.
+        every: one of so many windows is taken, drawn at random.
+        seeds: of the methods that draw at random.
+        inner: parts that the training groups are put into to choose, at most.
+        penalties: C of logistic regression to choose from, strongest first.
+        trees: of the forest; a tenth of them when its leaves are chosen.
+        leaves: windows in a leaf at least, to choose from.
+        kernels: of MiniRocket.
         draws: of the bootstrap.
         rounds: of the clock.
-        batch: windows that are scored at once.
     """
 
-    title = "Real recordings: slip against stable touch on a BioTac SP"
-    about = "slip against stable touch on a real BioTac SP, each object left out in turn"
-    page, is_page, is_simulated = "docs/real_data.md", True, False
-    libraries = ("aeon",)
-    quick = (
-        "objects=3 each=1 inner=2 rocket_seeds=[0,1] rocket_kernels=168 multi_rocket_kernels=84 "
-        "hydra_groups=4 trees=5 leaves=[1] regression_penalties=[0.1,1.0] draws=50 rounds=2 batch=8"
+    title = "Real recordings, objects left out (development data)"
+    about = (
+        "slip or not in real windows, each object left out in turn; `biotacsp` and `osu` are "
+        "development data of the default recipe"
     )
-    drawn: ClassVar = {"*.png": "_watched"}
+    page, is_page, is_simulated = "docs/real_data.md", True, False
+    libraries = ("aeon", "onnxruntime")
+    quick = (
+        "groups=3 every=2 seeds=[0,1] inner=2 penalties=[0.1,1.0] trees=10 leaves=[4,1] kernels=84 "
+        "draws=50 rounds=2"
+    )
     charts: ClassVar = {"": ()}
-    objects: int | None = None
-    each: int | None = None
+    groups: int | None = None
+    every: int = 1
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     inner: int = 5
-    rocket_seeds: tuple[int, ...] = (0, 1, 2)
-    rocket_kernels: int = 10_000
-    multi_rocket_kernels: int = 6_250
-    hydra_groups: int = 64
-    trees: int = 100
-    leaves: tuple[int, ...] = (1, 4)
-    regression_penalties: tuple[float, ...] = (0.001, 0.01, 0.1, 1.0, 10.0)
-    draws: int = 2000
-    rounds: int = 11
-    batch: int = 128
+    penalties: tuple[float, ...] = (0.0001, 0.001, 0.01, 0.1, 1.0, 10.0)
+    trees: int = 500
+    leaves: tuple[int, ...] = (32, 16, 4, 1)
+    kernels: int = 10_000
+    draws: int = 4000
+    rounds: int = 40
 
     def measure(self, job: Job) -> dict[str, Any]:
-        """Scores, times, and what follows from them."""
-        configs = [
-            composed("train", ["+exp=biotacsp_dos", *job.overrides, f"recipe={name}"])
-            for name in RECIPES
-        ]
-        recipes = [instantiate(config.recipe, _convert_="all") for config in configs]
+        """Scores, times and intervals of every set in the folder that is given."""
+        folders = [Path(text) for text in job.overrides if "=" not in text]
+        paths = sorted(path for folder in folders for path in folder.glob("*.npz"))
+        if not paths:
+            raise ValueError("give a folder of sets: python -m benchmarks.real FOLDER")
         with on_threads(1):
-            windows, folds = read_windows(configs[0], self)
-            found = on_folds(windows, folds, methods_of(windows, recipes, self))
-            ours = next(iter(found))
-            names = [name for name in found if "Rocket" in name]
-            times = times_of(windows, found, names[0], self)
-            detectors = [of.detector for of in found[ours].fitted]
-            streams = as_streams(windows, folds, detectors, configs[0], job.folder)
-        methods = {
-            name: evaluated(of, windows) | {"time": times.get(name)} for name, of in found.items()
-        }
-        return {
-            "data": {
-                "recordings": len(windows.recordings),
-                "windows": {"slip": int(windows.is_slip.sum()), "all": len(windows.is_slip)},
-                "objects": sorted(set(windows.objects.tolist())),
-                "channels": windows.samples.shape[1],
-                "samples": windows.samples.shape[2],
-                "pool": windows.pool.shape[1],
-            },
-            "settings": asdict(self),
-            "ours": ours,
-            "rockets": names,
-            "methods": methods,
-            "differences": differences(found, ours, windows, self.draws),
-            "streams": streams,
-            "folder": str(job.folder),
-        }
+            return {
+                "sets": {path.stem: _measured(read_set(path), path.stem, self) for path in paths}
+            }
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """All tables, by the heading that they stand under."""
+        sets = numbers["sets"]
         return {
-            "The recordings": _data(numbers),
-            "Limits": _limits(numbers),
-            "Scores": _scores(numbers),
-            "Each object, left out of everything": _groups(numbers, "objects"),
-            "Each direction of slip": _groups(numbers, "scenes"),
-            "As streams": _streams(numbers),
-            "How sure the differences are": _differences(numbers),
-            "Time": _times(numbers),
-            "What the folds chose": _choices(numbers),
+            "Sets": Table([{"set": name} | of["about"] for name, of in sets.items()]),
+            "Scores": _scores(sets),
+            "Cost": _costs(sets),
         }
 
     def draw(self, numbers: Report, drawing: Figure, ending: str) -> None:
-        """Balanced accuracy by object, and the corner of the ROC curves that matters."""
-        drawing.set_size_inches(9.2, 9.0)
-        dots, curves = drawing.subplots(2, 1)
-        chart(dots, *_groups(numbers, "objects").columns(""), "balanced accuracy by object, %")
-        shown = {n: of["curve"] for n, of in numbers["methods"].items() if of["time"] is not None}
-        rates = {name: (of["false_alarms"], of["found"]) for name, of in shown.items()}
-        lines(curves, rates, "stable touch called slip", "slip detected")
-        curves.set(xlim=(0, _CORNER), ylim=(1 - _CORNER, 1.0))
-
-
-# ------------------------------------------------------------------------------------- windows
-@dataclass(frozen=True, eq=False)
-class Windows:
-    """Windows of all recordings, in the order of the recordings and of time.
-
-    Attributes:
-        maker: what reads, cuts and describes them.
-        recordings: whose windows there are.
-
-    Shape:
-        - samples: ``[N, C, n]``, float64, tared and filtered as the configuration says
-        - is_slip: ``[N]``, bool
-        - recording: ``[N]``, place in ``recordings``
-        - pool: ``[N, F]``, float32, all features of every window; no label is looked at
-    """
-
-    maker: FeatureMaker
-    recordings: tuple[RecordingId, ...]
-    samples: Array
-    is_slip: Array
-    recording: Array
-    pool: Array
-    pool_s: float
-
-    @cached_property
-    def objects(self) -> Array:
-        """What each window was touched with, ``[N]``, text."""
-        return np.array([recording.material for recording in self.recordings])[self.recording]
-
-    @cached_property
-    def scenes(self) -> Array:
-        """How it slid, or that it did not, ``[N]``, text."""
-        return np.array([recording.scene for recording in self.recordings])[self.recording]
-
-    def of(self, recordings: Sequence[RecordingId]) -> Array:
-        """Which windows are of these recordings, ``[N]``, bool."""
-        wanted = set(recordings)
-        return np.array([each in wanted for each in self.recordings])[self.recording]
-
-    def by_recording(self, mask: Array) -> Iterable[tuple[RecordingId, torch.Tensor, torch.Tensor]]:
-        """Features and labels of the windows in ``mask``, one recording after the other."""
-        for place in np.unique(self.recording[mask]).tolist():
-            own = mask & (self.recording == place)
-            features, labels = torch.from_numpy(self.pool[own]), torch.from_numpy(self.is_slip[own])
-            yield self.recordings[place], features, labels
-
-
-def read_windows(config: DictConfig, sizes: Real) -> tuple[Windows, list[Split]]:
-    """All windows and the folds of ``train``.
-
-    Raises:
-        ValueError: as source, label rule and split do, or if recordings are simulated, a class is
-            absent, or a window is not left out by exactly one fold.
-    """
-    source: RecordingSource = instantiate(config.data, _convert_="all")
-    if source.is_simulated:
-        raise ValueError("recordings of data.root are marked as simulated; give real ones")
-    maker = feature_maker(source, instantiate(config.labels), **config.features)
-    recordings = _some_of(source.ids, sizes)
-    folds: list[Split] = instantiate(config.split, _convert_="all")(recordings)
-    cut = [maker.filtered_bins(each) for each in bar(recordings, "read and cut", "recording")]
-    bins = torch.cat([own.double() for own, _ in cut])
-    is_slip = torch.cat([laid.is_slip for _, laid in cut]).numpy().astype(bool)
-    where = np.repeat(np.arange(len(cut)), [len(own) for own, _ in cut])
-    if is_slip.all() or not is_slip.any():
-        which = "no window of stable touch" if is_slip.all() else "no window of slip"
-        raise ValueError(f"the {len(is_slip)} windows of data.root hold {which}; give both")
-    maker.extractor(bins[:_AT_ONCE])  # compiles
-    with torch.no_grad():
-        seconds, rows = timed(
-            lambda: torch.cat([maker.extractor(part).float() for part in bins.split(_AT_ONCE)])
-        )
-    pool_s = seconds / len(bins)
-    windows = Windows(maker, tuple(recordings), bins.numpy(), is_slip, where, rows.numpy(), pool_s)
-    if (np.sum([windows.of(fold.having("unseen")) for fold in folds], axis=0) != 1).any():
-        raise ValueError("expected each window left out by one fold; use leave_one_material_out")
-    return windows, folds
-
-
-def _some_of(recordings: Sequence[RecordingId], sizes: Real) -> list[RecordingId]:
-    """So many objects at most, and so many recordings of each and scene; sorted."""
-    materials = sorted({recording.material for recording in recordings})[: sizes.objects]
-    own = sorted((r.material, r.scene, r) for r in recordings if r.material in materials)
-    groups = groupby(own, key=lambda of: of[:2])
-    return sorted(r for _, group in groups for *_, r in islice(group, sizes.each))
+        """Balanced accuracy of every method with its interval, a panel for each set."""
+        sets = numbers["sets"]
+        drawing.set_size_inches(9.2, 0.8 + 1.9 * len(sets))
+        panels = drawing.subplots(len(sets), squeeze=False)[:, 0]
+        for axes, (name, of) in zip(panels, sets.items(), strict=True):
+            shown = [method for method in of["methods"] if method != CONSTANT]  # 50 % by definition
+            for lane, method in enumerate(shown):
+                found = of["methods"][method]["interval"]
+                value, low, high = (100 * found[end] for end in ("value", "low", "high"))
+                color = style.BLUE if method == OURS else style.GREY
+                look: Any = {"fmt": "o", "color": color, "capsize": 3}
+                axes.errorbar(value, lane, xerr=[[value - low], [high - value]], **look)
+            style.lanes(axes, shown)
+            axes.set_title(name)
+        axes.set_xlabel("balanced accuracy, %, with 95 % interval over recordings")
 
 
 # ------------------------------------------------------------------------------------- methods
-class Fitted(NamedTuple):
-    """What a fit to a fold made.
+class SimpleStatistics(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+    """Mean, std, rms, range and mean size of differences of each channel, ``[N, C, T] -> [N, F]``.
 
-    Attributes:
-        score: of windows ``[n, C, T]``, with all that takes; at least 0 means slip.
-        chosen: inside the fold, JSON-able.
-        detector: of ours.
+    Args:
+        with_logs: whether the logarithms of the last four are added.
     """
 
-    score: Callable[[Array], Array]
-    chosen: dict[str, Any]
-    detector: SlipDetector | None = None
+    def __init__(self, with_logs: bool = False) -> None:
+        self.with_logs = with_logs
+
+    def fit(self, X: Array, y: Any = None) -> SimpleStatistics:
+        """Learn the floors of the logarithms."""
+        self.floor_ = FLOOR * np.median(self._statistics(X)[:, 1:], axis=0) + 1e-12
+        return self
+
+    def transform(self, X: Array) -> Array:
+        """The statistics of windows."""
+        found = self._statistics(X)
+        columns = [found, np.log(found[:, 1:] + self.floor_)] if self.with_logs else [found]
+        return np.concatenate([part.reshape(len(X), -1) for part in columns], 1)
+
+    @staticmethod
+    def _statistics(windows: Array) -> Array:
+        x = windows.astype(np.float64)
+        rms, steps = np.sqrt(np.square(x).mean(-1)), np.abs(np.diff(x, axis=-1)).mean(-1)
+        return np.stack([x.mean(-1), x.std(-1), rms, np.ptp(x, axis=-1), steps], 1)
 
 
-Fit = Callable[[Array, SlipDetector | None], Fitted]
-"""To the training windows of a fold, a mask ``[N]``, and the detector that the first method fitted
-to the same."""
-
-
-def methods_of(
-    windows: Windows, recipes: Sequence[Recipe], sizes: Real
-) -> dict[str, tuple[Fit, float]]:
-    """All methods, ours first, and the seconds that describing a window took beforehand."""
-    seconds, simple = timed(lambda: simple_statistics(windows.samples))
-    forests = {
-        f"leaf {leaf}": RandomForestClassifier(
-            sizes.trees, min_samples_leaf=leaf, class_weight="balanced", random_state=0
-        )
-        for leaf in sizes.leaves
-    }
-    regressions = _regressions(sizes, {"as they are, ": None, "with logs, ": _with_logs()})
-    found: dict[str, tuple[Fit, float]] = {
-        f"ours, recipe={recipe.name}": (partial(_ours, windows, recipe), windows.pool_s)
-        for recipe in recipes
-    }
-    same = partial(_same_features, windows, sizes)
-    found["our features, logistic regression"] = (same, windows.pool_s)
-    for name, grid in (("logistic regression", regressions), ("random forest", forests)):
-        best = partial(_best_of, grid, windows, sizes, simple, simple_statistics)
-        found[f"simple statistics, {name}"] = (best, seconds / len(simple))
-    mini, multi = others.MINI_ROCKET, others.MULTI_ROCKET_HYDRA
-    kinds = [(mini, seed, sizes.rocket_kernels) for seed in sizes.rocket_seeds]
-    for kind in [*kinds, (multi, sizes.rocket_seeds[0], sizes.multi_rocket_kernels)]:
-        rocket = partial(_rocket, windows, *kind, sizes.hydra_groups)
-        found[f"{kind[0]}, seed {kind[1]}"] = (rocket, 0.0)
-    return found
-
-
-def _ours(windows: Windows, recipe: Recipe, train: Array, _: SlipDetector | None) -> Fitted:
-    """The detector that ``train`` makes of these windows."""
-    bins = [
-        RecordingBins(str(recording), recording.material, features, is_slip)
-        for recording, features, is_slip in windows.by_recording(train)
-    ]
-    fit = recipe.fit(bins, windows.maker.pool, is_nested=False)
-    metadata = fit.metadata | {"calibration": fit.calibration}
-    detector = fit.detector(windows.maker.pool, windows.maker.channel_filter, metadata)
-
-    @torch.no_grad()
-    def score(samples: Array) -> Array:
-        return detector.predict(torch.from_numpy(samples)).score.numpy()
-
-    pooled = sum(name.is_pooled for name in detector.selected_names)
-    chosen = {"features": len(detector.selected), "pooled": pooled, "degree": fit.kernel.degree}
-    return Fitted(score, chosen | {"C": fit.penalty}, detector)
-
-
-def _same_features(
-    windows: Windows, sizes: Real, train: Array, detector: SlipDetector | None
-) -> Fitted:
-    """Logistic regression on the scaled columns of our detector of the same fold."""
-    assert detector is not None  # ours is fitted first
-    with torch.no_grad():
-        known = torch.from_numpy(windows.pool[:, list(detector.selected)]).double()
-        rows = detector.scaled(known).numpy()
-
-    @torch.no_grad()
-    def describe(samples: Array) -> Array:
-        return detector.scaled(detector.extractor(torch.from_numpy(samples)).double()).numpy()
-
-    grid = _regressions(sizes, {"": None})  # columns are compressed already
-    return _best_of(grid, windows, sizes, rows, describe, train, detector)
-
-
-def _rocket(
-    windows: Windows, name: str, seed: int, kernels: int, groups: int, train: Array, _: Any
-) -> Fitted:
-    """Features by random convolutions, and ridge with a penalty chosen by objects left out."""
-    samples, sizes = windows.samples[train].astype(np.float32), {"num_groups": groups}
-    objects, is_slip = windows.objects[train], windows.is_slip[train]
-    made = others.fit(samples, is_slip, objects, name=name, seed=seed, num_kernels=kernels, **sizes)
-    return Fitted(made.score, {"alpha": made.alpha})
-
-
-def simple_statistics(samples: Array) -> Array:
-    """Mean, std, rms, range and mean size of differences: ``[N, C, n] -> [N, 5 C]``."""
-    found = [
-        samples.mean(-1),
-        samples.std(-1),
-        np.sqrt(np.square(samples).mean(-1)),
-        np.ptp(samples, axis=-1),
-        np.abs(np.diff(samples, axis=-1)).mean(-1),
-    ]
-    return np.concatenate(found, 1)
-
-
-def _with_logs() -> Any:
-    """Adds the signed logs of rows beside them."""
-    return FunctionTransformer(
-        lambda rows: np.concatenate([rows, np.sign(rows) * np.log1p(np.abs(rows))], 1)
-    )
-
-
-def _regressions(sizes: Real, forms: Mapping[str, Any]) -> dict[str, Any]:
+def methods_of(sizes: Real) -> dict[str, Fit]:
+    """All methods by name, ours first."""
     return {
-        f"{name}C {penalty:g}": make_pipeline(
-            form,
-            StandardScaler(),
-            LogisticRegression(C=penalty, class_weight="balanced", max_iter=2000),
-        )
-        for name, form in forms.items()
-        for penalty in sizes.regression_penalties
+        OURS: _ours,
+        "logistic regression": partial(_regression, sizes, False),
+        "logistic regression, logs": partial(_regression, sizes, True),
+        SEEDED[0]: partial(_forest, sizes),
+        SEEDED[1]: partial(_rocket, sizes),
+        CONSTANT: _constant,
     }
 
 
-def _best_of(
-    grid: Mapping[str, Any],
-    windows: Windows,
-    sizes: Real,
-    rows: Array,
-    describe: Callable[[Array], Array],
-    train: Array,
-    _: SlipDetector | None,
-) -> Fitted:
-    """The classifier of the grid that is best on training objects left out."""
-    objects, choices = windows.objects[train], {"classifier": list(grid.values())}
-    folds = GroupKFold(min(sizes.inner, len(set(objects.tolist()))))
-    every = Pipeline([("classifier", None)])
-    search = GridSearchCV(every, choices, scoring="balanced_accuracy", cv=folds)
-    best = search.fit(rows[train], windows.is_slip[train], groups=objects).best_estimator_
-
-    def score(samples: Array) -> Array:
-        described = describe(samples)
-        if hasattr(best, "decision_function"):
-            return np.asarray(best.decision_function(described))
-        return np.asarray(best.predict_proba(described)[:, 1] - 0.5)
-
-    return Fitted(score, {"": list(grid)[search.best_index_]})
+def classifier(train: RealSet, is_class: Array) -> SlipClassifier:
+    """Ours with its defaults."""
+    made = SlipClassifier(sample_rate_hz=float(train.sample_rate_hz), hand=train.layout)
+    return made.fit(train.X, is_class, groups=train.group)
 
 
-# ------------------------------------------------------------------------------------- scores
-@dataclass(eq=False)
-class OnFolds:
-    """What the folds of one method gave.
-
-    Attributes:
-        scores: ``[N]``, of every window by the fold that left its object out.
-        fit_s: seconds of each fold's fit, with describing its training windows.
-        fitted: by each fold.
-    """
-
-    scores: Array
-    fit_s: list[float] = field(default_factory=list)
-    fitted: list[Fitted] = field(default_factory=list)
+def _ours(train: RealSet, is_class: Array, seed: int) -> Scorer:
+    model = classifier(train, is_class)
+    return lambda x: np.where(model.predict_valid(x), model.decision_function(x), -1e-9)
 
 
-def on_folds(
-    windows: Windows, folds: Sequence[Split], methods: Mapping[str, tuple[Fit, float]]
-) -> dict[str, OnFolds]:
-    """Fit every method to the training windows of every fold, and score the others.
-
-    Raises:
-        ValueError: if a score is not finite.
-    """
-    found = {name: OnFolds(np.full(len(windows.is_slip), np.nan)) for name in methods}
-    detector: SlipDetector | None = None
-    for fold, name in bar(list(product(folds, methods)), "fits, fold by fold", "fit"):
-        held, train = windows.of(fold.having("unseen")), windows.of(fold.having("train"))
-        (fit, describe_s), of = methods[name], found[name]
-        seconds, fitted = timed(partial(fit, train, detector))
-        of.fit_s.append(seconds + describe_s * int(train.sum()))
-        of.scores[held] = fitted.score(windows.samples[held])
-        if not np.isfinite(of.scores[held]).all():
-            raise ValueError(f"{name} gave scores that are not finite")
-        of.fitted.append(fitted)
-        detector = found[next(iter(methods))].fitted[-1].detector
-    return found
+def _regression(sizes: Real, logs: bool, train: RealSet, is_class: Array, seed: int) -> Scorer:
+    made = LogisticRegression(class_weight="balanced", solver="newton-cholesky", max_iter=1000)
+    whole = make_pipeline(SimpleStatistics(logs), StandardScaler(), made)
+    whole.set_params(**_chosen(whole, {"C": sizes.penalties}, train, is_class, sizes))
+    return whole.fit(train.X, is_class).decision_function  # type: ignore[no-any-return]
 
 
-def evaluated(of: OnFolds, windows: Windows) -> dict[str, Any]:
-    """All that tables say of the scores of a method, JSON-able."""
-    is_slip, called = windows.is_slip, of.scores >= 0
-    by_object = {
-        name: float(balanced_accuracy_score(is_slip[own], called[own]))
-        for name in sorted(set(windows.objects.tolist()))
-        for own in [windows.objects == name]
-    }
-    worst = min(by_object, key=by_object.__getitem__)
-    quiet, detected, _ = (part.round(6).tolist() for part in roc_curve(is_slip, of.scores))
-    return {
-        "balanced_accuracy": float(balanced_accuracy_score(is_slip, called)),
-        "auc": float(roc_auc_score(is_slip, of.scores)),
-        "sensitivity": float(called[is_slip].mean()),
-        "specificity": float((~called[~is_slip]).mean()),
-        "objects": by_object,
-        "objects_mean": float(np.mean(list(by_object.values()))),
-        "worst": {"object": worst, "balanced_accuracy": by_object[worst]},
-        "scenes": {
-            name: float((called == is_slip)[windows.scenes == name].mean())
-            for name in sorted(set(windows.scenes.tolist()))
-        },
-        "curve": {"false_alarms": quiet, "found": detected},
-        "fit_s": median(of.fit_s),
-        "chosen": [one.chosen for one in of.fitted],
-    }
+def _forest(sizes: Real, train: RealSet, is_class: Array, seed: int) -> Scorer:
+    few = max(1, sizes.trees // 10)
+    made = RandomForestClassifier(few, class_weight="balanced", random_state=seed)
+    whole = make_pipeline(SimpleStatistics(), made)
+    grid = {"min_samples_leaf": sizes.leaves}
+    whole.set_params(**_chosen(whole, grid, train, is_class, sizes))
+    made.set_params(n_estimators=sizes.trees)
+    whole.fit(train.X, is_class)
+    return lambda x: whole.predict_proba(x)[:, 1] - 0.5
 
 
-def differences(
-    found: Mapping[str, OnFolds], ours: str, windows: Windows, draws: int
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Ours minus every other method, with a bootstrap interval by recording.
-
-    Recordings are drawn anew within their class, the same for all methods. Scores are held: what
-    another draw of training recordings would change is not in it.
-
-    Returns:
-        By other method and measure: ``value``, ``low`` and ``high`` of the interval, and the
-        ``share`` of draws in which ours is above.
-    """
-    generator, is_slip = np.random.default_rng(0), windows.is_slip
-    names, first = np.unique(windows.recording, return_index=True)
-    by_class = [names[is_slip[first] == value] for value in (False, True)]
-    values = {name: np.empty((2, draws + 1)) for name in found}
-    for draw in bar(range(draws + 1), "bootstrap", "draw"):
-        weights: Array = np.ones(len(is_slip))
-        if draw:  # the first is the set itself
-            taken = np.concatenate([generator.choice(of, len(of)) for of in by_class])
-            weights = np.bincount(taken, minlength=names.max() + 1)[windows.recording]
-        for name, of in found.items():
-            accuracy = balanced_accuracy_score(is_slip, of.scores >= 0, sample_weight=weights)
-            auc = roc_auc_score(is_slip, of.scores, sample_weight=weights)
-            values[name][:, draw] = accuracy, auc
-
-    def interval(gaps: Array) -> dict[str, float]:
-        low, high = np.quantile(gaps[1:], [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2]).tolist()
-        share = float((gaps[1:] > 0).mean())
-        return {"value": float(gaps[0]), "low": low, "high": high, "share": share}
-
-    measures = ("balanced_accuracy", "auc")
-    return {
-        name: dict(zip(measures, map(interval, values[ours] - values[name]), strict=True))
-        for name in found
-        if name != ours
-    }
-
-
-def times_of(
-    windows: Windows, found: Mapping[str, OnFolds], beside: str, sizes: Real
-) -> dict[str, dict[str, Any]]:
-    """From a window to its score on one thread, all methods in turns; JSON-able.
-
-    Of random methods with several seeds the first alone is timed.
-
-    Returns:
-        By method: ``batch``, how many windows at once, ``batched_s`` and ``alone_s`` for one
-        window, ``batched_times_faster`` and ``alone_times_faster`` than the method ``beside``.
-    """
-    inputs = {
-        "batched": windows.samples[-sizes.batch :].copy(),
-        "alone": windows.samples[-1:].copy(),
-    }
-    names = [name for name in found if "seed" not in name or name.endswith("seed 0")]
-    calls = {
-        f"{name}, {how}": partial(found[name].fitted[-1].score, inputs[how])
-        for name, how in product(names, inputs)
-    }
-    seconds = {name: of["seconds"] for name, of in interleaved(calls, sizes.rounds).items()}
-    rows: dict[str, dict[str, Any]] = {name: {"batch": len(inputs["batched"])} for name in names}
-    for (name, row), how in product(rows.items(), inputs):
-        own, other = seconds[f"{name}, {how}"], seconds[f"{beside}, {how}"]
-        row[f"{how}_s"] = median(own) / len(inputs[how])
-        row[f"{how}_times_faster"] = paired_ratio(other, own)._asdict()
-    return rows
-
-
-# ------------------------------------------------------------------------------------- streams
-def as_streams(
-    windows: Windows,
-    folds: Sequence[Split],
-    detectors: Sequence[SlipDetector | None],
-    config: DictConfig,
-    folder: Path,
+def _chosen(
+    whole: Pipeline, grid: Mapping[str, Any], train: RealSet, is_class: Array, sizes: Real
 ) -> dict[str, Any]:
-    """Which whole recordings raise an alarm; JSON-able.
+    """Of values of its last step those that are best on training groups left out."""
+    last = {f"{whole.steps[-1][0]}__{name}": values for name, values in grid.items()}
+    folds = GroupKFold(min(sizes.inner, len(np.unique(train.group))))
+    search = GridSearchCV(whole, last, scoring="balanced_accuracy", cv=folds, refit=False)
+    found: dict[str, Any] = search.fit(train.X, is_class, groups=train.group).best_params_
+    return found
 
-    Each is watched by the detector of the fold that left its object out, with an alarm that was
-    set on nothing (``onset=debounced``). Nobody knows when slip begins in this set, so there are
-    no delays. ``folder`` gets what ``detect`` leaves of the first slip.
+
+def _rocket(sizes: Real, train: RealSet, is_class: Array, seed: int) -> Scorer:
+    options = {"seed": seed, "num_kernels": sizes.kernels}
+    return others.fit(train.X, is_class, train.group, **options)
+
+
+def _constant(train: RealSet, is_class: Array, seed: int) -> Scorer:
+    return lambda x: np.full(len(x), 1.0 if is_class.mean() >= 0.5 else -1.0)
+
+
+# ------------------------------------------------------------------------------------- a set
+def left_out_scores(of: RealSet, fit: Fit, seed: int) -> tuple[Array, list[float]]:
+    """Scores of all windows by the fits that left their group out, and CPU seconds of each fold.
+
+    Shape:
+        - scores: ``[N, M]``; of two classes the second alone, else one against the others each
     """
-    source = windows.maker.source
-    assert isinstance(source, FileRecordings)
-    alarm = DebouncedAlarm(HOP_MS)
-    slips = {windows.recordings[place] for place in windows.recording[windows.is_slip]}
-    counts = {r.scene: {"recordings": 0, "with_alarm": 0} for r in windows.recordings}
-    shown = ""
-    for fold, detector in zip(bar(folds, "as streams", "fold"), detectors, strict=True):
-        assert detector is not None  # of ours
-        alarm(detector)
-        for recording in sorted(set(fold.having("unseen")) & set(windows.recordings)):
-            samples = source.load(recording).samples.T
-            stream = StreamingDetector(detector, dtype=samples.dtype)
-            alarms = len(stream.push(samples).alarms) + len(stream.flush().alarms)
-            counts[recording.scene]["recordings"] += 1
-            counts[recording.scene]["with_alarm"] += alarms > 0
-            if not shown and recording in slips:
-                shown = source.entry(recording).file
-                _through_detect(detector, source.root / shown, config, folder)
-    return {"by_scene": counts, "shown": shown, "hop_ms": HOP_MS, "k": alarm.k, "n": alarm.n}
+    names, index = of.classes()
+    columns = range(1, 2) if len(names) == 2 else range(len(names))
+    scores, cpu_s = np.full((len(index), len(columns)), np.nan), []
+    for group in np.unique(of.group):
+        held = of.group == group
+        train, known = of.part(~held), index[~held]
+        started = process_time()
+        fitted = [fit(train, known == column, seed) for column in columns]
+        cpu_s.append(process_time() - started)
+        scores[held] = np.stack([score(of.X[held]) for score in fitted], 1)
+    return scores, cpu_s
 
 
-def _through_detect(detector: SlipDetector, file: Path, config: DictConfig, folder: Path) -> None:
-    """What ``tactslip detect`` does with that file."""
-    folder.mkdir(parents=True, exist_ok=True)
-    detector.info |= {"simulated": False, "units": config.data.units}
-    detector.save(folder / "detector.pt")
-    given = composed("detect", [f"model='{folder / 'detector.pt'}'", f"input='{file}'"])
-    OmegaConf.update(given, "reading", config.data.reading, force_add=True)
-    detect(given, folder)
+def confusions(of: RealSet, scores: Array) -> Tensor:
+    """Windows by recording, true and decided class, ``[N, M] -> [R, K, K]``."""
+    names, index = of.classes()
+    decided = scores[:, 0] >= 0 if scores.shape[1] == 1 else scores.argmax(1)
+    trial, group = of.trials()
+    counts = np.zeros((len(group), len(names), len(names)))
+    np.add.at(counts, (trial, index, decided.astype(int)), 1)
+    return torch.from_numpy(counts)
+
+
+def balanced_accuracy(counts: Tensor) -> Tensor:
+    """The mean over seeds and classes of those decided right, ``[n, S, K, K] -> [n]``."""
+    return (counts.diagonal(dim1=-2, dim2=-1) / counts.sum(-1)).mean((-1, -2))
+
+
+def _measured(of: RealSet, name: str, sizes: Real) -> dict[str, Any]:
+    """Scores of every method, differences from ours with intervals, and costs; JSON-able."""
+    chosen = np.flatnonzero(np.isin(of.group, np.unique(of.group)[: sizes.groups]))
+    of = of.part(np.sort(np.random.default_rng(0).permutation(chosen)[:: sizes.every]))
+    of.check()
+    truth, counts = of.classes()[1], dict[str, Tensor]()
+    rows: dict[str, dict[str, Any]] = {}
+    for method, fit in methods_of(sizes).items():
+        seeds = sizes.seeds if method in SEEDED else sizes.seeds[:1]
+        runs = [left_out_scores(of, fit, seed) for seed in seeds]
+        counts[method] = torch.stack([confusions(of, scores) for scores, _ in runs], 1)
+        each = balanced_accuracy(counts[method].sum(0)[:, None]).tolist()
+        say(f"{name}, {method}: {style.percent(mean(each))} %")
+        rows[method] = {
+            "balanced_accuracy": each,
+            "auc": [
+                float(roc_auc_score(truth, scores[:, 0]))
+                for scores, _ in runs
+                if scores.shape[1] == 1
+            ],
+            "cpu_s": [seconds for _, folds in runs for seconds in folds],
+        }
+    groups = torch.from_numpy(of.trials()[1])
+    draws = {
+        "recordings": Bootstrap(len(groups), num=sizes.draws),
+        "within": Bootstrap(len(groups), num=sizes.draws, groups=groups),
+    }
+    ours = counts[OURS]
+
+    def lead(both: Tensor) -> Tensor:
+        own, other = both[:, : ours.shape[1]], both[:, ours.shape[1] :]
+        return balanced_accuracy(own) - balanced_accuracy(other)
+
+    for method, found in counts.items():
+        rows[method]["interval"] = draws["recordings"].statistic(balanced_accuracy, found)
+        both = torch.cat([ours, found], 1)
+        rows[method]["lead"] = {n: drawn.statistic(lead, both) for n, drawn in draws.items()}
+    return {"about": _about(of), "methods": rows, "cost": cost(of, sizes.rounds)}
+
+
+def _about(of: RealSet) -> dict[str, object]:
+    names, index = of.classes()
+    fractions = np.bincount(index) / len(index)
+    classes = [
+        f"{name} {style.percent(part, 1)} %" for name, part in zip(names, fractions, strict=True)
+    ]
+    return {
+        "recordings": len(of.trials()[1]),
+        "windows": len(of.y),
+        "classes (True: slip)": ", ".join(classes),
+        "groups": len(np.unique(of.group)),
+        "channels": of.X.shape[1],
+        "samples": of.X.shape[2],
+        "Hz": f"{float(of.sample_rate_hz):g}",
+        "source and licence": str(of.source),
+    }
+
+
+def cost(of: RealSet, rounds: int) -> dict[str, Any]:
+    """Times of one raw window to its score, and sizes of files, of a fit without the last group."""
+    index = of.classes()[1]
+    train = of.group != of.group[-1]
+    model = classifier(of.part(train), index[train] == 1)
+    window = of.X[~train][:1]
+    with TemporaryDirectory(prefix="tactslip-bench-") as folder, torch.inference_mode():
+        model.save(Path(folder) / "detector.pt")
+        (graph, *_) = model.export_onnx(folder)
+        session, metadata = host("files").load_model(graph, "bin")
+        x = window.astype(metadata["precision"])
+        calls: dict[str, Callable[[], Any]] = {
+            "native": partial(model.detector_.score_raw, torch.from_numpy(window)),
+            "onnxruntime": partial(session.run, ["score", "valid"], {"samples": x}),
+        }
+        timings = interleaved(calls, rounds, block_s=0.02)
+        return {
+            "window_s": {name: timing["seconds"] for name, timing in timings.items()},
+            "detector_bytes": (Path(folder) / "detector.pt").stat().st_size,
+            "onnx_bytes": graph.stat().st_size,
+        }
 
 
 # ------------------------------------------------------------------------------------- tables
-
-
-def _data(numbers: Report) -> Table:
-    """What was read, and what the run was set to."""
-    data, settings = numbers["data"], numbers["settings"]
-    rows = {
-        "recordings": data["recordings"],
-        "objects": len(data["objects"]),
-        "channels": data["channels"],
-        "samples in a window": data["samples"],
-        "windows": data["windows"]["all"],
-        "of them slip": data["windows"]["slip"],
-        "features in the pool": data["pool"],
-        "groups of objects that choose classifiers on simple statistics": settings["inner"],
-        "kernels of MiniRocket": f"{settings['rocket_kernels']:,}",
-        "kernels of MultiRocket": f"{settings['multi_rocket_kernels']:,}",
-        "groups of Hydra's kernels": settings["hydra_groups"],
-        "trees of the forest": settings["trees"],
-    }
-    return listed("number of", rows)
-
-
-def _limits(numbers: Report) -> Table:
-    """What was wanted of ours, whether it is met, and what is better."""
-    methods, rockets = numbers["methods"], numbers["rockets"]
-    ours = methods[numbers["ours"]]
-    own, key = 100 * ours["balanced_accuracy"], "balanced_accuracy"
-    goals = [
-        (f"balanced accuracy of {name}", own, 100 * methods[name][key], "%") for name in rockets
-    ]
-    for measure, words in (("balanced_accuracy", "balanced accuracy"), ("auc", "AUC")):
-        goals.append((f"{words}, the aim", 100 * ours[measure], 100 * _AIMS[measure], "%"))
-    for how, words in (("batched", "many windows at once"), ("alone", "one window alone")):
-        ratio = ours["time"][f"{how}_times_faster"]["median"]
-        goals.append((f"times faster than {rockets[0]}: {words}", ratio, _TIMES_FASTER, ""))
-    above = [name for name, of in methods.items() if 100 * of[key] > own]
-    found = limits(goals, is_least=True)
-    met = [row[""] for row in found.rows].count("met")
-    note = (
-        f"{met} of {len(goals)} limits are met, by {numbers['ours']}. "
-        f"Higher in balanced accuracy, of all methods and seeds: {'; '.join(above) or 'none'}."
-    )
-    return Table(found.rows, note)
-
-
-def _scores(numbers: Report) -> Table:
-    titles = {
-        "balanced_accuracy": "balanced accuracy %",
-        "auc": "AUC %",
-        "sensitivity": "sensitivity %",
-        "specificity": "specificity %",
-        "objects_mean": "mean over objects %",
-    }
+def _scores(sets: Mapping[str, Any]) -> Table:
     rows = []
-    for name, of in numbers["methods"].items():
-        worst = f"{of['worst']['object']} {percent(of['worst']['balanced_accuracy'], 1)}"
-        scores = {title: percent(of[key]) for key, title in titles.items()}
-        rows.append({"method": name} | scores | {"worst object %": worst})
-    return Table(rows)
-
-
-def _groups(numbers: Report, kind: str) -> Table:
-    """Balanced accuracy on each object, or the part of windows decided right in each scene."""
-    head = "balanced accuracy %" if kind == "objects" else "windows decided right, %"
-    return Table(
-        [
-            {head: method}
-            | {SCENES.get(name, name): percent(of, 1) for name, of in row[kind].items()}
-            for method, row in numbers["methods"].items()
-        ]
-    )
-
-
-def _streams(numbers: Report) -> Table:
-    found = numbers["streams"]
-    rows = [
-        {
-            "whole recordings as streams": words,
-            "recordings": found["by_scene"][name]["recordings"],
-            "with an alarm": found["by_scene"][name]["with_alarm"],
-        }
-        for name, words in SCENES.items()
-        if name in found["by_scene"]
-    ]
+    for name, method in ((n, m) for n, of in sets.items() for m in of["methods"]):
+        found = sets[name]["methods"][method]
+        row = {"set": name, "method": method}
+        row["balanced accuracy %"] = mean_sd(times(found["balanced_accuracy"], 100))
+        row["AUC %"] = mean_sd(times(found["auc"], 100))
+        leads = found["lead"]
+        for drawn, words in DRAWN.items():
+            row[f"ours ahead by, points; 95 % over {words}"] = (
+                "-" if method == OURS else style.interval(leads[drawn], 2, scale=100)
+            )
+        row["ours is"] = "-" if method == OURS else word(leads)
+        rows.append(row)
     note = (
-        "Each whole recording through `StreamingDetector`, by the machine of the fold that left "
-        f"its object out: a decision every {found['hop_ms']:g} ms, an alarm when {found['k']} of "
-        f"{found['n']} decisions say slip (`onset=debounced`). Nothing was set on alarms, and no "
-        "rate of false alarms is stated; when slip begins nobody knows, so there are no delays. "
-        f"The picture is what `detect` leaves of one of them, `{found['shown']}`.\n\n"
-        "![One recording](../benchmarks/results/real_watched.png)"
+        "Mean and standard deviation over seeds where a method draws at random. Intervals are by "
+        "a paired bootstrap: recordings are drawn with all their windows, the same for both "
+        "methods, once from all and once within each left-out group. *ahead* or *behind* stands "
+        "where neither interval includes 0. Scores are held: other training recordings and other "
+        "objects are not in the intervals."
     )
     return Table(rows, note)
 
 
-def _differences(numbers: Report) -> Table:
-    def words(found: Mapping[str, float]) -> str:
-        value, low, high = (100 * found[name] for name in ("value", "low", "high"))
-        return f"{value:+.2f} ({low:+.2f} to {high:+.2f})"
+def word(leads: Mapping[str, Mapping[str, float | None]]) -> str:
+    """``ahead`` or ``behind`` where no interval includes 0."""
+    lows, highs = ([one[end] for one in leads.values()] for end in ("low", "high"))
+    if all(low is not None and low > 0 for low in lows):
+        return "ahead"
+    if all(high is not None and high < 0 for high in highs):
+        return "behind"
+    return "interval includes 0"
 
-    rows, unsettled = [], []
-    for name, found in numbers["differences"].items():
-        gap = found["balanced_accuracy"]
-        row = {f"{numbers['ours']} minus": name, "balanced accuracy, points": words(gap)}
-        row["above in"] = f"{percent(gap['share'], 1)} % of draws"
-        rows.append(row | {"AUC, points": words(found["auc"])})
-        unsettled += [name] if gap["low"] <= 0 <= gap["high"] else []
-    note = f"**Nothing is settled beside:** {'; '.join(unsettled)}." if unsettled else ""
+
+def _costs(sets: Mapping[str, Any]) -> Table:
+    rows = []
+    for name, of in sets.items():
+        found = of["cost"]
+        row: dict[str, object] = {"set": name}
+        for method in (OURS, SEEDED[1]):
+            row[f"{method}: fit of a fold, CPU s"] = mean(of["methods"][method]["cpu_s"])
+        for way, seconds in found["window_s"].items():
+            row[f"one raw window, {way}, us"] = times(seconds, 1e6)
+        row["detector.pt, MB"] = found["detector_bytes"] / 1e6
+        row["model.onnx, MB"] = found["onnx_bytes"] / 1e6
+        rows.append(row)
     note = (
-        "Recordings are drawn anew within slip and within stable touch, "
-        f"{numbers['settings']['draws']:,} times with a fixed seed, the same for both methods; "
-        f"brackets hold {100 * COVERAGE:g} % of the differences. Where they hold 0, nothing is "
-        "settled. Scores are held, so this says nothing of other training recordings or other "
-        f"objects. {note}"
+        "On one thread; fits with all that is chosen inside. Limits on `biotacsp`: a fold 15 CPU "
+        "s, a window 300 us and 1,200 us in onnxruntime, files 8 MB."
     )
     return Table(rows, note)
-
-
-def _times(numbers: Report) -> Table:
-    cells = []
-    for name, row in numbers["methods"].items():
-        of = row["time"]
-        times: dict[str, object] = {"batch": of and of["batch"]}
-        for how in ("batched", "alone"):
-            faster = f"{number(of[f'{how}_times_faster']['median'])} x" if of else None
-            times[f"us a window, {how}"] = 1e6 * of[f"{how}_s"] if of else None
-            times[f"faster, {how}"] = faster
-        cells.append({"method": name, "fit of a fold, s": row["fit_s"]} | times)
-    note = (
-        "On one thread, from a window in memory to its score, all methods in turns, medians of "
-        f"{numbers['settings']['rounds']} rounds. For one window alone the calls themselves weigh "
-        "most. A fit counts the description of its training windows. Faster: than "
-        f"{numbers['rockets'][0]}, round by round; below 1 is slower."
-    )
-    return Table(cells, note)
-
-
-def _choices(numbers: Report) -> Table:
-    def words(key: str, value: Any) -> str:
-        return f"{key} {value if isinstance(value, str) else format(value, '.3g')}".strip()
-
-    cells = []
-    for name, row in numbers["methods"].items():
-        counts = Counter(", ".join(starmap(words, of.items())) for of in row["chosen"])
-        text = "; ".join(f"{choice} ({times}x)" for choice, times in counts.most_common())
-        cells.append({"method": name, "chosen inside the folds": text})
-    return Table(cells)
 
 
 if __name__ == "__main__":

@@ -36,7 +36,6 @@ from tactslip_torch.training.experiment import feature_cache, feature_maker
 Array = NDArray[Any]
 WINDOW_LENGTHS = (51,) * 14 + (11,) * 10
 RATE_HZ = 2000.0
-SEEN_ROLE = {"test": "held-out cycles of seen materials", "unseen": "held-out materials"}
 
 
 # ----------------------------------------------------------------------------- bins and streams

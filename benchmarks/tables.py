@@ -169,21 +169,19 @@ def listed(about: str, values: Mapping[str, object]) -> Table:
     return Table([{about: name, "": value} for name, value in values.items()])
 
 
-def limits(rows: Iterable[tuple[str, float, float, str]], *, is_least: bool = False) -> Table:
+def limits(rows: Iterable[tuple[str, float, float, str]]) -> Table:
     """Every limit beside what was measured, met or missed.
 
     Args:
         rows: what was measured, its value, the most that was set for it, and their unit.
-        is_least: whether the least was set in place of the most.
     """
-    sign = ">=" if is_least else "<="
     return Table(
         [
             {
                 "limits": what,
                 "measured": f"{number(measured, 4)} {unit}".strip(),
-                "limit": f"{sign} {number(limit, 4)} {unit}".strip(),
-                "": "met" if (measured >= limit if is_least else measured <= limit) else "MISSED",
+                "limit": f"<= {number(limit, 4)} {unit}".strip(),
+                "": "met" if measured <= limit else "MISSED",
             }
             for what, measured, limit, unit in rows
         ]

@@ -58,7 +58,8 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             ``SlipClassifier`` chooses among the three.
         pooling: statistics over channels, of ``mean``, ``std``, ``min``, ``max``, ``median``, or
             ``"sorted"``: the values in ascending order.
-        descriptors: names of those to compute; ``None`` for all 18.
+        descriptors: names of those to compute; ``None`` for all 17 of the paper's
+            features.
         frames: of the Savitzky-Golay filter, an odd number of samples by kind of channel. ``None``:
             51 for ``SG`` and 11 for ``PVDF``, as in the paper. Other kinds are not filtered.
         filtered: whether windows are filtered already. If not, the filter takes ``context_``

@@ -34,6 +34,8 @@ SG_DESCRIPTORS = (
 )
 TIME_DESCRIPTORS = (*SG_DESCRIPTORS, "correlation")
 SPECTRUM_DESCRIPTORS = (*SG_DESCRIPTORS, "spectral_centroid", "spectral_spread")
+SIMPLE_OF_GAUGES = ("rms", "mean_abs_change")
+SIMPLE_OF_FILMS = ("mean", "std", "rms", "range", "mean_abs_change")
 
 
 # Section 2: filter ---------------------------------------------------------------------------
@@ -145,6 +147,10 @@ def describe_one(
             return 0.0 if constant else (d**3).mean() / (d**2).mean() ** 1.5
         case "kurtosis":
             return 3.0 if constant else (d**4).mean() / (d**2).mean() ** 2
+        case "rms":
+            return rms
+        case "mean_abs_change":
+            return np.abs(np.diff(d)).mean()
         case "energy":
             return (x**2).sum()
         case "entropy":
@@ -179,7 +185,7 @@ def band_energy_ratio(spectra: np.ndarray) -> np.ndarray:
 def pool_names(
     num_gauges: int = 14, num_films: int = 10, level: int = 4
 ) -> list[tuple[str, str, str, str]]:
-    """(channel, component, domain, descriptor) in pool order."""
+    """(channel, component, domain, descriptor) in pool order: the paper's, then what is ours."""
     levels = range(1, level + 1)
     names = [(f"SG{i}", "raw", "time", d) for i in range(1, num_gauges + 1) for d in SG_DESCRIPTORS]
     for i in range(1, num_films + 1):
@@ -191,6 +197,10 @@ def pool_names(
             names += [(film, f"D{m}", "freq", d) for d in SPECTRUM_DESCRIPTORS]
         for letter in "AD":
             names += [(film, f"{letter}{m}", "freq", "band_energy_ratio") for m in levels]
+    for i in range(1, num_gauges + 1):
+        names += [(f"SG{i}", "raw", "time", d) for d in SIMPLE_OF_GAUGES]
+    for i in range(1, num_films + 1):
+        names += [(f"PVDF{i}", "raw", "time", d) for d in SIMPLE_OF_FILMS]
     return names
 
 
@@ -232,6 +242,9 @@ def pool(
                 )
         order = [f"{letter}{m}" for letter in "AD" for m in range(1, level + 1)]
         values.extend(band_energy_ratio(np.stack([spectra[name] for name in order])))
+    for i, x in enumerate(bins):
+        simple = SIMPLE_OF_GAUGES if i < num_gauges else SIMPLE_OF_FILMS
+        values.extend(describe(settle(x, np.abs(x).max()), simple))
     return np.array(values)
 
 

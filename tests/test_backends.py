@@ -8,10 +8,12 @@ import pytest
 import torch
 from contract.recordings import NAMES, bins_of, samples_of
 from extremes import EXTREMES, extreme_bins
+from test_detector import repeated
 
-from tactslip_torch.deploy.bins import RawBin
+from tactslip_torch.deploy.bins import RawBin, bin_graph
 from tactslip_torch.deploy.check import runner, session_of
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.streaming import StreamingDetector
 
@@ -23,6 +25,8 @@ CASES = [
     ("paper", "float64"),
     pytest.param(("general", "float64"), marks=pytest.mark.slow),
     pytest.param(("paper", "float32"), marks=pytest.mark.slow),
+    ("general, several views", "float32"),
+    pytest.param(("general, several views", "float64"), marks=pytest.mark.slow),
 ]
 
 
@@ -42,11 +46,33 @@ class Backends(NamedTuple):
         return [found[name] for name in ("score", *FLAGS)]
 
 
+def several_views(detector):
+    """The detector with some of its columns scaled once more, and a quadratic part on others."""
+    again = range(3, len(detector.scaler.minimum), 2)
+    scaler, head, chosen = repeated(detector.scaler, again), detector.head, list(again)
+    rng = np.random.default_rng(0)
+    size = float(head.linear.abs().mean())
+    bend = size * torch.from_numpy(rng.standard_normal((17, 17)))
+    linear = torch.cat([head.linear, -head.linear[chosen]])
+    views = QuadraticForm(bend + bend.T, linear, head.constant)
+    parts = detector.pool, detector.channel_filter, detector.selected, scaler, views, detector.info
+    imputation = torch.cat([detector.imputation, 0.5 * detector.imputation[chosen]])
+    return SlipDetector(*parts, imputation, detector.pooling, sensing=detector.sensing)
+
+
 @pytest.fixture(scope="module", params=CASES, ids="-".join)
-def backends(request, graphs_of):
-    recipe, precision = request.param
+def backends(request, graphs_of, tmp_path_factory):
+    name, precision = request.param
+    recipe, _, views = name.partition(", ")
     file = request.getfixturevalue(recipe).file
-    graph = runner(session_of(onnx.load(graphs_of(recipe, precision) / "model.onnx")))
+    if views:
+        made = several_views(SlipDetector.load(file))
+        file = tmp_path_factory.mktemp("views") / "detector.pt"
+        made.save(file)
+        model = bin_graph(made, precision).model()
+    else:
+        model = onnx.load(graphs_of(recipe, precision) / "model.onnx")
+    graph = runner(session_of(model))
     native, by_torch = (SlipDetector.load(file, backend=name) for name in ("auto", "torch"))
     score = native.predict_raw(bins_of(native, samples_of("D", 1))).score
     return Backends(native, by_torch, graph, getattr(torch, precision), float(score.std()))

@@ -7,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.harness import Benchmark, between_markers
+from benchmarks.paper_tables import RIDGE, forward_order
+from benchmarks.real_sets import RealSet
 from benchmarks.tables import Table
 from benchmarks.timing import interleaved, paired_ratio
 
@@ -37,9 +40,11 @@ def _subject(name: str) -> type[Benchmark]:
 def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path, monkeypatch, drawn) -> None:
     """In this process, as most commands that a subject runs; figures are small."""
     monkeypatch.chdir(ROOT)
+    if name == "closed_loop":
+        pytest.importorskip("mujoco")
     arguments = ["--quick", "--out", str(tmp_path)]
     if name == "real":
-        arguments.append(f"data.root={_real_set(tmp_path / 'set')}")
+        arguments.append(str(_real_sets(tmp_path / "sets")))
     subject = _subject(name)()
     assert subject.run(arguments) == 0
     assert json.loads((tmp_path / f"{name}.json").read_text())["quick"]
@@ -76,6 +81,32 @@ def test_a_table_has_numbers_to_the_right_and_words_to_the_left() -> None:
     assert table.markdown().split("\n")[1] == "| --- | ---: | --- |"
 
 
+def test_forward_selection_takes_what_lessens_the_error_most() -> None:
+    """Against a solve of every candidate at every step, with features that repeat each other."""
+    generator = torch.Generator().manual_seed(3)
+    scales = torch.tensor([1.0, 0.2, 5.0, 0.1, 3.0, 1.0, 8.0]).double()
+    z = torch.randn(60, 7, generator=generator, dtype=torch.float64)
+    z[:, 5] = z[:, 0] + 0.01 * z[:, 1]
+    is_slip, weights = z[:, 0] + 0.5 * z[:, 2] - 0.4 * z[:, 4] > 0.2, torch.rand(60).double() + 0.5
+    z = z * scales
+    targets, part = torch.where(is_slip, 1.0, -1.0).double(), weights / weights.sum()
+
+    def error(taken: list[int]) -> float:
+        columns = torch.cat([torch.ones(60, 1), z[:, taken]], 1) * part.sqrt()[:, None]
+        ridge = RIDGE**0.5 * torch.eye(1 + len(taken)).double()[1:]
+        left, right = (
+            torch.cat([columns, ridge]),
+            torch.cat([targets * part.sqrt(), 0 * ridge[:, 0]]),
+        )
+        return float((left @ torch.linalg.lstsq(left, right).solution - right).square().sum())
+
+    expected = list[int]()
+    for _ in range(5):
+        rest = [place for place in range(7) if place not in expected]
+        expected.append(min(rest, key=lambda place: error([*expected, place])))
+    assert forward_order(z, is_slip, weights, 5).tolist() == expected
+
+
 def test_only_what_stands_between_the_markers_is_replaced() -> None:
     text = "before\n<!-- a -->\nold\n<!-- /a -->\nbehind"
     assert between_markers(text, "a", "new") == text.replace("old", "new")
@@ -83,17 +114,16 @@ def test_only_what_stands_between_the_markers_is_replaced() -> None:
         between_markers(text, "b", "new")
 
 
-def _real_set(root: Path) -> Path:
-    """A set of the layout of the BioTac SP one: slip is a vibration, stable touch is not."""
+def _real_sets(folder: Path) -> Path:
+    """Two sets: slip is a vibration; and its pitch, which is one of three words."""
     generator = np.random.default_rng(5)
-    header = ",".join(f"ff_e{place + 1}" for place in range(24))
-    for scene, pitch in {"n": 0.9, "cw": 1.4, "t": 0.0}.items():
-        folder = root / "csvs" / scene
-        folder.mkdir(parents=True)
-        for number, name in enumerate(("bottle", "brush", "pen") * 2):
-            times = np.arange(50 + 128 + 32)
-            counts = 2500 + 40 * generator.random((len(times), 24)) + 100 * number
-            counts[50:] += 60 * np.sin(pitch * times[50:, None] + np.arange(24)) * (pitch > 0)
-            rows = "\n".join(",".join(map(str, row)) for row in counts.round().astype(int))
-            (folder / f"{name}{number}.csv").write_text(f"{header}\n{rows}\n")
-    return root
+    folder.mkdir()
+    rows = [(f"e{place}", "electrode", "finger", "distal", "fast") for place in range(3)]
+    pitch = np.tile([0.0, 0.9, 1.4], 24)
+    wave = np.sin(pitch[:, None, None] * np.arange(32)) * np.ones((1, 3, 1))
+    x = (wave + 0.1 * generator.standard_normal(wave.shape)).astype(np.float32)
+    group, recording = np.repeat(["bottle", "brush", "pen"], 24), np.tile(["a", "b"], 36)
+    for name, y in (("slip", pitch > 0), ("pitch", np.tile(["none", "low", "high"], 24))):
+        numbers = np.array(100.0), np.array(rows), np.array("made here")
+        np.savez(folder / f"{name}.npz", **RealSet(x, y, group, recording, *numbers)._asdict())
+    return folder

@@ -6,6 +6,7 @@ from tactslip_torch import FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.package_files import DETECTOR, load_table, save_table
+from tactslip_torch.runtime import signed_log
 from tactslip_torch.signals.filtering import ChannelFilter
 
 PER_KIND = 3
@@ -21,8 +22,12 @@ def noise(num_bins, seed=0, num_samples=150):
     return torch.from_numpy(size * rng.standard_normal((num_bins, 24, num_samples)) + offset)
 
 
-def random_detector(seed=0, compress=False):
-    """A detector nobody trained: three features of each kind, a scaler that fits, a random head."""
+def random_detector(seed=0, compress=False, num_repeated=0, num_quadratic=None):
+    """A detector nobody trained: three features of each kind, a scaler that fits, a random head.
+
+    The last columns are scaled once more, more compressed; the quadratic part may be of the first
+    scaled columns alone.
+    """
     rng = np.random.default_rng(seed)
     pool = FeaturePool(HandLayout.paper24())
     channel_filter = ChannelFilter([51] * 14 + [11] * 10)
@@ -35,16 +40,38 @@ def random_detector(seed=0, compress=False):
     ]
     selected = [int(i) for kind in kinds for i in rng.choice(kind, PER_KIND, replace=False)]
     features = pool(channel_filter.valid(noise(64, seed=99)))[:, selected]
-    num = len(selected)
+    scaler = FeatureScaler.fit(features, compress=compress)
+    if num_repeated:
+        scaler = repeated(scaler, range(len(selected) - num_repeated, len(selected)))
+    num = len(scaler.minimum)
     quadratic = torch.from_numpy(rng.standard_normal((num, num))) / num
+    quadratic = quadratic[:num_quadratic, :num_quadratic]
     linear = torch.from_numpy(rng.standard_normal(num))
     head = QuadraticForm(quadratic + quadratic.T, linear, torch.tensor(0.1, dtype=torch.float64))
     info = {"simulated": True, "seed": seed, "penalty": 0.3, "train_recordings": ["M1/0"]}
-    scaler = FeatureScaler.fit(features, compress=compress)
     return SlipDetector(pool, channel_filter, selected, scaler, head, info)
 
 
-VARIANTS = {"quadratic form": {}, "compression": {"compress": True}}
+def repeated(scaler, again):
+    """Behind the columns of a scaler with compression some of them again, with a tenth of it."""
+    columns = torch.tensor([*range(len(scaler.minimum)), *again])
+    scale = torch.cat([scaler.compression, 0.1 * scaler.compression[list(again)]])
+    own, ends = scaler.compression, (scaler.minimum, scaler.maximum)
+    ends = [own * torch.expm1(end.abs() / own) * end.sign() for end in ends]
+    return FeatureScaler(*(signed_log(end[columns], scale) for end in ends), scale, columns)
+
+
+VARIANTS = {
+    "quadratic form": {},
+    "compression": {"compress": True},
+    "linear": {"num_quadratic": 0},
+    "repeated columns": {"compress": True, "num_repeated": 5},
+    "repeated columns, few of them quadratic": {
+        "compress": True,
+        "num_repeated": 5,
+        "num_quadratic": 7,
+    },
+}
 """Arguments of ``random_detector`` for every kind of head and scaler."""
 
 
@@ -61,13 +88,17 @@ def test_the_score_is_the_head_of_scaled_features_and_the_same_from_a_file(varia
     detector, samples = random_detector(**VARIANTS[variant]), noise(5)
     bins = detector.channel_filter.valid(samples)
     features = detector.pool(bins).numpy()[:, list(detector.selected)]
+    if detector.scaler.columns is not None:
+        features = features[:, detector.scaler.columns.numpy()]
     if detector.scaler.compression is not None:
         compression = detector.scaler.compression.numpy()
         features = np.sign(features) * compression * np.log1p(np.abs(features) / compression)
     low, high = detector.scaler.minimum.numpy(), detector.scaler.maximum.numpy()
     z = np.clip(2 * (features - low) / (high - low) - 1, -1, 1)
     state = {name: value.numpy() for name, value in detector.head.state_dict().items()}
-    expected = np.einsum("ni,ij,nj->n", z, state["quadratic"], z) + z @ state["linear"] + 0.1
+    first = z[:, : len(state["quadratic"])]
+    expected = np.einsum("ni,ij,nj->n", first, state["quadratic"], first)
+    expected += z @ state["linear"] + 0.1
     np.testing.assert_allclose(detector(bins).numpy(), expected, rtol=1e-9, atol=1e-11)
     detector.save(tmp_path / "detector.pt")
     loaded = SlipDetector.load(tmp_path / "detector.pt")
@@ -113,6 +144,16 @@ def test_parts_that_disagree_are_refused(detector):
     for part, other, said in (
         ("selected", detector.selected[:-1], "11 columns, a scaler of 12 and a head of 12"),
         ("scaler", narrow, "12 columns, a scaler of 3 and a head of 12"),
+        (
+            "scaler",
+            FeatureScaler(-torch.ones(12), torch.ones(12), columns=range(1, 13)),
+            "the scaler takes column 12 of 12, counted from 0",
+        ),
+        (
+            "scaler",
+            FeatureScaler(-torch.ones(13), torch.ones(13), columns=[*range(12), 3]),
+            "13 columns, a scaler of 13 and a head of 12",
+        ),
         ("channel_filter", ChannelFilter([11] * 23), "of 23 channels does not fit a hand of 24"),
     ):
         with pytest.raises(ValueError, match=said):

@@ -9,6 +9,7 @@ import oracles
 import pytest
 import torch
 from sklearn.kernel_ridge import KernelRidge
+from torch import nn
 
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import (
@@ -80,6 +81,18 @@ def test_a_head_is_the_sum_over_its_bins(kernel, rng, device):
     assert head(bad).isnan().tolist() == [False, True]
     numbers = sum(value.numel() for value in head.state_dict().values())
     assert (head.num_features, head.cost.num_bytes) == (4, 8 * numbers)
+
+
+def test_a_quadratic_part_of_the_first_features_leaves_the_others_linear(rng):
+    quadratic, linear = (torch.from_numpy(rng.standard_normal(s)) for s in ((2, 2), (5,)))
+    quadratic += quadratic.mT.clone()
+    head = QuadraticForm(quadratic, linear, torch.tensor(0.3, dtype=torch.float64))
+    z = torch.from_numpy(rng.standard_normal((3, 4, 5))).requires_grad_()
+    filled = nn.functional.pad(quadratic, (0, 3, 0, 3))
+    whole = QuadraticForm(filled, linear, head.constant)
+    torch.testing.assert_close(head(z), whole(z), rtol=1e-12, atol=1e-12)
+    assert torch.autograd.gradcheck(head, z)
+    assert (head.num_features, head.is_linear, head.cost) == (5, False, (9, 80))
 
 
 @pytest.mark.parametrize(

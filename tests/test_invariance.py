@@ -8,6 +8,7 @@ import torch
 
 from tactslip_torch import FeaturePool, HandLayout
 from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
+from tactslip_torch.features.names import SIMPLE_STATISTICS
 
 PAGE = Path(__file__).parents[1] / "docs" / "numerics.md"
 ANSWERS = {"same": "same", "g": 1, "g^2": 2, "+ c": "shifts"}
@@ -18,7 +19,7 @@ def table():
     """By domain and descriptor the answers that the page's table states."""
     text = PAGE.read_text(encoding="utf-8").split("<!-- invariances -->")[1]
     rows = {}
-    for line in text.splitlines()[3:33]:
+    for line in text.splitlines()[3:35]:
         name, domain, *cells = (cell.strip() for cell in line.strip("|").split("|"))
         answers = dict(zip(KEYS, (ANSWERS.get(c, c) for c in cells), strict=False))
         answers["gain"] = 0 if answers["gain"] == "same" else answers["gain"]
@@ -79,5 +80,6 @@ def test_every_column_of_the_pool_answers_as_the_table_says(change):
 
 def test_the_table_has_every_descriptor_once():
     of_spectra = [*SPECTRUM_DESCRIPTORS, "band_energy_ratio"]
-    wanted = [("time", name) for name in TIME_DESCRIPTORS] + [("freq", n) for n in of_spectra]
+    of_signals = dict.fromkeys((*TIME_DESCRIPTORS, *SIMPLE_STATISTICS))
+    wanted = [("time", name) for name in of_signals] + [("freq", name) for name in of_spectra]
     assert list(ROWS) == wanted

@@ -15,6 +15,7 @@ from small_detector import HAND, raw_bins, small_detector
 
 from tactslip_torch import FeaturePool, HandLayout, native
 from tactslip_torch.features.bank import make_plan
+from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import build
 
@@ -54,6 +55,39 @@ def test_instruction_sets_agree_on_the_papers_hand(level, monkeypatch):
     fresh = made(pool)
     for num in (1, 20):
         torch.testing.assert_close(fresh(bins[:num]), plain[:num], rtol=1e-12, atol=1e-12)
+
+
+@needs_engine
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("setting", [["mean", "std", "min", "max"], "sorted"], ids=str)
+def test_a_bin_alone_has_exactly_the_columns_it_has_among_others(level, setting, rng, monkeypatch):
+    """Lanes across families and columns do what lanes across bins do, lost channels included."""
+    monkeypatch.setenv("TACTSLIP_NATIVE", level)
+    hand = HandLayout.paper24()
+    names = [n for n in FeaturePool(hand, level=1).names if "A1" not in str(n)]
+    features = torch.from_numpy(rng.standard_normal((43, len(names))) * 10 ** rng.uniform(-3, 3))
+    layer = ChannelPooling.fit(hand, names, features, setting).with_channels(names[:5])
+    place = {name: index for index, name in enumerate(names)}
+    inputs = features[:, [place[name] for name in layer.inputs]].numpy()
+    columns = np.r_[: len(layer.names), 3:20, 3]
+    low = rng.standard_normal(len(columns))
+    width, compression = np.exp(rng.standard_normal((2, len(columns))))
+    width[7] = 0
+    of_channel = np.where(columns < 5, columns, -1)
+    machine = layer.machine(
+        scaling=(low, low + width, compression, columns),
+        imputation=(np.full(len(columns), 0.4), of_channel),
+    )
+    is_lost = rng.uniform(size=(43, 24)) < 0.2
+    is_lost[1] = True
+    is_lost[2:9] = False
+    inputs[4, ::7] = np.nan
+    inputs[5, ::5] = 1e300
+    found = machine.columns(inputs, is_lost)
+    alone = [machine.columns(inputs[i : i + 1], is_lost[i : i + 1]) for i in range(43)]
+    np.testing.assert_array_equal(np.concatenate(alone), found)
+    assert np.isnan(found).any(1).nonzero()[0].tolist() == [4]
+    assert (found[1, of_channel >= 0] == 0.4).all()
 
 
 # Manners -------------------------------------------------------------------------------------

@@ -74,7 +74,7 @@ def assert_scores(detector, precision, samples, mask=None, spread=None):
 def test_every_head_and_scaler_comes_through(variant, precision):
     """Sensors that fail are replaced by imputation values."""
     detector, samples = random_detector(**VARIANTS[variant]), noise(36)
-    values = torch.linspace(-0.9, 0.9, len(detector.selected), dtype=torch.float64)
+    values = torch.linspace(-0.9, 0.9, detector.head.num_features, dtype=torch.float64)
     of_signal = (detector.pool, detector.channel_filter, detector.selected, detector.scaler)
     detector = SlipDetector(*of_signal, detector.head, imputation=values)
     needed = detector.needed_index.tolist()

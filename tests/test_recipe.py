@@ -18,7 +18,8 @@ from tactslip_torch.training.bins import BinSample, RecordingBins
 from tactslip_torch.training.choice import CandidateBins, balanced_accuracy, group_scores
 from tactslip_torch.training.recipe import FREE_CONSTANT, General, Paper
 
-POOL = FeaturePool(SMALL_HAND)
+WHOLE_POOL = FeaturePool(SMALL_HAND)
+POOL = WHOLE_POOL.paper()
 FAST_POOL = FeaturePool(
     HandLayout.from_rows(
         {"name": f"f{i}", "kind": "fast", "finger": f"f{i}", "segment": "tip", "adapting": "fast"}
@@ -121,6 +122,13 @@ FILTERS = [
 def test_a_filter_lets_pass_what_has_every_attribute_asked_for(wanted, matches):
     allowed = Paper(feature_filter=wanted).allowed(POOL)
     assert allowed.tolist() == [matches(name) for name in POOL.names]
+
+
+@pytest.mark.parametrize("recipe", [Paper(num_features=1), General(), General(descriptors=None)])
+def test_features_that_the_paper_lacks_are_not_selected(recipe):
+    allowed = recipe.allowed(WHOLE_POOL)
+    assert allowed[WHOLE_POOL.is_paper].any()
+    assert not allowed[~WHOLE_POOL.is_paper].any()
 
 
 # Both --------------------------------------------------------------------------------------------

@@ -26,6 +26,9 @@ REFUSED = [
     (lambda: scaler_of([0.0, 1.0], [1.0, 0.0]), r"feature 1.*1 and 0"),
     (lambda: scaler_of([-3e38], [3e38]), r"feature 0.*-3e\+38 and 3e\+38"),
     (lambda: scaler_of(*ENDS, torch.ones(3)), r"agree in shape, got \(2,\), \(2,\), \(3,\)"),
+    (lambda: scaler_of(*ENDS, [1.0, 1.0], [0]), r"agree in shape, got .* \(2,\), \(1,\)$"),
+    (lambda: scaler_of(*ENDS, [1.0, 1.0], [0, -1]), r"whole numbers from 0 on, got \[0, -1\]$"),
+    (lambda: scaler_of(*ENDS, [1.0, 1.0], [0.0, 1.5]), r"whole numbers .*, got \[0\.0, 1\.5\]$"),
     (
         lambda: scaler_of(*ENDS, [1.0, -1.0]),
         "feature 1: compression .* positive and finite, got -1",
@@ -94,9 +97,24 @@ def test_gradcheck_with_compression(rng):
     features = torch.from_numpy(rng.standard_normal((4, 3))).requires_grad_()
     scale = torch.tensor([0.1, 1.0, 30.0], dtype=torch.float64)
     edge = signed_log(torch.full((3,), 9.0, dtype=torch.float64), scale)
-    scaler = FeatureScaler(-edge, edge, scale)
-    assert torch.autograd.gradcheck(scaler, features, check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(scaler, features)
+    columns = torch.tensor([2, 0, 2])
+    for scaler in (FeatureScaler(-edge, edge, scale), FeatureScaler(-edge, edge, scale, columns)):
+        assert torch.autograd.gradcheck(scaler, features, check_forward_ad=True)
+        assert torch.autograd.gradgradcheck(scaler, features)
+
+
+def test_a_column_that_is_scaled_twice_has_both_ranges(rng):
+    """Also of bins with leading axes; a column that is not listed is not looked at."""
+    first = scaler_of([0.0, 1.0], [1.0, 3.0], [0.5, 2.0])
+    second = scaler_of([-1.0], [0.2], [1e-3])
+    parts = ((first.minimum, second.minimum), (first.maximum, second.maximum))
+    scale = torch.cat([first.compression, second.compression])
+    scaler = FeatureScaler(*map(torch.cat, parts), scale, [3, 0, 3])
+    features = torch.from_numpy(rng.standard_normal((2, 5, 4))).float()
+    features[..., 1:3] = torch.nan
+    found = scaler(features)
+    assert torch.equal(found[..., :2], first(features[..., [3, 0]]))
+    assert torch.equal(found[..., 2:], second(features[..., [3]]))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -1,8 +1,7 @@
-"""TSFEL, which makes other features of the same bins; and random convolutions of them, then ridge.
+"""TSFEL, which makes other features of the same bins; and MiniRocket of them, then ridge.
 
-MiniRocket, and MultiRocket with Hydra, are the strongest general classifiers of time series that
-fit in seconds; aeon makes the convolutions. All are imported when first used, with their warnings
-kept to themselves.
+MiniRocket is among the strongest general classifiers of time series that fit in seconds; aeon makes
+its convolutions. Both are imported when first used, with their warnings kept to themselves.
 """
 
 from __future__ import annotations
@@ -10,11 +9,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 from sklearn.linear_model import RidgeClassifier, RidgeClassifierCV
@@ -23,10 +20,6 @@ from sklearn.preprocessing import StandardScaler
 
 Array = NDArray[Any]
 ALPHAS = np.logspace(-3, 5, 17)
-MINI_ROCKET = "MiniRocket"
-MULTI_ROCKET_HYDRA = "MultiRocketHydra"
-_CONVOLUTIONS = "aeon.transformations.collection.convolution_based"
-Transform = Callable[[Array], Array]
 
 
 @contextmanager
@@ -56,64 +49,45 @@ def tsfel_features(sample_rate_hz: float = 2000.0) -> Callable[[Array], Array]:
     return features
 
 
-class Predictor(NamedTuple):
-    """A fitted classifier of windows.
-
-    Attributes:
-        score: of windows ``[N, C, T]``, ``[N]``; at least 0 means slip.
-        alpha: penalty of the ridge.
-    """
-
-    score: Transform
-    alpha: float
-
-
 def fit(
     windows: Array,
     is_slip: Array,
     groups: Array | None = None,
     *,
-    name: str = MINI_ROCKET,
     seed: int = 0,
-    num_kernels: int | None = None,
-    num_groups: int = 64,
-) -> Predictor:
-    """Fit a classifier of windows with balanced classes.
+    num_kernels: int = 10_000,
+) -> Callable[[Array], Array]:
+    """MiniRocket and ridge fitted to windows with balanced classes: what scores windows.
 
     Args:
         windows: in any unit; a window's own scale matters.
         is_slip: bool.
         groups: what is left out together to choose the penalty, such as materials; by default it
             is chosen by leaving out single windows.
-        name: ``MINI_ROCKET`` or ``MULTI_ROCKET_HYDRA``.
         seed: of the kernels.
-        num_kernels: of MiniRocket or MultiRocket; their authors' by default.
-        num_groups: of Hydra's kernels, eight each, for every dilation.
+        num_kernels: about as many features.
 
     Shape:
         - windows: ``[N, C, T]``; is_slip, groups: ``[N]``
+        - output: ``[N]`` of the result; at least 0 means slip
     """
-    if name == MINI_ROCKET:
-        rocket = mini_rocket(windows, 1, num_kernels or 10_000, seed)
-        scaler = StandardScaler().fit(rocket.transform(_single(windows)))
-        transform: Transform = lambda x: scaler.transform(rocket.transform(_single(x)))  # noqa: E731
-    else:
-        transform = _multi_rocket_hydra(windows, seed, num_kernels or 6_250, num_groups)
+    rocket = mini_rocket(windows, 1, num_kernels, seed)
     with quiet():
-        rows = transform(windows)
+        scaler = StandardScaler()
+        rows = scaler.fit_transform(rocket.transform(_single(windows)))
         if groups is None:
             ridge = RidgeClassifierCV(ALPHAS, class_weight="balanced").fit(rows, is_slip)
-            alpha = float(ridge.alpha_)
         else:
             alpha = _best_alpha((rows @ rows.T).astype(np.float64), is_slip, groups)
             ridge = RidgeClassifier(alpha, class_weight="balanced").fit(rows, is_slip)
 
     def score(windows: Array) -> Array:
         with quiet():
-            found: Array = ridge.decision_function(transform(windows))
+            rows = scaler.transform(rocket.transform(_single(windows)))
+            found: Array = ridge.decision_function(rows)
         return found
 
-    return Predictor(score, alpha)
+    return score
 
 
 def mini_rocket(windows: Array, threads: int, num_kernels: int = 10_000, seed: int = 0) -> Any:
@@ -127,39 +101,12 @@ def mini_rocket(windows: Array, threads: int, num_kernels: int = 10_000, seed: i
     """
     with quiet():
         import numba
+        from aeon.transformations.collection.convolution_based import MiniRocket
 
         numba.config.THREADING_LAYER = "workqueue"  # that by OpenMP sets the threads of torch too
-        transform = import_module(_CONVOLUTIONS).MiniRocket(
-            n_kernels=num_kernels, n_jobs=threads, random_state=seed
-        )
+        transform = MiniRocket(n_kernels=num_kernels, n_jobs=threads, random_state=seed)
         transform.fit(_single(windows))
         transform.transform(_single(windows[:2]))
-    return transform
-
-
-def _multi_rocket_hydra(windows: Array, seed: int, num_kernels: int, num_groups: int) -> Transform:
-    """As aeon's ``MultiRocketHydraClassifier``: both transforms, each with a scaler of its own."""
-    threads = torch.get_num_threads()
-    with quiet(), torch.random.fork_rng([]):
-        import numba
-
-        numba.config.THREADING_LAYER = "workqueue"
-        hydra = import_module(f"{_CONVOLUTIONS}._hydra").HydraTransformer(
-            n_groups=num_groups, random_state=seed
-        )
-        rocket = import_module(_CONVOLUTIONS).MultiRocket(n_kernels=num_kernels, random_state=seed)
-        counts = hydra.fit_transform(_single(windows))
-        torch.set_num_threads(threads)  # which Hydra sets
-        of_hydra = import_module("aeon.classification.convolution_based._hydra")._SparseScaler()
-        of_hydra.fit(counts)
-        of_rocket = StandardScaler().fit(rocket.fit_transform(_single(windows)))
-
-    def transform(others: Array) -> Array:
-        with quiet():
-            counts = of_hydra.transform(hydra.transform(_single(others))).numpy()
-            values = of_rocket.transform(rocket.transform(_single(others)))
-        return np.concatenate([counts, values], 1, dtype=np.float32)
-
     return transform
 
 

@@ -375,7 +375,7 @@ def _scored(features: Value, is_lost: Value, detector: SlipDetector, dtype: np.d
     # a column that is pooled is of no channel; a product is quicker than to pick flags
     of_channel = np.equal.outer(np.array(channels), detector.channel_index.numpy())
     if of_channel.any():
-        is_filled = is_lost.cast(F32) @ of_channel > 0.0  # [B, K]
+        is_filled = is_lost.cast(F32) @ of_channel > 0.0  # [B, S]
         z = z.graph.where(is_filled, _float64(z, detector.imputation), z)
     return machine(z, detector.head, dtype)
 
@@ -404,10 +404,12 @@ def _pooled(features: Value, is_lost: Value, detector: SlipDetector) -> Value:
 
 
 def scaled(features: Value, scaler: FeatureScaler) -> Value:
-    """Features in [-1, 1], ``[B, K]``, float64: ``FeatureScaler``.
+    """Columns ``[B, K]`` in [-1, 1], ``[B, S]``, float64: ``FeatureScaler``.
 
     ONNX has no ``log1p``: the logarithm becomes ``Log(1 + x)``, off by some eps of the scale.
     """
+    if scaler.columns is not None:
+        features = features.take(scaler.columns.tolist(), 1)
     least, width = scaler.minimum.double(), (scaler.maximum - scaler.minimum).double()
     is_point = width == 0
     slope = torch.where(is_point, 0.0, 2 / width.masked_fill(is_point, 1.0))
@@ -422,12 +424,15 @@ def scaled(features: Value, scaler: FeatureScaler) -> Value:
 
 
 def machine(z: Value, head: QuadraticForm, dtype: np.dtype[Any]) -> Value:
-    """The score of scaled features, in its dtype: ``[B, K] -> [B]``."""
-    z = z.cast(dtype)
+    """The score of scaled columns, in its dtype: ``[B, S] -> [B]``."""
+    z, num = z.cast(dtype), len(head.quadratic)
     pull: Value = z.graph.constant(head.linear.double(), dtype)
-    if not head.is_linear:
+    if num == head.num_features:
         pull = z @ head.quadratic.double() + pull
     score = (pull * z).sum(1) + float(head.constant)
+    if 0 < num < head.num_features:
+        first: Value = z.slice(0, num, 1)
+        score = score + (first @ head.quadratic.double() * first).sum(1)
     largest = float(np.finfo(dtype).max)
     return score.clamp(-largest, largest).cast(dtype)
 

@@ -1,1 +1,1 @@
-"""What describes a bin: the 17 descriptors, the pool of 2582 features, and which to keep."""
+"""What describes a bin: descriptors, the pool of features, and which to keep."""

@@ -30,7 +30,7 @@ from tactslip_torch.features.descriptors import (
     root,
     taken,
 )
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.names import SIMPLE_STATISTICS, FeatureName
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import ascending, is_traced
 from tactslip_torch.signals.wavelet import (
@@ -42,12 +42,19 @@ from tactslip_torch.signals.wavelet import (
     spectrum_matrix,
 )
 
-RowKind = Literal["slow", "time", "freq"]
-ROW_KINDS: tuple[RowKind, ...] = ("slow", "time", "freq")
+RowKind = Literal["raw", "time", "freq"]
+ROW_KINDS: tuple[RowKind, ...] = ("raw", "time", "freq")
 
 
-def pool_names(hand: HandLayout, level: int) -> tuple[FeatureName, ...]:
-    """Names of all features of a hand, in the paper's order."""
+def pool_names(hand: HandLayout, level: int, *, is_paper: bool = False) -> tuple[FeatureName, ...]:
+    """Names of all features of a hand: the paper's in its order, then what else there is.
+
+    Args:
+        hand: the channels.
+        level: number of wavelet levels.
+        is_paper: the paper's alone. The others are, by channel in the order of the hand, those of
+            ``SIMPLE_STATISTICS`` that the paper does not have of it.
+    """
     names = [
         FeatureName(hand.names[i], "raw", "time", descriptor)
         for i in hand.slow
@@ -67,16 +74,24 @@ def pool_names(hand: HandLayout, level: int) -> tuple[FeatureName, ...]:
             for kind in "AD"
             for m in range(1, level + 1)
         ]
+    if not is_paper:
+        known = set(names)
+        simple = [
+            FeatureName(channel, "raw", "time", descriptor)
+            for channel in hand.names
+            for descriptor in SIMPLE_STATISTICS
+        ]
+        names += [name for name in simple if name not in known]
     return tuple(names)
 
 
 class _Row(NamedTuple):
-    """Values that are described together: a slow channel's bin, a fast one's branch or spectrum.
+    """Values that are described together: a channel's bin, or a fast one's branch or spectrum.
 
     Attributes:
         kind: which of the three.
         channel: index in the hand.
-        branch: index in ``branch_names``; -1 for a slow channel.
+        branch: index in ``branch_names``; -1 for the bin.
     """
 
     kind: RowKind
@@ -155,7 +170,7 @@ def make_plan(hand: HandLayout, level: int, names: Sequence[FeatureName | str]) 
     found: list[tuple[_Row, str]] = []
     for name in (known[str(name)] for name in names):
         branch = branches[name.component]
-        kind: RowKind = "slow" if branch < 0 else "time" if name.domain == "time" else "freq"
+        kind: RowKind = "raw" if branch < 0 else "time" if name.domain == "time" else "freq"
         found.append((_Row(kind, channel_of[name.channel], branch), name.descriptor))
     is_share = [descriptor == "band_energy_ratio" for _, descriptor in found]
     rows = sorted(
@@ -181,14 +196,14 @@ _LEAST_LENGTH = 16 * torch.finfo(torch.float64).eps / 0.35
 """Of a row less its mean, as a part of its bin's magnitude; below it is rounding. A span of 16 eps:
 that of 100 centred values of length 1 lies between .2 (two levels) and 1.41."""
 _CHUNK_BINS = 32  # what fits the cache of a processor
-_OWN_ROWS = (*SORTED, "entropy", "correlation", "spectral_spread")
-"""Descriptors of so much work that they are taken of the rows that want them alone; those of sorted
-values together, of the rows that want any of them."""
+_OWN_ROWS = (*SORTED, "entropy", "correlation", "spectral_spread", "mean_abs_change")
+"""Descriptors of so much work, or of so few rows, that they are taken of the rows that want them
+alone; those of sorted values together, of the rows that want any of them."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """The coordinates of one branch, or of a slow channel's bin, and what is made of them.
+    """The coordinates of one branch, or of the bin, and what is made of them.
 
     There are ``r`` of the branch less its mean, of the same length as it, and then its sum: the sum
     of whole numbers is exact.
@@ -262,7 +277,7 @@ class LinearMaps:
         return len(self.frequency_hz)
 
     def block(self, branch: int) -> Block:
-        """The coordinates of a branch by its index; of a slow channel's bin for -1."""
+        """The coordinates of a branch by its index; of the bin itself for -1."""
         return self._blocks[branch]
 
     @cached_property
@@ -396,7 +411,10 @@ class Bank:
         wanted: dict[_Row, set[str]] = {row: set() for row in plan.rows}
         for each in plan.wanted:
             wanted[plan.rows[each.row]].add(each.descriptor)
-        families = (_Family(maps, wanted, frames, is_fast) for is_fast in (False, True))
+        families = (
+            _Family(maps, wanted, frames, is_fast, is_raw)
+            for is_fast, is_raw in ((False, True), (True, True), (True, False))
+        )
         self._families = [family for family in families if family.blocks]
         self._sets: list[_RowSet] = []
         for is_freq in (False, True):
@@ -484,18 +502,24 @@ class Bank:
 class _Family:
     """Channels of one kind, and the coordinates that the rows of any of them are made of.
 
-    The coordinates of all blocks (branches; of slow channels the bin) lie side by side, those of
-    one block followed by its sum; ``c`` channels, ``K`` coordinates in ``b`` blocks.
+    The coordinates of all blocks (of branches, or of the bin) lie side by side, those of one block
+    followed by its sum; ``c`` channels, ``K`` coordinates in ``b`` blocks.
     """
 
     def __init__(
-        self, maps: LinearMaps, wanted: Iterable[_Row], frames: Sequence[Frame], is_fast: bool
+        self,
+        maps: LinearMaps,
+        wanted: Iterable[_Row],
+        frames: Sequence[Frame],
+        is_fast: bool,
+        is_raw: bool,
     ) -> None:
         self.num = maps.num_samples
         self.frames = [i for i, frame in enumerate(frames) if frame.is_fast == is_fast]
         own = [frames[i] for i in self.frames]
         self.channels = tuple(channel for frame in own for channel in frame.channels)
-        self.blocks = sorted({row.branch for row in wanted if row.channel in self.channels})
+        own_rows = (row for row in wanted if row.channel in self.channels)
+        self.blocks = sorted({row.branch for row in own_rows if (row.branch < 0) == is_raw})
         blocks = [maps.block(branch) for branch in self.blocks]
         if not blocks:
             return
@@ -584,7 +608,7 @@ class _RowSet:
         for number, family in enumerate(families):
             num_blocks = len(family.blocks)
             for place, branch in enumerate(family.blocks):
-                kind: RowKind = "freq" if is_freq else "slow" if branch < 0 else "time"
+                kind: RowKind = "freq" if is_freq else "raw" if branch < 0 else "time"
                 own = [_Row(kind, channel, branch) for channel in family.channels]
                 chosen = [i for i, row in enumerate(own) if row in wanted]
                 if not chosen:

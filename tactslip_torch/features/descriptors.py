@@ -1,15 +1,15 @@
-"""The paper's descriptors, each defined once, as short functions of ``Rows``.
+"""Descriptors, the paper's and two more, each defined once, as short functions of ``Rows``.
 
 Rows are bins, wavelet branches or spectra that were brought to order one before (``bank.py``), so
 that no definition has to know of extremes. Only operations that ``torch.Tensor`` and the values of
 an ONNX graph (``deploy/value.py``) both offer are used: the same functions are the reference on any
 device, with gradients, and write the graph.
 
-A row that is constant has std, cv, skewness, correlation and entropy 0 and kurtosis 3; a zero row
-has peak factor 0; a zero spectrum has centroid, spread and band energy ratios 0. Gradients of
-constant rows and of tied values are 0 or one-sided, never NaN. Those of ``median``, ``iqr`` and
-``mode`` depend on which of several nearly equal values is chosen. No gradient flows through
-``entropy``.
+A row that is constant has std, cv, skewness, correlation, entropy and mean absolute change 0 and
+kurtosis 3; a zero row has rms and peak factor 0; a zero spectrum has centroid, spread and band
+energy ratios 0. Gradients of constant rows and of tied values are 0 or one-sided, never NaN. Those
+of ``median``, ``iqr`` and ``mode`` depend on which of several nearly equal values is chosen. No
+gradient flows through ``entropy``.
 """
 
 from __future__ import annotations
@@ -302,6 +302,17 @@ def _spectral_spread(x: Rows) -> Tensor:
     return root((amplitude * distance * distance).sum(-1).double() / total)
 
 
+def _rms(x: Rows) -> Tensor:
+    """Root mean square; 0, without gradient, for a zero row."""
+    return root(x.mean * x.mean + x.variance) * x.unit
+
+
+def _mean_abs_change(x: Rows) -> Tensor:
+    """Mean distance between neighbours, ``mean |x[t + 1] - x[t]|``; 0 for a constant."""
+    change = x.values[..., 1:] - x.values[..., :-1]
+    return change.abs().mean(-1).double() * x.unit
+
+
 def band_energy_ratios(energies: Tensor) -> Tensor:
     """Part of each branch in the energy of all branches' spectra; 0 if all are zero.
 
@@ -341,14 +352,17 @@ DESCRIPTORS: dict[str, Callable[[Rows], Tensor]] = {
     "correlation": _correlation,
     "spectral_centroid": _spectral_centroid,
     "spectral_spread": _spectral_spread,
+    "rms": _rms,
+    "mean_abs_change": _mean_abs_change,
 }
 """Every descriptor by its name, in the order of ``enum Descriptor`` (``native/engine.h``).
 
-Of every signal those up to the peak factor; correlation of branches; the others of spectra.
+Of every signal those up to the peak factor; correlation of branches; centroid and spread of
+spectra; the last two, which the paper has not, of bins.
 """
 COMMON_DESCRIPTORS = tuple(DESCRIPTORS)[:13]
 TIME_DESCRIPTORS = (*COMMON_DESCRIPTORS, "correlation")
-SPECTRUM_DESCRIPTORS = (*COMMON_DESCRIPTORS, *tuple(DESCRIPTORS)[14:])
+SPECTRUM_DESCRIPTORS = (*COMMON_DESCRIPTORS, "spectral_centroid", "spectral_spread")
 SORTED = ("median", "mode", "iqr")
 """Descriptors of sorted values."""
 STEPPED = ("mode", "entropy")

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+SIMPLE_STATISTICS = ("mean", "std", "rms", "range", "mean_abs_change")
+"""Descriptors of the filtered bin itself that every channel has, fast ones too; in volts."""
+
 
 @dataclass(frozen=True)
 class FeatureName:
@@ -11,7 +14,8 @@ class FeatureName:
 
     Args:
         channel: channel name, such as ``"PVDF3"``; of a pooled feature the kind, ``"PVDF"``.
-        component: ``"raw"`` (of a slowly adapting channel) or a branch, ``"A1"`` to ``"D4"``.
+        component: ``"raw"`` (the filtered bin) or, of a fast channel, a branch, ``"A1"`` to
+            ``"D4"``.
         domain: ``"time"`` or ``"freq"``.
         descriptor: name in ``descriptors.py``, or ``"band_energy_ratio"``.
         statistic: over the channels of the kind, such as ``"std"`` (``pooling.py``); empty for a
@@ -38,3 +42,8 @@ class FeatureName:
     def is_pooled(self) -> bool:
         """Whether it is a statistic over channels."""
         return bool(self.statistic)
+
+    @property
+    def is_simple(self) -> bool:
+        """Whether it is one of ``SIMPLE_STATISTICS`` of the filtered bin, or pooled of such."""
+        return self.component == "raw" and self.descriptor in SIMPLE_STATISTICS

@@ -1,7 +1,8 @@
 """The pool: every descriptor of every channel, branch and spectrum.
 
 For the paper's hand 14 slow channels x 13 descriptors + 10 fast ones x (8 branches x (14 time + 15
-frequency) + 8 band energy ratios) = 2582 features of a 50 ms bin.
+frequency) + 8 band energy ratios) = 2582 features of a 50 ms bin, which are the paper's. Behind
+them are 78 simple statistics of filtered bins, so that every channel has all five.
 
 Two backends make the same features. ``"torch"`` is the definitions (``bank.py``): differentiable,
 on any device. ``"native"`` is ``native/engine.cpp``, for values on the CPU. float64 agrees to 1e-9
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any, Literal, get_args
 
@@ -70,7 +72,7 @@ def saturating(x: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 class FeaturePool(nn.Module):
-    """Features of filtered bins: all of a hand, in the paper's order, or a selection of them.
+    """Features of filtered bins: all of a hand, the paper's before others, or some of them.
 
     Follows the dtype of its input. Gradients flow wherever the descriptor is differentiable; they
     are finite up to 1e288 V. The linear maps (wavelet branches and spectrum) are evaluated on an
@@ -107,7 +109,9 @@ class FeaturePool(nn.Module):
     Example:
         >>> pool = FeaturePool(HandLayout.paper24())
         >>> pool(torch.randn(5, 24, 100)).shape, str(pool.names[0])
-        (torch.Size([5, 2582]), 'SG1 raw time mean')
+        (torch.Size([5, 2660]), 'SG1 raw time mean')
+        >>> int(pool.is_paper.sum()), str(pool.names[-1])
+        (2582, 'PVDF10 raw time mean_abs_change')
         >>> pool.select([200, 7])(torch.randn(5, 24, 100)).shape
         torch.Size([5, 2])
     """
@@ -171,6 +175,10 @@ class FeaturePool(nn.Module):
         _ = pool.plan  # refuses an empty one
         return pool
 
+    def paper(self) -> FeaturePool:
+        """The pool of those of these features that the paper has."""
+        return self.select(self.is_paper.nonzero()[:, 0].tolist())
+
     def places(self, names: Iterable[FeatureName]) -> list[int]:
         """Where features of these names are among ``names``.
 
@@ -179,6 +187,12 @@ class FeaturePool(nn.Module):
         """
         place = {name: index for index, name in enumerate(self.names)}
         return [place[name] for name in names]
+
+    @property
+    def is_paper(self) -> Tensor:
+        """Which of the features the paper has, ``[F]``, bool; in a whole pool the first."""
+        paper = set(pool_names(self.hand, self.level, is_paper=True))
+        return torch.tensor([name in paper for name in self.names])
 
     @property
     def maps(self) -> LinearMaps:
@@ -271,11 +285,8 @@ class FeaturePool(nn.Module):
         plan, steps = self.plan, wavelet_steps(self.bin_samples, self.wavelet, self.level)
         spectrum = spectrum_matrix(self.bin_samples, self.spectrum)
         num_branches = len(steps.out)
-        offset = {
-            "slow": 1,
-            "time": 0,
-            "freq": num_branches,
-        }  # the bin of a slow channel is its row 0
+        # rows are branches, their spectra, band energy ratios, and the bin, whose branch is -1
+        offset = {"time": 0, "freq": num_branches, "raw": 2 * num_branches + 2}
         rows = [(row.channel, offset[row.kind] + row.branch) for row in plan.rows]
         wanted = [(*rows[w.row], tuple(DESCRIPTORS).index(w.descriptor), w.place)
                   for w in plan.wanted]  # fmt: skip
@@ -362,17 +373,15 @@ def is_rounding(pool: FeaturePool) -> Tensor:
     of size one: such a feature has no spread to speak of, or moves by much of it where samples move
     by ``1e-13``.
     """
-    of_fast = _of_fast_channel(pool.bin_samples, pool.wavelet, pool.level, pool.spectrum)
-    num_slow = len(pool_names(pool.hand, pool.level)) - len(pool.hand.fast) * len(of_fast)
-    slow = torch.zeros(num_slow, dtype=torch.bool)
-    return torch.cat([slow, of_fast.repeat(len(pool.hand.fast))])[list(pool.selected)]
+    of_branches = _of_branches(pool.bin_samples, pool.wavelet, pool.level, pool.spectrum)
+    return torch.tensor([replace(name, channel="") in of_branches for name in pool.names])
 
 
 @lru_cache(maxsize=16)
-def _of_fast_channel(
+def _of_branches(
     bin_samples: int, wavelet: Wavelet, level: int, spectrum: SpectrumMethod
-) -> Tensor:
-    """The same of the features of one channel that adapts fast."""
+) -> frozenset[FeatureName]:
+    """Those of the branches of any channel, as names without a channel; of a bin itself none is."""
     hand = HandLayout((Channel("noise", "noise", "none", "none", "fast"),))
     options = {"bin_samples": bin_samples, "wavelet": wavelet, "level": level}
     pool = FeaturePool(hand, spectrum=spectrum, backend="torch", **options)  # type: ignore[arg-type]
@@ -383,4 +392,5 @@ def _of_fast_channel(
     spread = before.std(0)
     is_large = (after - before).abs() > _LARGE * spread
     found: Tensor = (is_large.double().mean(0) > _SHARE) | (spread < _NONE)
-    return found
+    names = zip(pool.names, found.tolist(), strict=True)
+    return frozenset(replace(n, channel="") for n, is_found in names if is_found)

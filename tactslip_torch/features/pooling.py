@@ -345,10 +345,7 @@ class ChannelPooling(nn.Module):
             num_channels=len(self.hand),
             num_inputs=len(self.inputs),
             num_columns=len(self.names),
-            singles=[
-                (place, column[made], self.hand.names.index(self.inputs[place].channel))
-                for made, place in enumerate(self.singles)
-            ],
+            singles=[(place, column[made]) for made, place in enumerate(self.singles)],
             pools=pools,
             fill=self.fill.cpu().numpy(),
             **more,

@@ -67,10 +67,10 @@ class SlipDetector(nn.Module):
         channel_filter: the Savitzky-Golay filter of each channel.
         selected: pool indices of the features that are read, best first: the K columns themselves
             or, with ``pooling``, its inputs.
-        scaler: of the K columns.
-        head: the machine on scaled features.
+        scaler: from the K columns to S scaled columns, as many unless it has ``columns``.
+        head: the machine on scaled columns.
         info: JSON-able metadata about the training, kept in the file.
-        imputation: scaled columns in place of those of a lost channel, ``[K]``; default 0.
+        imputation: scaled columns in place of those of a lost channel, ``[S]``; default 0.
         pooling: from the features that are read to the columns; ``None``: they are the columns.
         sensing: what training tells of channels that work, by which lost channels and decisions
             that are not valid are told; may be set at any time. Default: ``Sensing.unknown``.
@@ -79,7 +79,7 @@ class SlipDetector(nn.Module):
     Shape:
         - bins: ``[*, C, n]``, filtered, in volts; ``n = pool.bin_samples``
         - score: ``[*]``, dtype of ``bins``; at least 0 means slip, NaN: not valid
-        - inside: ``bins -> features [*, M] -> columns [*, K] -> scaled [*, K] -> score [*]``
+        - inside: ``bins -> features [*, M] -> columns [*, K] -> scaled [*, S] -> score [*]``
         - raw samples, for ``score_raw`` and ``predict_raw``: ``[*, C, before + n + after]``, with
           ``context_before`` and ``context_after`` samples around the bin
 
@@ -88,7 +88,7 @@ class SlipDetector(nn.Module):
     """
 
     imputation: Tensor
-    channel_index: Tensor  # of each column; one past the last channel for a pooled one
+    channel_index: Tensor  # of each scaled column; one past the last channel for a pooled one
     needed_index: Tensor  # of the channels in use
     _is_used: Tensor
     counted: Tensor  # [C], 1 for channels that count among those that must be alive
@@ -120,6 +120,8 @@ class SlipDetector(nn.Module):
         self.register_buffer("imputation", imputation.to(next(head.buffers()), copy=True))
         place = {name: index for index, name in enumerate(pool.hand.names)}
         channels = [place.get(name.channel, len(place)) for name in self.selected_names]
+        if scaler.columns is not None:
+            channels = [channels[column] for column in scaler.columns.tolist()]
         indices = {"channel": channels, "needed": self.extractor.plan.channels}
         for name, index in indices.items():
             self.register_buffer(f"{name}_index", torch.tensor(index), persistent=False)
@@ -311,13 +313,13 @@ class SlipDetector(nn.Module):
         return columns
 
     def scaled(self, features: Tensor, is_lost: Tensor | None = None) -> Tensor:
-        """Scaled columns, which the head takes; shapes as ``columns`` has them."""
+        """Scaled columns ``[*, S]``, which the head takes; otherwise as ``columns``."""
         columns = self.columns(saturating(features, self.scaler.minimum.dtype), is_lost)
         scaled: Tensor = self.scaler(columns).to(self.imputation.dtype)
         return scaled if is_lost is None else self.imputed(scaled, is_lost)
 
     def imputed(self, scaled: Tensor, is_lost: Tensor) -> Tensor:
-        """Scaled columns ``[*, K]`` with imputation values in those of lost channels ``[*, C]``."""
+        """Scaled columns ``[*, S]`` with imputation values in those of lost channels ``[*, C]``."""
         pooled = torch.zeros_like(is_lost[..., :1])  # a pooled column is of the other channels
         is_filled = torch.cat([is_lost, pooled], -1).index_select(-1, self.channel_index)
         return torch.where(is_filled, self.imputation, scaled)
@@ -437,6 +439,11 @@ class SlipDetector(nn.Module):
                     "must be its inputs, in their order"
                 )
             num = len(pooling.names)
+        if (columns := self.scaler.columns) is not None:
+            if bool((columns >= num).any()):
+                most = int(columns.max())
+                raise ValueError(f"the scaler takes column {most} of {num}, counted from 0")
+            num = len(columns)
         if not num == len(self.scaler.minimum) == self.head.num_features:
             raise ValueError(
                 f"{num} columns, a scaler of {len(self.scaler.minimum)} and a head of "
@@ -448,7 +455,7 @@ class SlipDetector(nn.Module):
             )
         if imputation.shape != (num,) or not bool((imputation.abs() <= 1).all()):
             raise ValueError(
-                f"imputation must be {num} scaled features in [-1, 1], got "
+                f"imputation must be {num} scaled columns in [-1, 1], got "
                 f"{tuple(imputation.shape)} of at most {float(imputation.abs().max()):g}"
             )
 
@@ -503,7 +510,8 @@ class SlipDetector(nn.Module):
         cls, metadata: Mapping[str, Any], state: Mapping[str, Tensor], backend: BackendName
     ) -> SlipDetector:
         """What ``save`` wrote."""
-        if odd := [name for name, value in state.items() if not value.is_floating_point()]:
+        numbers = {name: value for name, value in state.items() if name != "scaler.columns"}
+        if odd := [name for name, value in numbers.items() if not value.is_floating_point()]:
             raise ValueError(f"{odd[0]} must hold floating-point numbers")
         for name, most in (("channels", _MOST_CHANNELS), ("window_lengths", _MOST_CHANNELS)):
             if len(metadata[name]) > most:
@@ -556,25 +564,29 @@ class _Engine:
         self._of = detector
         scaler, head, channel_filter = detector.scaler, detector.head, detector.channel_filter
         more: dict[str, Any] = {
-            "scaling": tuple(
-                None if each is None else each.double().numpy()
-                for each in (scaler.minimum, scaler.maximum, scaler.compression)
+            "scaling": (
+                scaler.minimum.double().numpy(),
+                scaler.maximum.double().numpy(),
+                None if scaler.compression is None else scaler.compression.double().numpy(),
+                None if scaler.columns is None else scaler.columns.numpy(),
             )
         }
         if type(head) is QuadraticForm:
             quadratic, linear = head.quadratic.double(), head.linear.double()
             more["head"] = (quadratic.numpy(), linear.numpy(), float(head.constant))
-        more["imputation"] = detector.imputation.double().numpy()
         hand, sensing = detector.pool.hand, detector.sensing
+        of_channel = detector.channel_index.numpy()
+        of_channel = np.where(of_channel < len(hand), of_channel, -1)
+        more["imputation"] = detector.imputation.double().numpy(), of_channel
         if detector.pooling is not None:
             self._machine = detector.pooling.machine(**more)
         else:
-            num, of_channel = len(detector.selected), detector.channel_index.tolist()
+            num = len(detector.selected)
             self._machine = Machine(
                 num_channels=len(hand),
                 num_inputs=num,
                 num_columns=num,
-                singles=[(i, i, of_channel[i]) for i in range(num)],
+                singles=[(i, i) for i in range(num)],
                 **more,
             )
         channels = range(len(hand))

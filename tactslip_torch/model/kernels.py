@@ -226,10 +226,10 @@ class SolveReport:
 
 
 class QuadraticForm(nn.Module):
-    """``z' Q z + l' z + a``.
+    """``x' Q x + l' z + a``, with the first ``m`` of the K features ``z`` in ``x``.
 
     Args:
-        quadratic: ``[K, K]``, symmetric; of a linear machine empty, ``[0, 0]``.
+        quadratic: ``[m, m]``, symmetric; of a linear machine empty, ``[0, 0]``.
         linear: ``[K]``.
         constant: a scalar tensor.
 
@@ -247,11 +247,11 @@ class QuadraticForm(nn.Module):
     def __init__(self, quadratic: Tensor, linear: Tensor, constant: Tensor) -> None:
         super().__init__()
         self.solved: SolveReport | None = None
-        num = linear.shape[-1]
-        is_known = quadratic.shape in ((num, num), (0, 0))
-        if not is_known or linear.shape != (num,) or constant.shape != ():
+        num = quadratic.shape[-1] if quadratic.ndim else -1
+        is_known = quadratic.shape == (num, num) and linear.ndim == 1 and num <= len(linear)
+        if not is_known or constant.shape != ():
             raise ValueError(
-                "expected quadratic [K, K] or [0, 0], linear [K] and a scalar constant, got "
+                "expected quadratic [m, m], linear [K], m at most K, and a scalar constant, got "
                 f"{tuple(quadratic.shape)}, {tuple(linear.shape)} and {tuple(constant.shape)}"
             )
         self.register_buffer("quadratic", quadratic.clone())
@@ -281,11 +281,15 @@ class QuadraticForm(nn.Module):
             - z: ``[*, K]``
             - output: ``[*]``
         """
-        if self.is_linear:
-            linear: Tensor = torch.linalg.vecdot(self.linear, z) + self.constant
-            return linear
-        pull = nn.functional.linear(z, self.quadratic, self.linear)  # as few calls as can be
-        score: Tensor = torch.linalg.vecdot(pull, z) + self.constant
+        if (num := len(self.quadratic)) == self.num_features:
+            pull = nn.functional.linear(z, self.quadratic, self.linear)  # as few calls as can be
+            whole: Tensor = torch.linalg.vecdot(pull, z) + self.constant
+            return whole
+        score: Tensor = torch.linalg.vecdot(self.linear, z) + self.constant
+        if num:
+            first = z[..., :num]
+            pull = nn.functional.linear(first, self.quadratic)
+            score = score + torch.linalg.vecdot(pull, first)
         return score
 
 

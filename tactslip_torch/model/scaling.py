@@ -7,6 +7,7 @@ for features whose tails are heavy on real recordings.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -20,29 +21,42 @@ class FeatureScaler(nn.Module):
     """Takes a range of every feature to [-1, 1] and clips the rest.
 
     Clipping is ours: a quadratic kernel grows with the fourth power of what leaves the range.
-    A feature whose range is a point becomes 0.
+    A feature whose range is a point becomes 0. With ``columns`` a feature may be scaled several
+    times, each with a compression scale and a range of its own.
 
     Args:
-        minimum: ``[K]``, what becomes -1, of the compressed feature where there is compression.
-        maximum: ``[K]``, what becomes 1.
-        compression: ``[K]``, compression scales of ``signed_log``, which comes first; without it
+        minimum: ``[S]``, what becomes -1, of the compressed feature where there is compression.
+        maximum: ``[S]``, what becomes 1.
+        compression: ``[S]``, compression scales of ``signed_log``, which comes first; without it
             features are not compressed.
+        columns: ``[S]``, whole numbers, which of the K features each is; without it all of them
+            in their order, so that S is K.
 
     Raises:
-        ValueError: if shapes disagree, a range is not finite, a minimum exceeds its maximum or a
-            compression is not positive and finite.
+        ValueError: if shapes disagree, a range is not finite, a minimum exceeds its maximum, a
+            compression is not positive and finite or a column is no index.
     """
 
     minimum: Tensor
     maximum: Tensor
     compression: Tensor | None
+    columns: Tensor | None
 
-    def __init__(self, minimum: Tensor, maximum: Tensor, compression: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        minimum: Tensor,
+        maximum: Tensor,
+        compression: Tensor | None = None,
+        columns: Tensor | Sequence[int] | None = None,
+    ) -> None:
         super().__init__()
-        shapes = [tuple(x.shape) for x in (minimum, maximum, compression) if x is not None]
+        if columns is not None:
+            columns = torch.as_tensor(columns, device=minimum.device)
+        parts = minimum, maximum, compression, columns
+        shapes = [tuple(x.shape) for x in parts if x is not None]
         if len(set(shapes)) > 1:
             raise ValueError(
-                f"minimum, maximum and compression must agree in shape, got "
+                "minimum, maximum, compression and columns must agree in shape, got "
                 f"{', '.join(map(str, shapes))}"
             )
         bad = ~(minimum.isfinite() & maximum.isfinite() & (minimum <= maximum))
@@ -61,9 +75,14 @@ class FeatureScaler(nn.Module):
                     f"feature {i}: compression must be positive and finite, got "
                     f"{float(compression[i]):g}"
                 )
+        if columns is not None and (columns.dtype != torch.int64 or bool((columns < 0).any())):
+            raise ValueError(
+                f"columns must be whole numbers from 0 on, got {columns.tolist()!r:.80}"
+            )
         self.register_buffer("minimum", minimum.clone())
         self.register_buffer("maximum", maximum.clone())
         self.register_buffer("compression", None if compression is None else compression.clone())
+        self.register_buffer("columns", None if columns is None else columns.clone())
 
     @classmethod
     def fit(cls, features: Tensor, *, compress: bool = False, tail: float = 0.0) -> FeatureScaler:
@@ -101,8 +120,11 @@ class FeatureScaler(nn.Module):
         """Scale bins; NaN stays NaN, gradients are 0 where a value is clipped.
 
         Shape:
-            - features, output: ``[*, K]``
+            - features: ``[*, K]``
+            - output: ``[*, S]``
         """
+        if self.columns is not None:
+            features = features.index_select(-1, self.columns)
         if self.compression is not None:
             features = signed_log(features, self.compression)
         width = self.maximum - self.minimum

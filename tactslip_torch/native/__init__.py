@@ -28,6 +28,7 @@ Array = np.ndarray[Any, Any]
 BackendName = Literal["auto", "native", "torch"]
 _LOG = logging.getLogger(__name__)
 MAX_BRANCHES = 32
+_WHOLE = 8  # numbers to a multiple of which arrays of the machine are filled up
 
 
 class _Matrix(ctypes.Structure):
@@ -94,11 +95,11 @@ class _Pool(ctypes.Structure):
 class _Machine(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in (
-            "num_channels", "num_inputs", "num_columns", "num_singles", "num_pools",
-            "most_channels")),
+            "num_channels", "num_inputs", "num_columns", "num_scaled", "num_quadratic",
+            "num_singles", "num_pools", "most_channels")),
         *((name, ctypes.c_void_p) for name in (
-            "single_inputs", "single_columns", "single_channels", "pools", "fill", "minimum",
-            "maximum", "compression", "imputation", "quadratic", "linear")),
+            "single_inputs", "single_columns", "pools", "fill", "sources", "minimum", "maximum",
+            "compression", "imputation", "channels", "quadratic", "linear")),
         ("constant", ctypes.c_double),
     )  # fmt: skip
 
@@ -150,6 +151,12 @@ class _Kept:
         array = np.array(values, dtype, order="C")  # a copy: tensors may move their memory
         self._held.append(array)
         return array.ctypes.data
+
+    def _filled_up(self, values: Any, dtype: Any, filler: float) -> int:
+        """An array whose last axis is filled up, so that any vector of the engine reads whole."""
+        array = np.asarray(values, dtype)
+        widths = [(0, 0)] * (array.ndim - 1) + [(0, -array.shape[-1] % _WHOLE)]
+        return self._array(np.pad(array, widths, constant_values=filler), dtype)
 
     def _run(self, plan: Any, machine: Any, bins: _Bins) -> None:
         pointers = (each and ctypes.byref(each) for each in (plan, machine, bins))
@@ -205,9 +212,10 @@ class FeatureEngine(_Kept):
         num_channels: of bins.
         slow: indices of the channels that are described as they are.
         fast: indices of the channels whose branches and spectra are described.
-        wanted: channel, row, descriptor and column of every feature. Rows are the branches (0 for a
-            slow channel), their spectra, and one for band energy ratios, whose descriptor is the
-            number of the branch. Descriptors are numbered as ``enum Descriptor``.
+        wanted: channel, row, descriptor and column of every feature. Rows are the branches, their
+            spectra, one for band energy ratios, whose descriptor is the number of the branch, and
+            the bin itself, the only one of a slow channel. Descriptors are numbered as ``enum
+            Descriptor``.
         low: from a bin, or the approximation's coefficients of one level, to those of the next.
         high: from the same to the coefficients of details.
         out: from coefficients to branches A1, D1, A2, D2 and so on.
@@ -242,7 +250,7 @@ class FeatureEngine(_Kept):
                 f"the native engine has {MAX_BRANCHES // 2} levels at most, got {num_branches // 2}"
                 '; use backend="torch"'
             )
-        self._num_rows = 2 * num_branches + 1
+        self._num_rows = 2 * num_branches + 2
         bands = [self._matrices(group, 4, np.float64) for group in (low, high, out)]
         lines = [spectrum @ matrix for matrix in out]
         wanted = sorted(wanted)
@@ -313,7 +321,7 @@ class FeatureEngine(_Kept):
             - bins: ``[M, C, n + context]``, float32 or float64; samples of a channel lie side by
               side
         """
-        num, width = len(bins), 0 if machine.has_head else machine.num_columns
+        num, width = len(bins), 0 if machine.has_head else machine.num_scaled
         each = self.num_channels
         ends = [*accumulate((8 * num, 8 * num * each, 8 * num * width, num, num, num, num * each))]
         memory = np.zeros(ends[-1], np.uint8)  # of all that is found: one address to ask for
@@ -381,12 +389,16 @@ class Machine(_Kept):
     Args:
         num_channels: of the hand.
         num_inputs: features that go in.
-        singles: input, column and channel of what is not pooled.
+        num_columns: K, of which S scaled columns are made.
+        singles: input and column of what is not pooled.
         pools: what is; their columns and the singles' are all there are.
-        fill: columns where no channel of their kind is in use.
-        imputation: scaled columns of lost channels; None: they stay as they are.
-        scaling: minimum, maximum and compression scales (or None); None: nothing is scaled.
-        head: quadratic part ``[K, K]`` (or empty), linear part and constant; None: no score.
+        fill: columns where no channel of their kind is in use, ``[K]``.
+        scaling: minimum, maximum, compression scales (or None) and the columns that are scaled
+            (None: one each), ``[S]``; None: nothing is scaled, and S is K.
+        imputation: scaled columns of lost channels, and the channel of each (-1: of several),
+            ``[S]``; None: they stay as they are.
+        head: quadratic part ``[m, m]`` of the first m scaled columns (or empty), linear part
+            ``[S]`` and constant; None: no score.
     """
 
     def __init__(
@@ -395,15 +407,18 @@ class Machine(_Kept):
         num_channels: int,
         num_inputs: int,
         num_columns: int,
-        singles: Sequence[tuple[int, int, int]],
+        singles: Sequence[tuple[int, int]],
         pools: Sequence[Pool] = (),
         fill: Array | None = None,
-        imputation: Array | None = None,
-        scaling: tuple[Array, Array, Array | None] | None = None,
+        scaling: tuple[Array, Array, Array | None, Array | None] | None = None,
+        imputation: tuple[Array, Array] | None = None,
         head: tuple[Array, Array, float] | None = None,
     ) -> None:
         super().__init__()
-        self.num_columns, self.has_head = num_columns, head is not None
+        minimum, maximum, compression, sources = scaling or (None,) * 4
+        if sources is None:
+            sources = np.arange(num_columns)
+        self.num_scaled, self.has_head = len(sources), head is not None
         made = (_Pool * max(1, len(pools)))()
         for to, pool in zip(made, pools, strict=False):
             kinds = ("mean", "std", "min", "max")
@@ -411,46 +426,49 @@ class Machine(_Kept):
             fractions = [0.0 if isinstance(s, str) else s for s in pool.statistics]
             to.num_channels, to.num_families = len(pool.channels), len(pool.scales)
             to.num_statistics = len(codes)
-            for name, values in (
-                ("channels", pool.channels),
-                ("inputs", pool.inputs),
-                ("statistics", codes),
-                ("columns", pool.columns),
-            ):
-                setattr(to, name, self._array(values, np.int64))
+            to.channels = self._array(pool.channels, np.int64)
+            to.statistics = self._array(codes, np.int64)
             to.fractions = self._array(fractions, np.float64)
-            to.scales = self._array(pool.scales, np.float64)
+            to.inputs = self._filled_up(pool.inputs.T, np.int64, 0)
+            to.columns = self._filled_up(pool.columns, np.int64, -1)
+            to.scales = self._filled_up(pool.scales, np.float64, 1.0)
         self._held.append(made)
-        places = np.array(singles, np.int64).reshape(-1, 3)
+        places = np.array(singles, np.int64).reshape(-1, 2)
         self.of = _Machine(
-            num_channels, num_inputs, num_columns, len(places), len(pools),
+            num_channels, num_inputs, num_columns, self.num_scaled, 0, len(places), len(pools),
             max((len(pool.channels) for pool in pools), default=0),
             *(self._array(each, np.int64) for each in places.T), ctypes.addressof(made),
         )  # fmt: skip
+        self.of.sources = self._filled_up(sources, np.int64, 0)
         if fill is not None:
             self.of.fill = self._array(fill, np.float64)
+        if minimum is not None:
+            self.of.minimum = self._filled_up(minimum, np.float64, 0.0)
+            self.of.maximum = self._filled_up(maximum, np.float64, 0.0)
+        if compression is not None:
+            self.of.compression = self._filled_up(compression, np.float64, 1.0)
         if imputation is not None:
-            self.of.imputation = self._array(imputation, np.float64)
-        for name, array in zip(("minimum", "maximum", "compression"), scaling or (), strict=False):
-            setattr(self.of, name, None if array is None else self._array(array, np.float64))
+            self.of.imputation = self._array(imputation[0], np.float64)
+            self.of.channels = self._array(imputation[1], np.int64)
         if head is not None:
             quadratic, linear, constant = head
-            self.of.linear, self.of.constant = self._array(linear, np.float64), constant
-            if quadratic.size:
+            self.of.linear = self._filled_up(linear, np.float64, 0.0)
+            self.of.constant = constant
+            if num := len(quadratic):
                 lower = np.tril(quadratic + quadratic.T)
                 lower[np.diag_indices_from(lower)] /= 2
-                rows = np.zeros((-(-num_columns // 4) * 4, num_columns))  # read by fours
-                rows[:num_columns] = lower
-                self.of.quadratic = self._array(rows, np.float64)
+                rows = np.pad(lower, [(0, -num % _WHOLE), (0, 0)]).reshape(-1, _WHOLE, num)
+                self.of.num_quadratic = num
+                self.of.quadratic = self._array(rows.swapaxes(1, 2), np.float64)
 
     def columns(self, inputs: Array, is_lost: Array | None = None) -> Array:
-        """Columns of bins, scaled if there is a scaling, ``[M, K]``.
+        """Columns of bins, scaled if there is a scaling, ``[M, S]``.
 
         Shape:
             - inputs: ``[M, inputs]``, float32 or float64
             - is_lost: ``[M, C]``, bool, channels that are left out of their pools
         """
-        found = np.empty((len(inputs), self.num_columns))
+        found = np.empty((len(inputs), self.num_scaled))
         inputs = np.asarray(inputs, np.float64)  # has a name, or it is gone before it is read
         call = _Bins(*_samples_of(inputs), scaled=found.ctypes.data)
         if is_lost is not None:
@@ -465,7 +483,7 @@ class Scores(NamedTuple):
 
     Attributes:
         is_odd: magnitudes are out of range, and all else is of no meaning, ``[M]``.
-        scaled: columns, ``[M, K]``; K is 0 where there is a score.
+        scaled: columns, ``[M, S]``; S is 0 where there is a score.
         score: ``[M]``, NaN where not valid; None without a head.
         is_valid: enough channels are alive, ``[M]``.
         in_range: so is the size of their signals, ``[M]``.

@@ -1,7 +1,7 @@
 // Features of filtered bins, in the order and under the names of features/descriptors.py.
 //
 // Lanes run across (bin, channel) pairs: element k of every vector belongs to pair k of a group, so
-// a line of code reads like its formula. A row (a slow channel's bin, a branch of a fast channel or
+// a line of code reads like its formula. A row (a channel's bin, a branch of a fast channel or
 // its spectrum) is formed by products with given matrices, in double, and brought to order one
 // before it is described: row = centre + span * d, with d in double or float. One sort of d feeds
 // median, mode, iqr and entropy.
@@ -254,6 +254,13 @@ template <class T> struct Describe {
     D value = s.top / rms;
     return rms > 0 ? value : D{};
   }
+  static D rms(const Half& s) { return root(s.energy / s.n); }
+  // Between neighbours in time, before values are sorted; in the unit of d.
+  static V mean_abs_change(const V* d, int64_t n) {
+    V sum = {};
+    for (int64_t i = 1; i < n; ++i) sum += magnitude(d[i] - d[i - 1]);
+    return sum / (T)(n - 1);
+  }
   static D correlation(const Half& s) {
     D value = s.both / root(s.second * s.other);
     return (s.span > 0) & (s.other > 0) ? value : D{};
@@ -317,7 +324,7 @@ template <class T> struct Group : Describe<T> {
   D unknown[H];       // NaN for what is broken, if that is not told otherwise, or 0
   D is_constant[H], centre[H];
   D values[MAX_BRANCHES][H];
-  uint32_t need[2 * MAX_BRANCHES + 1];
+  uint32_t need[2 * MAX_BRANCHES + 2];
   double limit;
   void* out;  // features of the first of these bins
   bool out_is_float;
@@ -432,6 +439,8 @@ template <class T> struct Group : Describe<T> {
     }
   }
 
+  int64_t num_rows() { return 2 * num_branches + 2; }  // of a channel, the last of which is its bin
+
   // Features of the group's row to their columns.
   void write(int64_t row_number) {
     for (int i = 0; i < MAX_BRANCHES; ++i)
@@ -447,7 +456,7 @@ template <class T> struct Group : Describe<T> {
   }
 
   template <class X> void write(X* to, int64_t row_number, int start, int end) {
-    int64_t at = channel[start] * (2 * num_branches + 1) + row_number;
+    int64_t at = channel[start] * num_rows() + row_number;
     to += (bin[start] - first_bin) * plan.num_features;
     for (int64_t w = plan.first[at]; w < plan.first[at + 1]; ++w) {
       const double* from = (const double*)values[plan.descriptor[w]];
@@ -477,6 +486,11 @@ template <class T> struct Group : Describe<T> {
       if (wanted & 1u << ENERGY) values[ENERGY][h] = Base::energy(half);
       if (wanted & 1u << PEAK_FACTOR) values[PEAK_FACTOR][h] = Base::peak_factor(half);
       if (wanted & 1u << CORRELATION) values[CORRELATION][h] = Base::correlation(half);
+      if (wanted & 1u << RMS) values[RMS][h] = Base::rms(half);
+    }
+    if (wanted & 1u << MEAN_ABS_CHANGE) {
+      V change = Base::mean_abs_change(d, count);
+      for (int h = 0; h < H; ++h) values[MEAN_ABS_CHANGE][h] = halves[h].span * get(&change, h);
     }
     if (!(wanted & ORDERED)) return;
     sort(d, (int)count);
@@ -602,13 +616,21 @@ template <class T> struct Group : Describe<T> {
     write(row_number);
   }
 
-  void describe_slow() {
+  // The bin itself.
+  void describe_raw() {
+    int64_t row_number = num_rows() - 1;
+    if (!need[row_number]) return;
     for (int h = 0; h < H; ++h) memcpy(row[h], y[h], n * sizeof(D));
     other = V{};
-    describe_time(need[0], true, nullptr, 0);
+    describe_time(need[row_number], true, nullptr, row_number);
   }
 
-  void describe_fast() {
+  void describe_branches() {
+    uint32_t shares = need[2 * num_branches];
+    int64_t levels_wanted = 0;
+    for (int64_t b = 0; b < num_branches; ++b)
+      if (need[b] || need[num_branches + b] || shares) levels_wanted = b / 2 + 1;
+    if (!levels_wanted) return;
     for (int h = 0; h < H; ++h) {  // the bin itself, for correlation
       Extent e = extent(y[h], n);
       D span = e.high - e.low, factor = 1 / span;
@@ -618,10 +640,6 @@ template <class T> struct Group : Describe<T> {
     }
     other = V{};
     for (int64_t i = 0; i < n; ++i) other += raw[i] * raw[i];
-    uint32_t shares = need[2 * num_branches];
-    int64_t levels_wanted = 0;
-    for (int64_t b = 0; b < num_branches; ++b)
-      if (need[b] || need[num_branches + b] || shares) levels_wanted = b / 2 + 1;
     // coefficients, finest first; those of level m lie from `starts[m]` on
     int64_t starts[MAX_BRANCHES / 2 + 1] = {0};
     for (int64_t m = 0; m < levels_wanted; ++m)
@@ -683,15 +701,14 @@ template <class T> struct Group : Describe<T> {
 
   // What is wanted of any of the pairs' channels.
   void gather_needs() {
-    int64_t num_rows = 2 * num_branches + 1;
-    for (int64_t r = 0; r < num_rows; ++r) {
+    for (int64_t r = 0; r < num_rows(); ++r) {
       need[r] = 0;
-      for (int k = 0; k < num; ++k) need[r] |= plan.need[channel[k] * num_rows + r];
+      for (int k = 0; k < num; ++k) need[r] |= plan.need[channel[k] * num_rows() + r];
     }
   }
 };
 
-// -- Pooling over channels, scaling and head: lanes run across bins ----------------------------------
+// -- Pooling over channels, scaling and head --------------------------------------------------------
 
 // log(1 + x) for x >= 0, as fdlibm has it: an error below 1 ulp.
 INLINE D log1p_of(D x) {
@@ -720,63 +737,113 @@ INLINE D signed_log(D x, D scale) {
   return x < 0 ? -bent : bent;
 }
 
+// What lanes run across: a few bins, or, of one bin alone, its families, scaled columns and rows of
+// the head. Each number is made by the same operations in the same order, so scores are the same.
+enum Across { BINS, ONE_BIN };
+
+constexpr int64_t filled_up(int64_t num) { return (num + WHOLE - 1) / WHOLE * WHOLE; }
+
 struct Judge {
   const Machine& machine;
-  D *x, *z, *values, *sorted, *in_use;  // [inputs], [columns], three times [channels]
-  int64_t at;  // the first of a few bins
+  D *x, *y, *z;  // [inputs], [columns], [scaled]: of a few bins, or of one in as many doubles
+  D *values, *sorted, *in_use;  // [channels]
+  int64_t at;                   // the first of these bins
   int few;
   const uint8_t* is_lost;  // of these bins
 
   explicit Judge(const Machine& machine) : machine(machine) {}
 
   size_t place(char* at) {
-    int64_t inputs = machine.num_inputs, most = machine.most_channels;
+    int64_t most = machine.most_channels;
     x = (D*)at;
-    z = x + inputs;
-    values = z + machine.num_columns + 4;
+    y = x + machine.num_inputs;
+    z = y + machine.num_columns;
+    values = z + filled_up(machine.num_scaled);
     sorted = values + most;
     in_use = sorted + most;
-    return (inputs + machine.num_columns + 4 + 3 * most) * sizeof(D);
+    return (in_use + most - x) * sizeof(D);
   }
 
   // Of inputs of bins from `start` on.
   void judge(const double* inputs, int64_t stride, int64_t start, int64_t num, const Bins& bins) {
-    const Machine& m = machine;
-    for (int64_t b = 0; b < num; b += DL) {
+    for (int64_t b = 0; b < num; b += few) {
       at = start + b;
       few = (int)(num - b < DL ? num - b : DL);
-      is_lost = bins.is_lost ? bins.is_lost + at * m.num_channels : nullptr;
-      for (int64_t i = 0; i < m.num_inputs; ++i)
-        for (int k = 0; k < DL; ++k) x[i][k] = inputs[(b + (k < few ? k : 0)) * stride + i];
-      for (int64_t i = 0; i < m.num_singles; ++i) z[m.single_columns[i]] = x[m.single_inputs[i]];
-      for (int64_t p = 0; p < m.num_pools; ++p) pool(m.pools[p]);
-      for (int64_t i = 0; m.minimum && i < m.num_columns; ++i) z[i] = scale(i, z[i]);
-      for (int64_t i = 0; m.imputation && is_lost && i < m.num_singles; ++i)
-        for (int k = 0; k < few; ++k)
-          if (is_lost[k * m.num_channels + m.single_channels[i]])
-            z[m.single_columns[i]][k] = m.imputation[m.single_columns[i]];
-      for (int k = 0; bins.scaled && k < few; ++k)
-        for (int64_t i = 0; i < m.num_columns; ++i)
-          bins.scaled[(at + k) * m.num_columns + i] = z[i][k];
-      if (!bins.score) continue;
-      D score = clamped(head(), bins.score_as_float ? LARGEST_FLOAT : LARGEST);
-      for (int k = 0; k < few; ++k)
-        bins.score[at + k] = bins.is_valid && !bins.is_valid[at + k] ? NAN : score[k];
+      if (2 * few <= DL) few = 1;  // up to here it is quicker
+      is_lost = bins.is_lost ? bins.is_lost + at * machine.num_channels : nullptr;
+      if (few == 1)
+        judge_few<ONE_BIN>(inputs + b * stride, stride, bins);
+      else
+        judge_few<BINS>(inputs + b * stride, stride, bins);
     }
   }
 
-  void pool(const Pool& p) {
+  template <Across ACROSS>
+  void judge_few(const double* inputs, int64_t stride, const Bins& bins) {
+    const Machine& m = machine;
+    for (int64_t i = 0; i < m.num_inputs; ++i)
+      for (int k = 0; k < (ACROSS == BINS ? DL : 1); ++k)
+        of<ACROSS>(x, i, k) = inputs[(k < few ? k : 0) * stride + i];
+    for (int64_t i = 0; i < m.num_singles; ++i)
+      for (int k = 0; k < (ACROSS == BINS ? DL : 1); ++k)
+        of<ACROSS>(y, m.single_columns[i], k) = of<ACROSS>(x, m.single_inputs[i], k);
+    for (int64_t p = 0; p < m.num_pools; ++p) pool<ACROSS>(m.pools[p]);
+    for (int64_t i = 0; i < m.num_scaled; i += step<ACROSS>()) scale<ACROSS>(i);
+    for (int k = 0; m.imputation && is_lost && k < few; ++k)
+      for (int64_t i = 0; i < m.num_scaled; ++i)
+        if (m.channels[i] >= 0 && is_lost[k * m.num_channels + m.channels[i]])
+          of<ACROSS>(z, i, k) = m.imputation[i];
+    for (int k = 0; bins.scaled && k < few; ++k)
+      for (int64_t i = 0; i < m.num_scaled; ++i)
+        bins.scaled[(at + k) * m.num_scaled + i] = of<ACROSS>(z, i, k);
+    if (!bins.score) return;
+    D score = clamped(head<ACROSS>(), bins.score_as_float ? LARGEST_FLOAT : LARGEST);
+    for (int k = 0; k < few; ++k)
+      bins.score[at + k] = bins.is_valid && !bins.is_valid[at + k] ? NAN : score[k];
+  }
+
+  // Families, scaled columns or rows that one vector holds.
+  template <Across ACROSS> static constexpr int step() { return ACROSS == BINS ? 1 : DL; }
+
+  // A number of a bin.
+  template <Across ACROSS> static double& of(D* rows, int64_t i, int k) {
+    return ((double*)rows)[ACROSS == BINS ? i * DL + k : i];
+  }
+
+  // One vector of numbers that are there once for each family, scaled column or row.
+  template <Across ACROSS> static D constants(const double* from) {
+    D found = D{} + *from;
+    if (ACROSS == ONE_BIN) memcpy(&found, from, sizeof(D));
+    return found;
+  }
+
+  // One vector of inputs or columns.
+  template <Across ACROSS> static D gathered(const D* from, const int64_t* places) {
+    if (ACROSS == BINS) return from[*places];
+    D found;
+    for (int k = 0; k < DL; ++k) found[k] = ((const double*)from)[places[k]];
+    return found;
+  }
+
+  template <Across ACROSS> void pool(const Pool& p) {
+    int64_t stride = filled_up(p.num_families);
     D count = {};
     for (int64_t c = 0; c < p.num_channels; ++c) {
       in_use[c] = D{} + 1;
       for (int k = 0; is_lost && k < few; ++k)
-        if (is_lost[k * machine.num_channels + p.channels[c]]) in_use[c][k] = 0;
+        if (is_lost[k * machine.num_channels + p.channels[c]]) {
+          if (ACROSS == BINS)
+            in_use[c][k] = 0;
+          else
+            in_use[c] = D{};
+        }
       count += in_use[c];
     }
-    for (int64_t r = 0; r < p.num_families; ++r) {
-      D mean = {}, square = {}, low = {}, high = {}, last = {}, scale = D{} + p.scales[r];
+    for (int64_t r = 0; r < p.num_families; r += step<ACROSS>()) {
+      D mean = {}, square = {}, low = {}, high = {}, last = {};
+      D scale = constants<ACROSS>(p.scales + r);
       for (int64_t c = 0; c < p.num_channels; ++c) {
-        D value = signed_log(x[p.inputs[r * p.num_channels + c]], scale);
+        D value = signed_log(gathered<ACROSS>(x, p.inputs + c * stride + r), scale);
         values[c] = in_use[c] > 0 ? value : D{};
         mean += values[c];
         last = larger(last, values[c]);
@@ -790,8 +857,10 @@ struct Judge {
       }
       bool is_sorted = false;
       for (int64_t s = 0; s < p.num_statistics; ++s) {
-        int64_t column = p.columns[s * p.num_families + r];
-        if (column < 0) continue;
+        const int64_t* columns = p.columns + s * stride + r;
+        bool is_wanted = false;
+        for (int k = 0; k < step<ACROSS>(); ++k) is_wanted |= columns[k] >= 0;
+        if (!is_wanted) continue;
         D found = mean;
         if (p.statistics[s] == POOLED_STD) found = root(square / larger(count - 1, D{} + 1));
         if (p.statistics[s] == POOLED_MIN) found = low + mean;
@@ -808,30 +877,49 @@ struct Judge {
             found += weight > 0 ? sorted[c] * weight : D{};  // linear interpolation
           }
         }
-        z[column] = count > 0 ? found : D{} + machine.fill[column];
+        if (ACROSS == BINS) y[*columns] = count > 0 ? found : D{} + machine.fill[*columns];
+        for (int k = 0; ACROSS == ONE_BIN && k < DL; ++k)
+          if (columns[k] >= 0)
+            of<ACROSS>(y, columns[k], 0) = count[0] > 0 ? found[k] : machine.fill[columns[k]];
       }
     }
   }
 
-  D scale(int64_t i, D value) {
-    if (machine.compression) value = signed_log(value, D{} + machine.compression[i]);
-    double width = machine.maximum[i] - machine.minimum[i];
-    if (!(width > 0)) return value - value;  // 0; NaN stays NaN
-    value = 2 * ((value - machine.minimum[i]) / width) - 1;
-    return clamped(value, 1);
+  template <Across ACROSS> void scale(int64_t i) {
+    const Machine& m = machine;
+    D value = gathered<ACROSS>(y, m.sources + i);
+    if (m.compression) value = signed_log(value, constants<ACROSS>(m.compression + i));
+    if (m.minimum) {
+      D low = constants<ACROSS>(m.minimum + i), width = constants<ACROSS>(m.maximum + i) - low;
+      D scaled = clamped(2 * ((value - low) / width) - 1, 1);
+      value = width > 0 ? scaled : value - value;  // 0; NaN stays NaN
+    }
+    z[i / step<ACROSS>()] = value;
   }
 
-  D head() {
+  // The scores of a few bins, or that of one in lane 0.
+  template <Across ACROSS> D head() {
     const Machine& m = machine;
+    constexpr int rows = ACROSS == BINS ? WHOLE / 2 : WHOLE, num = rows / step<ACROSS>();
+    for (int64_t i = m.num_scaled; i < filled_up(m.num_scaled); ++i)
+      for (int k = 0; k < (ACROSS == BINS ? DL : 1); ++k) of<ACROSS>(z, i, k) = 0;
     D sums = D{} + m.constant;
-    for (int r = 0; r < 4; ++r) z[m.num_columns + r] = D{};
-    for (int64_t i = 0; i < m.num_columns; i += 4) {  // rows of four, filled up with zeros
-      D pull[4] = {};
-      for (int r = 0; r < 4 && i + r < m.num_columns; ++r) pull[r] += m.linear[i + r];
-      for (int64_t j = 0; m.quadratic && j < i + 4 && j < m.num_columns; ++j)
+    for (int64_t i = 0; i < m.num_scaled; i += rows) {
+      D pull[num];
+      for (int v = 0; v < num; ++v) pull[v] = constants<ACROSS>(m.linear + i + v * step<ACROSS>());
+      const double* block = m.quadratic + i / WHOLE * WHOLE * m.num_quadratic + i % WHOLE;
+      int64_t reach = i + rows < m.num_quadratic ? i + rows : m.num_quadratic;
+      for (int64_t j = 0; i < m.num_quadratic && j < reach; ++j) {
+        D other = ACROSS == BINS ? z[j] : D{} + of<ACROSS>(z, j, 0);
 #pragma GCC unroll 4
-        for (int r = 0; r < 4; ++r) pull[r] += z[j] * m.quadratic[(i + r) * m.num_columns + j];
-      for (int r = 0; r < 4; ++r) sums += pull[r] * z[i + r];
+        for (int v = 0; v < num; ++v)
+          pull[v] += other * constants<ACROSS>(block + WHOLE * j + v * step<ACROSS>());
+      }
+      for (int v = 0; v < num; ++v) {
+        D terms = pull[v] * z[i / step<ACROSS>() + v];
+        if (ACROSS == BINS) sums += terms;
+        for (int k = 0; ACROSS == ONE_BIN && k < DL; ++k) sums[0] += terms[k];
+      }
     }
     return sums;
   }
@@ -889,10 +977,8 @@ template <class T> int run(const Plan& plan, const Machine* machine, const Bins&
           group.template read<float>();
         else
           group.template read<double>();
-        if (kind == 0)
-          group.describe_slow();
-        else
-          group.describe_fast();
+        group.describe_raw();
+        if (kind == 1) group.describe_branches();
       }
     }
     int64_t stride = plan.num_features ? plan.num_features : bins.bin_stride;

@@ -4,7 +4,7 @@
 
 enum Descriptor {
   MEAN, MEDIAN, MODE, RANGE, MEAN_DEVIATION, STD, CV, IQR, SKEWNESS, KURTOSIS, ENERGY, ENTROPY,
-  PEAK_FACTOR, CORRELATION, SPECTRAL_CENTROID, SPECTRAL_SPREAD, NUM_DESCRIPTORS
+  PEAK_FACTOR, CORRELATION, SPECTRAL_CENTROID, SPECTRAL_SPREAD, RMS, MEAN_ABS_CHANGE, NUM_DESCRIPTORS
 };
 constexpr int MAX_BRANCHES = 32;  // and at least NUM_DESCRIPTORS, whose place band energy ratios take
 
@@ -20,7 +20,7 @@ struct Plan {
   int64_t num_channels, num_samples, num_lines, num_branches;
   int64_t num_features, num_coefficients, num_slow, num_fast;
   const int64_t *slow, *fast;  // channels that are read
-  // of each channel and row: where its part of descriptor and column starts, and which bits it has
+  // of each channel and row (branches, their spectra, band energy ratios, the bin itself): where its part of descriptor and column starts, and which bits it has
   const int64_t *first, *descriptor, *column;
   const uint32_t* need;
   // from a bin, or an approximation's coefficients, to those one level coarser; to branches; to lines
@@ -61,22 +61,33 @@ struct Bins {
 
 enum Statistic { POOLED_MEAN, POOLED_STD, POOLED_MIN, POOLED_MAX, POOLED_ORDER };
 
+// Arrays of families, scaled columns and rows of a head are filled up to a multiple of this, so that
+// any vector reads whole.
+constexpr int WHOLE = 8;
+
 // Descriptors of the channels of one kind, whose statistics over these channels are columns.
 struct Pool {
   int64_t num_channels, num_families, num_statistics;
-  const int64_t *channels, *inputs;  // in the hand; [families, channels]
+  const int64_t *channels, *inputs;  // in the hand; [channels, families]
   const int64_t *statistics, *columns;  // [statistics]; [statistics, families], -1: not wanted
   const double *fractions, *scales;  // of orders among ascending values, from 0 to 1; [families]
 };
 
 // From inputs (features) to columns, to scaled columns, and to a score.
 struct Machine {
-  int64_t num_channels, num_inputs, num_columns, num_singles, num_pools, most_channels;
-  const int64_t *single_inputs, *single_columns, *single_channels;  // columns that are not pooled
+  int64_t num_channels, num_inputs, num_columns, num_scaled, num_quadratic;
+  int64_t num_singles, num_pools, most_channels;
+  const int64_t *single_inputs, *single_columns;  // of columns that are not pooled
   const Pool* pools;
-  const double *fill, *minimum, *maximum, *compression;  // [columns]; null: not pooled, scaled, compressed
-  const double* imputation;  // [columns], scaled, of a lost channel; null: columns stay as they are
-  const double *quadratic, *linear;  // lower triangle, off its diagonal twice; null: none
+  const double* fill;       // [columns], where no channel is in use; null: nothing is pooled
+  const int64_t* sources;   // [scaled], the column that each is made of
+  const double *minimum, *maximum, *compression;  // [scaled]; null: not scaled, not compressed
+  const double* imputation;  // [scaled], of a lost channel; null: they stay as they are
+  const int64_t* channels;   // [scaled], -1: of several; null without imputation
+  // of the first scaled columns: lower triangle, off its diagonal twice, [blocks, columns, WHOLE
+  // rows of a block]; null: none
+  const double* quadratic;
+  const double* linear;  // [scaled]; null: no score
   double constant;
 };
 

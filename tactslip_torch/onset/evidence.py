@@ -736,6 +736,10 @@ class OnsetClassifier:
             constant = torch.tensor(of_head["constant"], dtype=torch.float64)
             quadratic, linear = (_unpacked(of_head[n]) for n in ("quadratic", "linear"))
             head = QuadraticForm(quadratic, linear, constant)
+            if len(quadratic) not in (0, len(linear)):
+                raise ValueError(
+                    f"expected a quadratic part of {len(linear)} columns, got {len(quadratic)}"
+                )
         bounds = (torch.tensor(plain[name], dtype=torch.float64) for name in ("minimum", "maximum"))
         scaler, num = FeatureScaler(*bounds), evidence.num_columns
         known = (num, num * (1 + len(evidence.lags)))

@@ -1,5 +1,6 @@
 """The simulated hand: scenes in, recordings with exact truth out."""
 
+from tactslip_torch.simulation._sensors import HandSignals
 from tactslip_torch.simulation.scene import (
     FIDELITIES,
     MATERIALS,
@@ -37,6 +38,7 @@ __all__ = [
     "Disturbances",
     "Dynamics",
     "Faults",
+    "HandSignals",
     "Handling",
     "Imperfections",
     "Material",

@@ -22,7 +22,7 @@ from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tactslip_torch.runtime import runs_of
 from tactslip_torch.simulation._blocks import (
@@ -38,7 +38,7 @@ from tactslip_torch.simulation._blocks import (
     lognormal,
     smooth_step,
 )
-from tactslip_torch.simulation._contact import Contacts, ElementContact, Grasp
+from tactslip_torch.simulation._contact import Contacts, ElementContact, Grasp, draw_grasp
 from tactslip_torch.simulation.scene import Motion, Scene
 
 _BANDS = ("high", "low")  # parts of vibration, above and below 25 Hz
@@ -77,14 +77,14 @@ def _levels_v(scene: Scene, grasp: Grasp, speed_mm_s: Array) -> tuple[Array, Arr
     return friction_v, 1e-3 * grasp.texture_mv * relative**grasp.texture_exponent
 
 
-def _lines(scene: Scene, grasp: Grasp, motion: Motion) -> Array:
+def _lines(scene: Scene, grasp: Grasp, speed_mm_s: Array, position_mm: Array) -> Array:
     """Sine and cosine of the texture's lines, weighted by what the skin and the converter pass.
 
     Their weights' squares sum to 1. A tacky material's sawtooth has harmonics that fall with their
     order; these lines stand for its stick-slip, so bristles, which stick and slip, have none. Lines
     near or beyond the Nyquist frequency are faded out, not folded.
     """
-    shape = motion.grid.time_s.shape
+    shape = speed_mm_s.shape
     tacky = grasp.material.character == "tacky"
     if grasp.wavelength_mm is None or (tacky and scene.fidelity != "kinematic"):
         return np.zeros((2, 0, *shape))
@@ -95,10 +95,10 @@ def _lines(scene: Scene, grasp: Grasp, motion: Motion) -> Array:
     middle_hz = float(np.median(grasp.resonance_hz))
     out = np.empty((2, len(orders), *shape))
     for number, wavelength in enumerate(grasp.wavelength_mm * spread / orders):
-        frequency = motion.speed_mm_s / wavelength
+        frequency = speed_mm_s / wavelength
         passed = np.minimum(_resonance(frequency, middle_hz, _LINE_DAMPING), 1.0)
         passed *= weights[number] * np.clip(4.5 - 10.0 * frequency / scene.sample_rate_hz, 0, 1)
-        phase = (2 * np.pi / wavelength) * motion.position_mm
+        phase = (2 * np.pi / wavelength) * position_mm
         out[:, number] = passed * np.sin(phase), passed * np.cos(phase)
     return out
 
@@ -139,21 +139,18 @@ class _Vibrations:
         self._scene, self._grasp, self._grid = scene, grasp, grid
         motion = Motion(scene.slides, grid)
         self._levels_v = _levels_v(scene, grasp, motion.speed_mm_s)  # [K, B] each
-        self._lines = _lines(scene, grasp, motion)
+        self._lines = _lines(scene, grasp, motion.speed_mm_s, motion.position_mm)
 
     def element(self, element: int, contact: ElementContact) -> _Vibration:
         """One element's vibration, imperfections included; work only in blocks that slide."""
         scene, grasp, grid = self._scene, self._grasp, self._grid
-        low_fraction = scene.contact.friction_noise_low_share
-        line_fraction = grasp.material.line_share if grasp.material.wavelength_mm else 0.0
         root_load = np.sqrt(grasp.load_n[element])
         rng = generator(*scene.key("line mixture"), element)
         mixture = rng.standard_normal(self._lines.shape[:2])
         bands, fluctuation = np.stack([contact.release_v, grid.zeros()]), grid.zeros()
         for rows in _runs(np.asarray(contact.slide.any(axis=-1))):
             slide = contact.slide[rows]
-            keys = [(*scene.key(band), element) for band in _BANDS]
-            high, low = self._band_noises(element, rows, keys)
+            noises = self.sliding_noises(element, rows)
             if scene.fidelity == "bristles":  # a speed of its own, with the vibration of that speed
                 friction_gate = _powered(slide, scene.contact.friction_noise_exponent)
                 texture_gate = _powered(slide, grasp.texture_exponent)
@@ -162,18 +159,15 @@ class _Vibrations:
             friction_v, texture_v = (level_v[rows] for level_v in self._levels_v)
             friction = grasp.mu_ratio * grasp.mu_s * root_load * friction_v * friction_gate
             texture = root_load * texture_v * texture_gate
-            broad = np.sqrt((1 - low_fraction) * friction**2 + (1 - line_fraction) * texture**2)
             lines = np.einsum("pl,plkb->kb", mixture, self._lines[:, :, rows])
-            bands[0, rows] += broad * high + np.sqrt(line_fraction) * texture * lines
-            bands[1, rows] += np.sqrt(low_fraction) * friction * low
-            fluctuation[rows] += np.minimum(slide, 1.0) * low
+            bands[:, rows] += _sliding_v(scene, grasp, friction, texture, noises, lines)
+            fluctuation[rows] += np.minimum(slide, 1.0) * noises[1]
         self._add_imperfections(bands, element, contact)
         return _Vibration(bands, fluctuation)
 
     def _add_imperfections(self, bands: Array, element: int, contact: ElementContact) -> None:
         """Partial slip or sticking, and local noise."""
         scene, grasp, grid = self._scene, self._grasp, self._grid
-        of = scene.imperfections
         index = int(np.flatnonzero(grasp.element_of_channel == element)[0])
         for start_s, end_s in _partial_intervals(scene, scene.hand.channels[index].finger):
             rows, envelope = grid.pulse(start_s, end_s, _PARTIAL_RAMP_S)
@@ -183,11 +177,23 @@ class _Vibrations:
             sticks = np.where(holds, 1.0, 1.0 - envelope)
             noises = self._friction_noises(element, rows, "partial slip")
             bands[:, rows] = sticks * bands[:, rows] + slip_v * noises
-        if of.local_noise_mv > 0:
-            rng = generator(*scene.key("local noise"), element)
-            size_v = 1e-3 * of.local_noise_mv * lognormal(rng, _LEVEL_SPREAD)
-            level = np.sqrt(grasp.load_n[element]) * size_v * _wandering(_LEVEL_SPREAD, rng, grid)
-            bands += level * self._friction_noises(element, slice(None), "local noise")
+        if scene.imperfections.local_noise_mv > 0:
+            bands += np.sqrt(grasp.load_n[element]) * self.local_noise_v(element)
+
+    def local_noise_v(self, element: int) -> Array:
+        """Noise of an element of 1 N that is independent of all others, ``[2, K, B]``."""
+        scene, grid = self._scene, self._grid
+        if scene.imperfections.local_noise_mv == 0:
+            return np.stack([grid.zeros(), grid.zeros()])
+        rng = generator(*scene.key("local noise"), element)
+        size_v = 1e-3 * scene.imperfections.local_noise_mv * lognormal(rng, _LEVEL_SPREAD)
+        level_v = size_v * _wandering(_LEVEL_SPREAD, rng, grid)
+        return np.asarray(level_v * self._friction_noises(element, slice(None), "local noise"))
+
+    def sliding_noises(self, element: int, rows: slice = slice(None)) -> Array:
+        """Noise of the high and of the low part of sliding, of unit rms, ``[2, k, B]``."""
+        keys = [(*self._scene.key(band), element) for band in _BANDS]
+        return self._band_noises(element, rows, keys)
 
     def _friction_noises(self, element: int, rows: slice, purpose: str) -> Array:
         """Noise with the bands' fractions of friction's power, unit rms in all, ``[2, k, B]``."""
@@ -203,6 +209,29 @@ class _Vibrations:
         responses = _band_responses(grasp.spectral_exponent, *skin, part.sample_rate_hz)
         pairs = zip(keys, responses, strict=True)
         return np.stack([part.coloured_noise(key, response) for key, response in pairs])
+
+
+def _sliding_v(
+    scene: Scene, grasp: Grasp, friction_v: Array, texture_v: Array, noises: Array, lines: Array
+) -> Array:
+    """Vibration of a slide above and below 25 Hz, volts at a fast channel of unit gain.
+
+    Args:
+        scene: whose friction noise is divided.
+        grasp: whose texture is.
+        friction_v: rms of friction noise.
+        texture_v: rms of the texture's vibration.
+        noises: of the high and of the low part, of unit rms.
+        lines: of the texture.
+
+    Shape:
+        - noises, output: ``[2, *]``; all else ``[*]``
+    """
+    low_fraction = scene.contact.friction_noise_low_share
+    line_fraction = grasp.material.line_share if grasp.material.wavelength_mm else 0.0
+    broad = np.sqrt((1 - low_fraction) * friction_v**2 + (1 - line_fraction) * texture_v**2)
+    high = broad * noises[0] + np.sqrt(line_fraction) * texture_v * lines
+    return np.stack([high, np.sqrt(low_fraction) * friction_v * noises[1]])
 
 
 def _steady_v(scene: Scene, grasp: Grasp, element: int, speed_mm_s: float) -> float:
@@ -320,17 +349,22 @@ def _warming_v(scene: Scene, index: int, grid: Grid) -> Array:
     return np.asarray(far_v * np.expm1(-_WARMING_TIMES * since) / np.expm1(-_WARMING_TIMES))
 
 
-def _converted(scene: Scene, front: _Front, index: int, grid: Grid, volts: Array) -> Array:
-    """Volts of the converter: with offset, drift and white noise, between the rails, in steps."""
+def _with_noise(scene: Scene, front: _Front, index: int, grid: Grid, volts: Array) -> Array:
+    """Volts of one channel with its offset, drift and white noise, ``[K, B]``."""
     noise = grid.white_noise((*scene.key("white"), scene.hand.names[index]))
     total = volts + front.offset_v[index] + front.white_v[index] * noise
     total += _drift_v(scene, index, grid)
     if scene.sensors.warming_mv > 0:
         total += _warming_v(scene, index, grid)
-    total *= scene.sensors.gain
+    return np.asarray(total)
+
+
+def _converted(scene: Scene, volts: Array) -> Array:
+    """Volts of the converter: with the gain of all channels, between the rails, in steps."""
+    volts = scene.sensors.gain * volts
     rail_v = scene.sensors.rail_v
     step_v = 2.0 * rail_v / 2.0**scene.sensors.num_bits
-    return np.asarray(np.clip(np.round(total / step_v) * step_v, -rail_v, rail_v - step_v))
+    return np.asarray(np.clip(np.round(volts / step_v) * step_v, -rail_v, rail_v - step_v))
 
 
 def volts_of(
@@ -362,7 +396,9 @@ def volts_of(
             else:  # what presses is felt like friction (prior, ours)
                 sensed = _fast_volts(scene, grid, shear_n + press_n, vibration)
             volts[index] += front.gain[index] * _drift_factor(scene, "gain", index, grid) * sensed
-    return [_converted(scene, front, index, grid, volts[index]) for index in indices]
+    return [
+        _converted(scene, _with_noise(scene, front, index, grid, volts[index])) for index in indices
+    ]
 
 
 # --- disturbances of every channel ----------------------------------------------------------------
@@ -839,21 +875,20 @@ def _partial_intervals(scene: Scene, finger: str) -> list[Interval]:
 # --- faults ---------------------------------------------------------------------------------------
 
 
-def recorded_channels(scene: Scene) -> list[int]:
-    """Whose signal stands in every row of the file: its own, unless cables are swapped."""
-    rows = {name: index for index, name in enumerate(scene.hand.names)}
-    recorded = list(range(len(rows)))
-    for one, other in scene.faults.swapped:
-        recorded[rows[one]], recorded[rows[other]] = rows[other], rows[one]
-    return recorded
+def recorded_channels(scene: Scene) -> tuple[list[int], dict[int, float]]:
+    """Whose signal stands in every row of the file, and the volts of rows that hold one value.
 
-
-def stuck_volts(scene: Scene) -> dict[int, float]:
-    """The rows that hold one value, and which: the converter's zero or its highest step."""
+    A row has its own channel's signal, unless cables are swapped; what is stuck has the converter's
+    zero or its highest step.
+    """
     sensors, names = scene.sensors, scene.hand.names
+    recorded = list(range(len(names)))
+    for one, other in scene.faults.swapped:
+        row, row_of_other = names.index(one), names.index(other)
+        recorded[row], recorded[row_of_other] = row_of_other, row
     highest_v = sensors.rail_v - 2.0 * sensors.rail_v / 2.0**sensors.num_bits
     dead = {names.index(name): 0.0 for name in scene.faults.dead}
-    return dead | {names.index(name): highest_v for name in scene.faults.saturated}
+    return recorded, dead | {names.index(name): highest_v for name in scene.faults.saturated}
 
 
 def losses(scene: Scene, num_samples: int) -> list[tuple[int, int]]:
@@ -879,3 +914,166 @@ def held_samples(scene: Scene, num_samples: int) -> NDArray[np.int64]:
     for first, end in losses(scene, num_samples):
         held[first:end] = held[first - 1]
     return held
+
+
+# --- forces from outside --------------------------------------------------------------------------
+
+
+class HandSignals:
+    """Volts of a simulated hand for contact forces that something else computes, piece by piece.
+
+    Gains, noise, mains, knocks, faults and, in strokes that move ``"both"``, motor and arm are the
+    scene's. What happens at the contact is given, so the scene's own slides, handling and partial
+    slips are left out. Each element slides on its own: vibration has the level of its slip speed
+    and of the root of its normal force, and lines run with its own travel. In whatever pieces
+    forces come, volts are those of one piece, to a step of the converter.
+
+    Args:
+        scene: of the hand; it lasts as long as the scene's recording.
+
+    Attributes:
+        scene: that was given.
+        grasp: how the scene's hand touches, of which come friction, skin and gains; the loads are
+            those of a hand at rest, for the caller to share a grip by.
+        elements: finger and segment of every element, in the order of the columns of forces.
+
+    Example:
+        >>> scene = Scene("M5", strokes=(), tail_s=1.0)
+        >>> signals = HandSignals(scene)
+        >>> still = np.zeros((10, len(signals.elements)))
+        >>> signals.push(still + 0.5, still, still).shape
+        (10, 24)
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.grasp = scene, draw_grasp(scene)
+        self.elements = tuple(dict.fromkeys((c.finger, c.segment) for c in scene.hand.channels))
+        num, empty = len(self.elements), Grid(np.zeros(0, np.int64), scene.sample_rate_hz)
+        self._end = math.ceil(scene.end_s * scene.sample_rate_hz - 1e-6)
+        self._held = held_samples(scene, self._end)
+        self._recorded, self._stuck = recorded_channels(scene)
+        self._front, self._is_slow = _draw_front(scene), _is_slow(scene)
+        size = self._block_samples = empty.block_samples
+        response = _highpass_response(scene.sensors.pvdf_highpass_hz, size, scene.sample_rate_hz)
+        self._taps = np.fft.irfft(response)[size::-1]
+        none = np.zeros((num, 0))
+        num_lines = _lines(scene, self.grasp, none, none).shape[1]
+        rngs = [generator(*scene.key("line mixture"), element) for element in range(num)]
+        self._mixture = np.stack([rng.standard_normal((2, num_lines)) for rng in rngs])
+        self._count, self._travel_mm = 0, np.zeros((num, 1))
+        self._forces_n = np.zeros((num, 0))  # of the last block, as fast channels feel them
+        self._last_v = np.zeros((1, len(scene.hand)))
+
+    def push(
+        self,
+        normal_n: ArrayLike,
+        friction_n: ArrayLike,
+        slip_mm_s: ArrayLike,
+        inertia_n: ArrayLike | None = None,
+    ) -> Array:
+        """The volts of the next samples.
+
+        Args:
+            normal_n: that presses each element; before the first sample it was as in it.
+            friction_n: size of each element's friction; likewise.
+            slip_mm_s: speed at which each element slides, 0 where it sticks: a physics engine
+                whose contacts creep needs a dead band.
+            inertia_n: of the skin that lets go, whose burst a fast channel feels
+                (``Dynamics.release_v_per_n``); none by default.
+
+        Shape:
+            - arguments: ``[n, E]``, ``n`` from 0, at the scene's sampling rate
+            - output: ``[n, C]``, float64
+
+        Raises:
+            ValueError: if an argument has another shape or is not finite, or the scene's recording
+                is over.
+        """
+        none = np.zeros(np.shape(normal_n))
+        inertia_n = none if inertia_n is None else inertia_n
+        given = {"normal_n": normal_n, "friction_n": friction_n, "slip_mm_s": slip_mm_s}
+        arrays = []
+        for name, values in {**given, "inertia_n": inertia_n}.items():
+            arrays.append(array := np.asarray(values, np.float64))
+            if array.shape != (len(arrays[0]), len(self.elements)):
+                raise ValueError(
+                    f"expected {name} [n, {len(self.elements)}] (samples, elements), all of one n, "
+                    f"got {array.shape}"
+                )
+            if not np.isfinite(array).all() or (name in given and (array < 0).any()):
+                raise ValueError(f"{name} must be finite, forces and slip speeds not negative")
+        num = len(arrays[0])
+        if self._count + num > self._end:
+            raise ValueError(
+                f"the scene ends after {self._end} samples, got {self._count + num}: raise tail_s"
+            )
+        pieces, at = [np.zeros((0, len(self.scene.hand)))], 0
+        while at < num:
+            first = self._count % self._block_samples
+            if not first:
+                self._begin_block(self._count // self._block_samples)
+            taken = min(self._block_samples - first, num - at)
+            normal, friction, slip, inertia = (array[at : at + taken].T for array in arrays)
+            pieces.append(self._volts(first, normal, friction, slip, inertia))
+            at, self._count = at + taken, self._count + taken
+        return np.concatenate(pieces)
+
+    def _begin_block(self, block: int) -> None:
+        """Make what does not depend on forces."""
+        scene, grasp, front = self.scene, self.grasp, self._front
+        grid = Grid(np.array([block]), scene.sample_rate_hz)
+        channels, elements = range(len(scene.hand)), range(len(self.elements))
+        common = enumerate(_common_volts(scene, grid, list(channels)))
+        self._noise_v = np.concatenate([_with_noise(scene, front, i, grid, v) for i, v in common])
+        vibrations = _Vibrations(scene, grasp, grid)
+        self._sliding = np.concatenate([vibrations.sliding_noises(e) for e in elements], 1)
+        self._local_v = np.concatenate([vibrations.local_noise_v(e) for e in elements], 1)
+        one = grid.zeros() + 1.0
+        self._share = np.concatenate(
+            [one * _drift_factor(scene, "share", e, grid) for e in elements]
+        )
+        gains = [g * _drift_factor(scene, "gain", i, grid) * one for i, g in enumerate(front.gain)]
+        self._gain = np.concatenate(gains)
+
+    def _volts(
+        self, first: int, normal_n: Array, friction_n: Array, slip_mm_s: Array, inertia_n: Array
+    ) -> Array:
+        """The volts ``[m, C]`` of samples of one block, from forces ``[E, m]``."""
+        scene, grasp, part = self.scene, self.grasp, slice(first, first + normal_n.shape[1])
+        normal_n, friction_n = (self._share[:, part] * force for force in (normal_n, friction_n))
+        travel_mm = self._travel_mm + np.cumsum(slip_mm_s, axis=1) / scene.sample_rate_hz
+        self._travel_mm = travel_mm[:, -1:]
+        root_load, noises = np.sqrt(normal_n), self._sliding[:, :, part]
+        bands = np.zeros_like(noises)
+        if (slides := slip_mm_s > 0).any():
+            levels_v = (np.where(slides, v, 0.0) for v in _levels_v(scene, grasp, slip_mm_s))
+            friction_v, texture_v = (root_load * level_v for level_v in levels_v)
+            friction_v = grasp.mu_ratio * grasp.mu_s * friction_v
+            lines = _lines(scene, grasp, slip_mm_s, travel_mm)
+            lines = np.einsum("epl,plek->ek", self._mixture, lines)
+            bands += _sliding_v(scene, grasp, friction_v, texture_v, noises, lines)
+        bands += root_load * self._local_v[:, :, part]
+        bands[0] += scene.dynamics.release_v_per_n * inertia_n
+        steadiness = np.minimum(slip_mm_s / _REFERENCE_MM_S, 1.0)
+        vibration = _Vibration(bands, steadiness * noises[1])
+        slow_v = _slow_volts(scene, normal_n, friction_n, vibration)
+        fast_v = self._strain_v(normal_n + friction_n) + bands[0] + bands[1]
+        own = grasp.element_of_channel
+        sensed_v = np.where(self._is_slow[:, None], slow_v[own], fast_v[own])
+        volts = _converted(scene, self._noise_v[:, part] + self._gain[:, part] * sensed_v)
+        volts = volts[self._recorded].T
+        volts[:, list(self._stuck)] = list(self._stuck.values())
+        held = self._held[self._count : self._count + len(volts)] - self._count
+        volts = np.concatenate([self._last_v, volts])[np.maximum(held, -1) + 1]
+        self._last_v = volts[-1:]
+        return np.asarray(volts)
+
+    def _strain_v(self, force_n: Array) -> Array:
+        """What fast channels of unit gain have of a force behind their high-pass, ``[E, m]``."""
+        num_before = len(self._taps) - 1
+        if self._count == 0:
+            self._forces_n = np.repeat(force_n[:, :1], num_before, axis=1)
+        force_n = np.concatenate([self._forces_n, force_n], axis=1)
+        self._forces_n = force_n[:, -num_before:]
+        windows = np.lib.stride_tricks.sliding_window_view(force_n, len(self._taps), axis=1)
+        return np.asarray(self.scene.sensors.pvdf_shear_v_per_n * (windows @ self._taps))

@@ -32,7 +32,6 @@ from tactslip_torch.simulation._sensors import (
     Handled,
     held_samples,
     recorded_channels,
-    stuck_volts,
     volts_of,
 )
 from tactslip_torch.simulation.scene import (
@@ -117,7 +116,7 @@ def simulate(
     truth = _timeline(scene, grasp, contact.slips)
     volts = np.full((len(scene.hand), truth.num_samples), np.nan)
     wanted, indices = _wanted_samples(scene, truth, windows), _channel_indices(scene, channels)
-    recorded, stuck = recorded_channels(scene), stuck_volts(scene)
+    recorded, stuck = recorded_channels(scene)
     if len(wanted) and indices:
         held = held_samples(scene, truth.num_samples)[wanted]  # the sample that stands there
         size = Grid(held, scene.sample_rate_hz).block_samples

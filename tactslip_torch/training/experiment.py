@@ -248,6 +248,7 @@ def feature_maker(
         arithmetic="native" if dtype == "float32" else "double",
         backend=backend,
     )
+    pool = pool.paper()  # a recipe takes no others
     if recipe is not None and recipe.descriptors is not None:
         wanted = {*recipe.descriptors, "range"}  # ranges tell which channels are silent
         names = {name for name in pool.names if name.descriptor in wanted}

@@ -197,13 +197,14 @@ class _Recipe(ABC):
     def allowed(self, pool: FeaturePool) -> Tensor:
         """Which features of a pool may be selected, ``[F]``, bool.
 
-        Those that rounding decides, as some wavelets have them, never may.
+        Those that rounding decides, as some wavelets have them, never may, and neither may those
+        that the paper does not have.
 
         Raises:
             ValueError: if ``descriptors`` or ``feature_filter`` names what no feature has, or
                 nothing matches.
         """
-        mask = ~is_rounding(pool)
+        mask = ~is_rounding(pool) & pool.is_paper
         if self.descriptors is not None:
             known = {*TIME_DESCRIPTORS, *SPECTRUM_DESCRIPTORS, "band_energy_ratio"}
             if unknown := [name for name in self.descriptors if name not in known]:

@@ -65,6 +65,12 @@ NO_DETECTORS = {  # what is changed in metadata, or which tensor becomes what
     "bins": lambda content, tensors: content["pool"].update(bin_samples=10**9),
     "text": lambda content, tensors: content["pool"].update(sample_rate_hz="fast"),
     "shape": lambda content, tensors: tensors.update({"scaler.minimum": torch.zeros(3)}),
+    "index": lambda content, tensors: tensors.update(
+        {"scaler.columns": torch.arange(1, 1 + len(tensors["scaler.minimum"]))}
+    ),
+    "index dtype": lambda content, tensors: tensors.update(
+        {"scaler.columns": torch.zeros_like(tensors["scaler.minimum"])}
+    ),
     "dtype": lambda content, tensors: tensors.update({"head.constant": torch.tensor(1)}),
     "number": lambda content, tensors: tensors.update({"head.constant": torch.tensor(torch.nan)}),
 }

@@ -17,6 +17,7 @@ from torch.autograd import gradcheck, gradgradcheck
 from tactslip_torch.deploy.bins import described
 from tactslip_torch.deploy.value import Graph
 from tactslip_torch.features.descriptors import DESCRIPTORS
+from tactslip_torch.features.names import FeatureName
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -120,7 +121,8 @@ def through_onnx(pool, bins, selected=None):
     return session.run(None, {"samples": bins.numpy()})[0].astype(np.float64)
 
 
-LINEAR = ("mean", "median", "mode", "range", "mean_deviation", "std", "iqr")
+SIMPLE = ("mean", "std", "rms", "range", "mean_abs_change")
+LINEAR = (*SIMPLE, "median", "mode", "mean_deviation", "iqr")
 POWERS = {"energy": 2, **dict.fromkeys(LINEAR, 1)}
 """With which a factor of the bin is in a descriptor; 0: it is a ratio, or has a unit of its own."""
 
@@ -157,7 +159,15 @@ def assert_close(found, expected, bins, tolerance, names=NAMES):
 
 def test_features_have_the_names_of_the_definitions():
     assert [str(name) for name in FeaturePool(HAND).names] == NAMES
-    assert len(FeaturePool(HandLayout.paper24()).names) == 2582
+
+
+def test_the_papers_features_come_first_and_every_channel_has_the_simple_ones():
+    pool = FeaturePool(HandLayout.paper24())
+    assert pool.is_paper.tolist() == [True] * 2582 + [False] * 78
+    assert pool.paper().names == pool.names[:2582]
+    simple = {(name.channel, name.descriptor) for name in pool.names if name.is_simple}
+    assert simple == {(channel, descriptor) for channel in pool.hand.names for descriptor in SIMPLE}
+    assert all(name.is_simple for name in pool.names[2582:])
 
 
 @cache
@@ -226,6 +236,39 @@ def test_order_statistics_alone_sort_no_more_than_they_need(wanted, num, rng):
     np.testing.assert_allclose(found, pool(bins)[:, chosen].numpy(), rtol=1e-9, atol=1e-12)
 
 
+def plain_statistics(bins):
+    """Of ``[N, C, n]`` the simple statistics by channel, ``[N, C, 5]``, in NumPy's own words."""
+    change = np.abs(np.diff(bins, axis=-1)).mean(-1)
+    rms = np.sqrt((bins**2).mean(-1))
+    found = [bins.mean(-1), bins.std(-1, ddof=1), rms, np.ptp(bins, axis=-1), change]
+    return np.stack(found, -1)
+
+
+@pytest.mark.parametrize("backend", [*BACKENDS, "onnx"])
+@pytest.mark.parametrize("num", [13, 100, 101])
+def test_simple_statistics_alone_are_numpys_and_need_nothing_but_the_bin(num, backend, rng):
+    """A hand that lists a fast channel first, and another between slow ones."""
+    rows = HAND.to_rows()
+    hand = HandLayout.from_rows([rows[i] for i in (2, 0, 3, 1)])
+    pool = FeaturePool(hand, bin_samples=num, level=1)
+    names = [FeatureName(c, "raw", "time", d) for c in hand.names for d in SIMPLE]
+    places = pool.places(names)
+    assert {row.kind for row in pool.select(places).plan.rows} == {"raw"}
+    bins = rng.standard_normal((40, 4, num)) * 10.0 ** rng.integers(-6, 6, (40, 4, 1))
+    bins[::2] += rng.uniform(-5, 5, (20, 4, 1))
+    bins[3], bins[4] = 0.0, 0.25
+    given = torch.from_numpy(bins)
+    if backend == "onnx":
+        found = through_onnx(pool, given, places)
+    else:
+        found = pool.select(places, backend)(given).numpy()
+    found, expected = found.reshape(40, 4, 5), plain_statistics(bins)
+    rounding = 1e-13 * np.abs(bins).max(-1, keepdims=True)
+    assert (np.abs(found - expected) <= 1e-10 * np.abs(expected) + rounding).all()
+    assert not found[3].any()
+    assert not found[4][:, [1, 3, 4]].any()
+
+
 # Extremes --------------------------------------------------------------------------------------
 
 
@@ -278,6 +321,7 @@ KNOWN = {
     "entropy": 3.866,
 }
 STILL = ("range", "mean_deviation", "std", "cv", "iqr", "skewness", "entropy", "correlation")
+STILL += ("mean_abs_change",)
 
 
 @pytest.mark.parametrize("level", [1.0, 0.1, -5.0, 3e-5, 0.0, 1e-30])
@@ -290,7 +334,7 @@ def test_a_constant_bin_has_the_stated_values(level):
         _, component, domain, descriptor = name.split()
         here = 0.0 if component[0] == "D" else level
         stated = {"mean": here, "median": here, "mode": here, "energy": 100 * here**2}
-        stated["peak_factor"] = np.sign(here)
+        stated |= {"peak_factor": np.sign(here), "rms": abs(here)}
         if domain == "time" and descriptor in stated:
             assert value == pytest.approx(stated[descriptor], rel=1e-13), name
         if level == 0 and domain == "freq":
