@@ -24,7 +24,7 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.decisions import KEY, AlarmSettings, Decider, score_stream
 from tactslip_torch.onset.events import EventRules, LatencyParts, recording_events
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
-from tactslip_torch.onset.rules import Cusum, KOfN
+from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN
 from tactslip_torch.report.results import _confounder_rows, alarm_figure, alarm_table
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation import CONFOUNDERS
@@ -214,7 +214,7 @@ def recounted(detector, settings, scenes):
         stream = alarm.Stream(recording, source.timeline(recording), none, none, none)
         found = recording_events(alarm.event_record(stream, made), EventRules(), latency)
         alarms += len(found.false_alarms_s)
-        hours += float(made.is_valid.sum()) * 0.005 / 3600
+        hours += float((made.onset_score > NOTHING_YET).sum()) * 0.005 / 3600
     return alarms, hours
 
 

@@ -159,7 +159,8 @@ def oracle(evidence, x, masked=()):
                         / (before(power[i], n, 0, t) * before(power[j], n, 0, t))
                         for i, j in combinations(range(len(fast)), 2)
                     ]
-                    row.append(np.mean(squares, 0) if squares else np.zeros(len(level[0])))
+                    squares = squares or [np.zeros(len(level[0]))]
+                    row += [np.mean(squares, 0), np.max(squares, 0)]
         if slow:
             size = np.log1p(np.abs(z[t]))
             row += pools(size, ("mean", "max", "min"))
@@ -357,8 +358,7 @@ def scored_without_lost_blocks(classifier, samples, masked, most):
     first = samples.shape[-1] // evidence.hop_samples - len(blocks.means)
     if evidence.hand.fast:
         own = blocks.logs.sum(1).isfinite() & ~masked[list(evidence.hand.fast)]
-        loud = (blocks.logs > evidence.silence).any(1)
-        is_lost = (own.sum(-1) < evidence.min_alive) | ~(own & blocks.moves & loud).any(-1)
+        is_lost = (own.sum(-1) < evidence.min_alive) | ~(own & blocks.moves).any(-1)
     else:
         own = blocks.means.isfinite() & ~masked
         is_lost = own.sum(-1) < evidence.min_alive

@@ -84,7 +84,7 @@ def assert_same(found, expected):
         how = {"rtol": 0, "atol": close, "equal_nan": True}
         torch.testing.assert_close(*pair, **how, msg=lambda m, name=name: name + m)
     exact = ("number", "available_s", "onset_s", "is_valid", "in_range", "channels_lost")
-    for name in (*exact, "is_alarm", "is_on", "hint"):
+    for name in (*exact, "is_alarm", "is_on", "is_hint"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
@@ -462,6 +462,6 @@ def test_joined_decisions_by_a_plain_loop(rule, bin_hop, hop, frame):
     assert found.number.tolist() == list(range(4000 // hop))
     assert found.by_onset.tolist() == by_onset
     assert (found.is_alarm.tolist(), found.is_on.tolist()) == (alarms, standing)
-    assert found.hint.tolist() == (onset[: 4000 // hop] >= classifier.hint).tolist()
+    assert found.is_hint.tolist() == (onset[: 4000 // hop] >= classifier.hint).tolist()
     assert {alarm.raised_by for alarm in found.alarms} == {"onset"}
     assert (bins.statistic >= settings.threshold).any()  # bins raise none of these

@@ -347,8 +347,11 @@ def host_metadata(detector: SlipDetector, kind: str, precision: Precision) -> di
             "threshold_curve": settings.metadata.get("threshold_curve", []),
         }
         if settings.onset is not None:  # whose threshold the one above is
-            metadata["status_threshold"] = settings.threshold
             metadata["onset_hop_samples"] = timing.onset_hop
+            if math.isfinite(settings.threshold):  # of bins, which raise no alarm
+                metadata["status_threshold"] = settings.threshold
+            if math.isfinite(settings.onset.hint):
+                metadata["hint_threshold"] = settings.onset.hint
     return metadata
 
 

@@ -258,7 +258,7 @@ def stream_graph(
                 last = graph.where(samples >= float(timing.frame), last, -1.0)
             place = (last - made + 1.0).clamp(min=0.0).cast(I64)  # row 0 is what was known before
             at_hop = graph.op("Gather", rows, place, axis=0)
-            score, stated, statistic, _, in_range, onset_s = (
+            score, stated, statistic, valid, in_range, onset_s = (
                 at_hop[..., i] for i in range(len(OF_LAST_BIN))
             )
             statistic, time_s = statistic.cast(dtype), samples / rate_hz
@@ -272,7 +272,7 @@ def stream_graph(
                 score.cast(dtype),
                 stated.cast(dtype),
                 statistic,
-                is_known,
+                valid.cast(BOOL) | is_known,
                 in_range.cast(BOOL),
                 alarm,
                 on,
@@ -473,12 +473,11 @@ def _measured(samples: Value, places: Value, evidence: OnsetEvidence) -> _Measur
             one, other = (heard.take(of.tolist(), 2) for of in evidence.pairs)
             products = (to_mean @ (one * other)).reshape(0, -1)
         known = of_fast.sum(1).isfinite()
-        moves = (of_fast - evidence.silence).amax(1) > 0.0
+        moves = known
         if hop >= FEWEST_BLOCK_SAMPLES:
             own = frames.slice(context, END, 1)
-            moves = moves & ~(own - own.slice(0, 1, 1)).abs().amax(1).eq(0.0)
-        is_still = graph.constant(evidence.is_still or [False] * len(fast), BOOL)
-        moves = known & (moves | is_still)
+            is_still = graph.constant(evidence.is_still or [False] * len(fast), BOOL)
+            moves = known & (~(own - own.slice(0, 1, 1)).abs().amax(1).eq(0.0) | is_still)
     if slow:
         block = _rows(samples.take(slow, 1), first * hop, range(context, context + hop))
         means = block.cast(F64).mean(1)

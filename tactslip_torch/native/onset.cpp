@@ -90,14 +90,11 @@ struct Hop {
     int64_t num_known = 0;
     bool any_moves = false;
     for (int64_t f = 0; f < own.num_fast; ++f) {
-      double sum = 0.0, rise = -INFINITY;
-      for (int64_t i = f; i < num_logs; i += own.num_fast) {
-        sum += logs[i];
-        rise = logs[i] - own.silence[i] > rise ? logs[i] - own.silence[i] : rise;
-      }
+      double sum = 0.0;
+      for (int64_t i = f; i < num_logs; i += own.num_fast) sum += logs[i];
       if (!run.in_use[own.fast[f]] || !isfinite(sum)) continue;
       ++num_known;
-      any_moves |= own.is_still[f] || (rise > 0.0 && moves(start, f));
+      any_moves |= own.is_still[f] || moves(start, f);
     }
     if (own.num_fast) return num_known < own.min_alive || !any_moves;
     for (int64_t s = 0; s < own.num_slow; ++s)
@@ -199,7 +196,8 @@ struct Hop {
       double rise = -INFINITY, sum = 0.0;
       for (int64_t b = 0; b < num_filters; ++b) {
         int64_t i = b * num_fast + f;
-        rise = kept.floor[i] - own.silence[i] > rise ? kept.floor[i] - own.silence[i] : rise;
+        double over = kept.floor[(NUM_FLOORS - 1) * num_logs + i] - own.silence[i];
+        rise = over > rise ? over : rise;
         sum += kept.floor[i];
         for (int64_t w = 0; w < own.num_windows; ++w) sum += level[w * num_logs + i];
       }
@@ -220,15 +218,19 @@ struct Hop {
       last_means(kept.products, products, num_products, own.windows[w], false, values);
       for (int64_t b = 0; b < num_filters; ++b) {
         const double* own_power = power + w * num_logs + b * num_fast;
-        double sum = 0.0, num = 0.0;
+        double sum = 0.0, num = 0.0, most = 0.0;
         for (int64_t p = 0; p < own.num_pairs; ++p) {
           int64_t i = own.first[p], j = own.second[p];
           if (!in_use[i] || !in_use[j]) continue;
           double product = values[b * own.num_pairs + p];
-          sum += product * product / (own_power[i] * own_power[j]), num += 1.0;
+          double square = product * product / (own_power[i] * own_power[j]);
+          most = square > most ? square : most;
+          sum += square, num += 1.0;
         }
-        *to++ = num ? sum / num : 0.0;
+        to[b] = num ? sum / num : 0.0;
+        to[num_filters + b] = most;
       }
+      to += 2 * num_filters;
     }
     // pools over slow channels
     if (int64_t num_slow = own.num_slow) {

@@ -293,7 +293,8 @@ class Decisions(NamedTuple):
     """One entry per decision of a stream, in order.
 
     With an onset classifier there is one every hop of its own, and the columns of bins are those of
-    the last bin known by then. Such a decision is valid where the classifier has a score.
+    the last bin known by then. Such a decision is valid where the bin is, or where the classifier
+    has a score; only the score raises alarms.
 
     Attributes:
         number: of the decision in its stream, from 0, ``[m]``, int64.
@@ -310,7 +311,7 @@ class Decisions(NamedTuple):
         is_on: whether an alarm stands after it: the contact's status, ``[m]``.
         onset_score: of the onset classifier, ``NOTHING_YET`` where there is none, ``[m]``, float64.
         by_onset: whether that reaches its threshold, ``[m]``.
-        hint: whether it reaches the lower one, ``[m]``; never without an onset classifier.
+        is_hint: whether it reaches the lower one, ``[m]``; never without an onset classifier.
         channels: names of ``C`` channels, empty where they are not known.
     """
 
@@ -328,7 +329,7 @@ class Decisions(NamedTuple):
     is_on: Tensor
     onset_score: Tensor
     by_onset: Tensor
-    hint: Tensor
+    is_hint: Tensor
     channels: tuple[str, ...] = ()
 
     @property
@@ -595,10 +596,9 @@ class Decider:
         began_s, of_bin = latest[0], latest[1:5].astype(bins.score.numpy().dtype)
         score, llr, stated, statistic = torch.from_numpy(of_bin).unbind()
         by_onset = scores >= onset.threshold
-        is_valid = scores > NOTHING_YET
-        _, alarms, standing, _ = self._alarm_rule.walk(
-            np.where(is_valid, by_onset * 1.0, np.nan), 0
-        )
+        is_known = scores > NOTHING_YET
+        ratios = np.where(is_known, by_onset * 1.0, np.nan)
+        _, alarms, standing, _ = self._alarm_rule.walk(ratios, 0)
         available_s = self._end_s(samples)
         onset_s = np.where(by_onset, available_s - onset.lead_s, began_s)
         return Decisions(
@@ -609,7 +609,7 @@ class Decider:
             llr,
             stated,
             statistic,
-            torch.from_numpy(is_valid),
+            torch.from_numpy((latest[5] > 0) | is_known),
             torch.from_numpy(latest[6] > 0),
             torch.from_numpy(latest[7:].T > 0),
             torch.from_numpy(alarms),

@@ -4,7 +4,7 @@ All columns are ratios, so neither gain nor unit of a channel matters:
 
 - *fast channels*: power of up to four band filters over 10, 25 and 50 ms, as a log ratio to the
   channel's own *floor*, its mean log power over the last 1, 0.3 and 0.1 s; mean, largest, smallest
-  and spread over channels; the mean squared correlation between channels, of each filter;
+  and spread over channels; mean and largest squared correlation between channels, of each filter;
 - *slow channels*: steps between means of neighbouring stretches over the mean size of such steps in
   the last second; their size and, with their sign, mean, largest and smallest over channels, and
   how far the signs agree.
@@ -362,7 +362,7 @@ class OnsetEvidence:
         return self.blocks(samples[:, start:])
 
     def is_lost(self, blocks: Blocks, in_use: Tensor) -> Tensor:
-        """Blocks in which too few channels are finite, or each fast one is still or silent.
+        """Blocks in which too few channels are finite, or each fast one is still.
 
         ``[m]``, bool.
 
@@ -375,8 +375,7 @@ class OnsetEvidence:
             return known.sum(-1) < self.min_alive
         known = blocks.logs.sum(1).isfinite() & in_use[list(self.hand.fast)]
         still = torch.tensor(self.is_still or (False,) * len(self.hand.fast))
-        moves = blocks.moves & ((blocks.logs - self.silence).amax(1) > 0.0)
-        return (known.sum(-1) < self.min_alive) | ~(known & (moves | still)).any(-1)
+        return (known.sum(-1) < self.min_alive) | ~(known & (blocks.moves | still)).any(-1)
 
     def begin(self, blocks: Blocks, num_lagged: int = 0) -> Memory:
         """What is kept where a block is the first: all that was before is equal to it."""
@@ -402,7 +401,7 @@ class OnsetEvidence:
         """The evidence of each of some blocks in a row, at least one, of which none is lost.
 
         A channel is left out of the pools where one of its blocks that a column rests on is not
-        finite, and a fast one while its floor is that of silence.
+        finite, and a fast one while its quickest floor is that of silence.
 
         Args:
             blocks: ``k`` of them.
@@ -508,7 +507,7 @@ class OnsetEvidence:
         if num_fast:
             levels = [each.log() * 0.5 for each in power]
             known = (sum(levels[1:], levels[0]) + floors[0]).sum(1).isfinite()
-            loud = (floors[0] - self.silence).amax(1) > 0.0
+            loud = (floors[-1] - self.silence).amax(1) > 0.0
             alive = known & loud & fast  # [k, F]
             for level in levels:
                 columns += _over_channels(level - floors[0], alive, num_fast, with_spread=True)
@@ -534,7 +533,7 @@ class OnsetEvidence:
     def _correlations(
         self, power: Sequence[Tensor], products: Sequence[Tensor], alive: Tensor
     ) -> list[Tensor]:
-        """Mean squared correlation over pairs in use, 0 without any: ``[k, B]`` each."""
+        """Mean and largest squared correlation over pairs in use, 0 of none: ``[k, B]`` each."""
         num_fast, num_pairs = len(self.hand.fast), self.pairs.shape[1]
         first, second = torch.zeros(2, num_fast, num_pairs, dtype=torch.float64)
         first[self.pairs[0], torch.arange(num_pairs)] = 1.0
@@ -547,7 +546,8 @@ class OnsetEvidence:
         for own, product in zip(power, products, strict=True):
             known = torch.where(rows, own, 1.0)
             square = product * product / ((known @ first) * (known @ second))
-            made.append(torch.where(both.unsqueeze(1) > 0.0, square, 0.0).sum(-1) / num)
+            square = torch.where(both.unsqueeze(1) > 0.0, square, 0.0)
+            made += [square.sum(-1) / num, square.amax(-1)]
         return made
 
     def to_dict(self) -> dict[str, Any]:

@@ -460,6 +460,8 @@ def budget_scores(
         for stream, made in decide(own, settings, timing):
             time_s, times = made.available_s.numpy(), stream.times
             quiet = made.is_valid.numpy().copy()
+            if settings.onset is not None:
+                quiet &= made.onset_score.numpy() > NOTHING_YET
             firsts = first_releases(times.onsets_s, times.released_s)
             for first_s, (_, end_s) in zip(firsts, times.sliding_s, strict=True):
                 before_s = first_s - EventRules().early_s
