@@ -358,7 +358,8 @@ def scored_without_lost_blocks(classifier, samples, masked, most):
     first = samples.shape[-1] // evidence.hop_samples - len(blocks.means)
     if evidence.hand.fast:
         own = blocks.logs.sum(1).isfinite() & ~masked[list(evidence.hand.fast)]
-        is_lost = (own.sum(-1) < evidence.min_alive) | ~(own & blocks.moves).any(-1)
+        own &= blocks.moves & (blocks.logs > evidence.silence).any(1)
+        is_lost = own.sum(-1) < evidence.min_alive
     else:
         own = blocks.means.isfinite() & ~masked
         is_lost = own.sum(-1) < evidence.min_alive

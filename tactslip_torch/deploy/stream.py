@@ -473,18 +473,19 @@ def _measured(samples: Value, places: Value, evidence: OnsetEvidence) -> _Measur
             one, other = (heard.take(of.tolist(), 2) for of in evidence.pairs)
             products = (to_mean @ (one * other)).reshape(0, -1)
         known = of_fast.sum(1).isfinite()
-        moves = known
+        moves = (of_fast - evidence.silence).amax(1) > 0.0
         if hop >= FEWEST_BLOCK_SAMPLES:
             own = frames.slice(context, END, 1)
-            is_still = graph.constant(evidence.is_still or [False] * len(fast), BOOL)
-            moves = known & (~(own - own.slice(0, 1, 1)).abs().amax(1).eq(0.0) | is_still)
+            moves = moves & ~(own - own.slice(0, 1, 1)).abs().amax(1).eq(0.0)
+        is_still = graph.constant(evidence.is_still or [False] * len(fast), BOOL)
+        known = known & (moves | is_still)
     if slow:
         block = _rows(samples.take(slow, 1), first * hop, range(context, context + hop))
         means = block.cast(F64).mean(1)
         if not fast:
-            known = moves = means.isfinite()
+            known = means.isfinite()
     is_known = known.cast(F64).sum(1) >= float(evidence.min_alive)
-    return _Measured(logs, products, means, is_known & moves.any(1))
+    return _Measured(logs, products, means, is_known)
 
 
 def _onset_scores(

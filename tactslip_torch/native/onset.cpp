@@ -88,15 +88,16 @@ struct Hop {
   // OnsetEvidence.is_lost
   bool is_lost(int64_t start) {
     int64_t num_known = 0;
-    bool any_moves = false;
     for (int64_t f = 0; f < own.num_fast; ++f) {
-      double sum = 0.0;
-      for (int64_t i = f; i < num_logs; i += own.num_fast) sum += logs[i];
+      double sum = 0.0, rise = -INFINITY;
+      for (int64_t i = f; i < num_logs; i += own.num_fast) {
+        sum += logs[i];
+        rise = logs[i] - own.silence[i] > rise ? logs[i] - own.silence[i] : rise;
+      }
       if (!run.in_use[own.fast[f]] || !isfinite(sum)) continue;
-      ++num_known;
-      any_moves |= own.is_still[f] || moves(start, f);
+      num_known += own.is_still[f] || (rise > 0.0 && moves(start, f));
     }
-    if (own.num_fast) return num_known < own.min_alive || !any_moves;
+    if (own.num_fast) return num_known < own.min_alive;
     for (int64_t s = 0; s < own.num_slow; ++s)
       num_known += run.in_use[own.slow[s]] && isfinite(means[s]);
     return num_known < own.min_alive;

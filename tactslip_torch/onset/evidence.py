@@ -362,9 +362,10 @@ class OnsetEvidence:
         return self.blocks(samples[:, start:])
 
     def is_lost(self, blocks: Blocks, in_use: Tensor) -> Tensor:
-        """Blocks in which too few channels are finite, or each fast one is still.
+        """Blocks in which too few channels are alive, ``[m]``, bool.
 
-        ``[m]``, bool.
+        A fast one is alive where it is finite, moves and is not silent, a slow one where it is
+        finite.
 
         Args:
             blocks: any.
@@ -374,8 +375,9 @@ class OnsetEvidence:
             known = blocks.means.isfinite() & in_use[list(self.hand.slow)]
             return known.sum(-1) < self.min_alive
         known = blocks.logs.sum(1).isfinite() & in_use[list(self.hand.fast)]
+        moves = blocks.moves & ((blocks.logs - self.silence).amax(1) > 0.0)
         still = torch.tensor(self.is_still or (False,) * len(self.hand.fast))
-        return (known.sum(-1) < self.min_alive) | ~(known & (blocks.moves | still)).any(-1)
+        return (known & (moves | still)).sum(-1) < self.min_alive
 
     def begin(self, blocks: Blocks, num_lagged: int = 0) -> Memory:
         """What is kept where a block is the first: all that was before is equal to it."""
