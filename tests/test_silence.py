@@ -54,7 +54,7 @@ def rules(detector, volts):
     least = 0.1 * blocks.logs.exp().median(0).values.mT
     evidence = replace(onset.evidence, least_rms=tuple(map(tuple, least.tolist())))
     onset = replace(onset, evidence=evidence)
-    onset = replace(onset, threshold=float(OnsetStream(onset).push(quiet).max()) + 0.1)
+    onset = replace(onset, threshold=float(OnsetStream(onset).push(quiet).max()) + 2.0)
     return {
         "debounced": usual,
         "k of n below 0": replace(usual, threshold=-0.5),

@@ -146,7 +146,7 @@ def _experiment(config: DictConfig) -> Experiment:
 def _refuse_simulated_streams(config: DictConfig, source: RecordingSource) -> None:
     """Refuse an alarm that is calibrated on another hand's simulated recordings."""
     streams = config.onset.get("streams") or {}
-    if source.is_simulated or "SimulatedRecordings" not in str(streams.get("_target_")):
+    if source.is_simulated or ".simulation." not in str(streams.get("_target_")):
         return
     raise ValueError(
         "onset=alarms is calibrated on simulated recordings, and these are not; leave onset at "
