@@ -30,6 +30,7 @@ from tactslip_torch.report import style
 from tactslip_torch.simulation import (
     UNSEEN_MATERIALS,
     Contact,
+    Disturbances,
     Handling,
     HandSignals,
     Scene,
@@ -48,6 +49,7 @@ _LAG_S = 0.01  # of the actuator behind its delay: a first-order lag
 _MARGIN = 1.5  # of the force that the controller takes over the one that the object should need
 _SLIDES_MM_S = 2.0  # of a pad
 _RECENT_S = 0.25
+_TAP_S = 0.015
 _FILMED_HOPS, _FILM_SIZE = 10, (230, 150)  # a frame each 50 ms; height and width
 _PAUSE_S = 0.02  # of a slide that goes on
 
@@ -57,6 +59,7 @@ class Lift:
     """One lift: an object and how it is loaded, drawn by number.
 
     The controller expects a mass and friction and grips with 1.5 times the force that they need.
+    Motors and knocks have levels of the draw, and the object is tapped once before it is loaded.
 
     Args:
         number: of the draw.
@@ -88,6 +91,11 @@ class Lift:
             "rise_s": (0.02, 0.02) if self.kind == "sudden" else (0.3, 1.2),
             "distance_mm": (35.0, 50.0),
             "tightened_s": (1.8, 2.6),
+            "tap_n": (1.0, 4.0),
+            "tapped_s": (1.8, 2.3),
+            "motor_mv": (1.0, 20.0),
+            "knock_mv": (30.0, 200.0),
+            "start_mv": (20.0, 100.0),
         }
         return {name: float(rng.uniform(*bounds)) for name, bounds in ranges.items()}
 
@@ -99,6 +107,11 @@ class Lift:
             self.materials[self.number % len(self.materials)],
             strokes=(stroke,),
             contact=Contact(load_n=self._drawn["load_n"]),
+            disturbances=Disturbances(
+                motor_vibration_mv=self._drawn["motor_mv"],
+                burst_mv=self._drawn["knock_mv"],
+                arm_transient_mv=self._drawn["start_mv"],
+            ),
             handling=Handling(carried_kg=0.0),
             tail_s=3.0,
             seed=1000,
@@ -130,6 +143,11 @@ class Lift:
         """What pulls the object down beside its weight."""
         since = (time_s - self._drawn["loaded_s"]) / self._drawn["rise_s"]
         return most_n * min(max(since, 0.0), 1.0)
+
+    def tap_n(self, time_s: float) -> float:
+        """What pushes the object aside: half a sine."""
+        phase = (time_s - self._drawn["tapped_s"]) / _TAP_S
+        return self._drawn["tap_n"] * math.sin(math.pi * phase) if 0 < phase < 1 else 0.0
 
     def raised(self, time_s: float) -> float:
         """By what nobody's alarm multiplies the grip."""
@@ -307,7 +325,7 @@ def run_lift(
             commands.append(grip_n * factor * reflex.factor * lift.raised(time_s))
             force_n += (closed[step] * commands.popleft() - force_n) * STEP_S / _LAG_S
             pull_n = lift.pull_n(time_s, most_n - weight_n)
-            felt.append(gripper.step(force_n, heights_m[step], pull_n))
+            felt.append(gripper.step(force_n, heights_m[step], pull_n, lift.tap_n(time_s)))
         pads = Pads(*np.array(felt).swapaxes(0, 1))
         if time_s > WATCHED_S:
             grips_n.append(force_n)
