@@ -10,7 +10,7 @@ lifts and one reflex. Puts its tables into docs/onset.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,17 @@ from matplotlib.lines import Line2D
 
 from benchmarks.gripper import Array
 from benchmarks.harness import Benchmark, Job, resumed, say
-from benchmarks.lifts import HOP, Energy, Lift, Listening, Never, Oracle, Trigger, run_lift
+from benchmarks.lifts import (
+    HOP,
+    REACH_MM,
+    Energy,
+    Lift,
+    Listening,
+    Never,
+    Oracle,
+    Trigger,
+    run_lift,
+)
 from benchmarks.tables import Report, Table, percent
 from tactslip_torch import AlarmSettings, SlipDetector
 from tactslip_torch.onset.rules import Cusum
@@ -44,8 +54,8 @@ class ClosedLoop(Benchmark):
     Args:
         lifts: how many; a twelfth of them are loaded with 1.4 times the limit, shown apart.
         delays_ms: of the actuator.
-        calibration: lifts of seen materials without slip, with a grip raised by nobody's alarm,
-            in which neither energy nor CUSUM may reach its threshold.
+        calibration: lifts of lighter objects of seen materials, which do not slip, with a grip
+            raised by nobody's alarm, in which neither energy nor CUSUM may reach its threshold.
         detector: shipped one or file, trained on ``SEEN_MATERIALS``.
     """
 
@@ -130,7 +140,7 @@ class ClosedLoop(Benchmark):
         return {"Lifts": Table(rows, note), "Dropped, by load": Table(kinds)}
 
     def draw(self, numbers: Report, drawing: Figure, ending: str) -> None:
-        """Drops and force of every method; hollow: the longer delay."""
+        """Drops, slides and force of every method, by delay."""
         methods = numbers["methods"]
         names = list(dict.fromkeys(name.split(", ")[0] for name in methods))
         drawing.set_size_inches(9.2, 4.2)
@@ -139,7 +149,7 @@ class ClosedLoop(Benchmark):
         for axes, (key, title) in zip(panels, titles.items(), strict=True):
             for name, row in methods.items():
                 method, _, delay = name.partition(", ")
-                is_first = delay in ("", str(self.delays_ms[0]))
+                is_first = delay in ("", _first_delay(methods))
                 lane = names.index(method) + (0.0 if not delay else -0.14 if is_first else 0.14)
                 middle, low, high = row[key] if key == "dropped" else np.array(row[key])[[1, 0, 2]]
                 factor, colour = 100.0 if key == "dropped" else 1.0, style.PALETTE[not is_first]
@@ -147,10 +157,11 @@ class ClosedLoop(Benchmark):
                 axes.plot(factor * middle, lane, "o", color=colour, markersize=5)
             axes.set_title(title)
             style.lanes(axes, names)
-        panels[1].set_xscale("symlog", linthresh=1.0)
+        panels[1].set(xscale="log", xlim=(0.02, 1.5 * REACH_MM))
+        delays = dict.fromkeys(name.partition(", ")[2] for name in methods if ", " in name)
         handles = [
             Line2D([], [], color=style.PALETTE[place], marker="o", label=f"{delay} ms of delay")
-            for place, delay in enumerate(self.delays_ms)
+            for place, delay in enumerate(delays)
         ]
         style.legend_below(drawing, handles, len(handles))
 
@@ -158,6 +169,11 @@ class ClosedLoop(Benchmark):
 def _words(name: str) -> str:
     method, _, delay = name.partition(", ")
     return f"{method}, {delay} ms" if delay else method
+
+
+def _first_delay(methods: Iterable[str]) -> str:
+    """That of the first method which has one."""
+    return next(name.partition(", ")[2] for name in methods if ", " in name)
 
 
 def _percents(shares: list[float] | None) -> str:
@@ -172,7 +188,9 @@ def _thresholds(detector: SlipDetector, num: int) -> dict[str, float]:
     """What energy and CUSUM reach at most, in lifts without slip."""
     energy, cusum = -np.inf, -np.inf
     for number in range(num):
-        lift = Lift(10_000 + number, "steady", materials=SEEN_MATERIALS, tightens=True)
+        lift = Lift(
+            10_000 + number, "steady", mass=(0.4, 0.6), materials=SEEN_MATERIALS, tightens=True
+        )
         of_energy = Energy(list(detector.pool.hand.fast))
         of_cusum = Listening(detector, _by_cusum(detector, np.inf))
         for trigger in (of_energy, of_cusum):
@@ -226,8 +244,7 @@ def _row(lifts: list[dict[str, Any]], name: str) -> dict[str, Any]:
     """Of one method in all lifts: values with intervals, quantiles and means."""
     own = {key: [lift[name][key] for lift in lifts] for key in lifts[0][name]}
     dropped = np.array(own["dropped"], float)
-    delay = name.partition(", ")[2]
-    alarm = f"{_ALARM}, {delay or next(n for n in lifts[0] if n.startswith(_ALARM)).split()[-1]}"
+    alarm = f"{_ALARM}, {name.partition(', ')[2] or _first_delay(lifts[0])}"
     beside = dropped - np.array([lift[alarm]["dropped"] for lift in lifts], float)
     late = [ms for ms in own["late_ms"] if ms is not None]
     return {

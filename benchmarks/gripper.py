@@ -117,17 +117,18 @@ class Gripper:
         self._lift = int(self.model.jnt_dofadr[self.model.joint("lift").id])
         self._slip_mm_s = np.zeros(2 * _ROWS)
 
-    def step(self, grip_n: float, lift_m: float, pull_n: float) -> Pads:
+    def step(self, grip_n: float, lift_m: float, pull_n: float, tap_n: float = 0.0) -> Pads:
         """One step of ``STEP_S``.
 
         Args:
             grip_n: of each finger.
             lift_m: height of the gripper above where it began.
             pull_n: that draws the object down beside its weight.
+            tap_n: that pushes it aside, along its faces that are free.
         """
         model, data = self.model, self.data
         data.ctrl[:] = grip_n, grip_n, lift_m
-        data.xfrc_applied[self._object, 2] = -pull_n
+        data.xfrc_applied[self._object, 1:3] = tap_n, -pull_n
         fall = np.exp(-((self._slip_mm_s / self._stribeck_mm_s) ** 2))
         ratio = self._mu_ratio + (1.0 - self._mu_ratio) * fall
         model.pair_friction[:, :2] = (self._mu_s * ratio)[:, None]

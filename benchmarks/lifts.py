@@ -30,6 +30,7 @@ from tactslip_torch.report import style
 from tactslip_torch.simulation import (
     UNSEEN_MATERIALS,
     Contact,
+    Disturbances,
     Handling,
     HandSignals,
     Scene,
@@ -43,11 +44,12 @@ REACH_MM = 30.0
 _CLOSING_S, _CLOSED_S = 0.15, 0.45
 WATCHED_S = 0.8
 """From when on a reflex may tighten: the grip has closed, the lift begins later."""
-_LIFT_S, _LOADED_S, _END_S = 1.2, (2.3, 2.7), 4.2
+_LIFT_S, _LOADED_S, _REST_S = 1.2, (2.3, 2.7), 0.7
 _LAG_S = 0.01  # of the actuator behind its delay: a first-order lag
 _MARGIN = 1.5  # of the force that the controller takes over the one that the object should need
 _SLIDES_MM_S = 2.0  # of a pad
 _RECENT_S = 0.25
+_TAP_S = 0.015
 _FILMED_HOPS, _FILM_SIZE = 10, (230, 150)  # a frame each 50 ms; height and width
 _PAUSE_S = 0.02  # of a slide that goes on
 
@@ -56,8 +58,8 @@ _PAUSE_S = 0.02  # of a slide that goes on
 class Lift:
     """One lift: an object and how it is loaded, drawn by number.
 
-    The controller expects a mass and friction and grips with 1.5 times the force that they need;
-    the real mass is .7 to 1.3 times the expected one.
+    The controller expects a mass and friction and grips with 1.5 times the force that they need.
+    Motors and knocks have levels of the draw, and the object is tapped once before it is loaded.
 
     Args:
         number: of the draw.
@@ -65,6 +67,7 @@ class Lift:
             what static friction holds, ``"sudden"``: within 20 ms; ``"heavy"``: so heavy is the
             object itself; ``"steady"``: the pull grows slowly to .9 of the limit.
         over: of the limit of static friction.
+        mass: of the real object over the expected one.
         materials: to draw one from.
         tightens: whether the grip is raised once at a random time, by nobody's alarm.
     """
@@ -72,6 +75,7 @@ class Lift:
     number: int
     kind: Kind
     over: tuple[float, float] = (1.02, 1.2)
+    mass: tuple[float, float] = (0.7, 1.3)
     materials: tuple[str, ...] = UNSEEN_MATERIALS
     tightens: bool = False
 
@@ -80,13 +84,18 @@ class Lift:
         rng = np.random.default_rng([41, self.number])
         low, high = (0.9, 0.9) if self.kind == "steady" else self.over
         ranges = {
-            "mass": (0.7, 1.3),
+            "mass": self.mass,
             "over": (low, high),
             "load_n": (0.5, 1.5),
             "loaded_s": _LOADED_S,
             "rise_s": (0.02, 0.02) if self.kind == "sudden" else (0.3, 1.2),
             "distance_mm": (35.0, 50.0),
-            "tightened_s": (2.0, 3.0),
+            "tightened_s": (1.8, 2.6),
+            "tap_n": (1.0, 4.0),
+            "tapped_s": (1.8, 2.3),
+            "motor_mv": (1.0, 20.0),
+            "knock_mv": (30.0, 200.0),
+            "start_mv": (20.0, 100.0),
         }
         return {name: float(rng.uniform(*bounds)) for name, bounds in ranges.items()}
 
@@ -98,12 +107,24 @@ class Lift:
             self.materials[self.number % len(self.materials)],
             strokes=(stroke,),
             contact=Contact(load_n=self._drawn["load_n"]),
+            disturbances=Disturbances(
+                motor_vibration_mv=self._drawn["motor_mv"],
+                burst_mv=self._drawn["knock_mv"],
+                arm_transient_mv=self._drawn["start_mv"],
+            ),
             handling=Handling(carried_kg=0.0),
-            tail_s=_END_S,
+            tail_s=3.0,
             seed=1000,
             session=f"lift {self.number}",
             name="lift",
         )
+
+    @property
+    def end_s(self) -> float:
+        """When all is over: some time behind the last change of load."""
+        lifted_s = self.scene.arm[0].stop_s
+        loaded_s = self._drawn["loaded_s"] + self._drawn["rise_s"]
+        return (lifted_s if self.kind == "heavy" else loaded_s) + _REST_S
 
     @property
     def shape(self) -> str:
@@ -122,6 +143,11 @@ class Lift:
         """What pulls the object down beside its weight."""
         since = (time_s - self._drawn["loaded_s"]) / self._drawn["rise_s"]
         return most_n * min(max(since, 0.0), 1.0)
+
+    def tap_n(self, time_s: float) -> float:
+        """What pushes the object aside: half a sine."""
+        phase = (time_s - self._drawn["tapped_s"]) / _TAP_S
+        return self._drawn["tap_n"] * math.sin(math.pi * phase) if 0 < phase < 1 else 0.0
 
     def raised(self, time_s: float) -> float:
         """By what nobody's alarm multiplies the grip."""
@@ -289,7 +315,7 @@ def run_lift(
     ends_s = recent_s = -math.inf
     false = {1: 0, 2: 0}
     volts = np.zeros((HOP, len(lift.scene.hand)))
-    times_s = np.arange(round(_END_S / STEP_S), dtype=np.float64) * STEP_S
+    times_s = np.arange(HOP * round(lift.end_s / STEP_S / HOP), dtype=np.float64) * STEP_S
     heights_m = 1e-3 * stroke.travel_mm(times_s)
     closed = np.clip((times_s - _CLOSING_S) / (_CLOSED_S - _CLOSING_S), 0.0, 1.0)
     for first in range(0, len(times_s), HOP):
@@ -299,7 +325,7 @@ def run_lift(
             commands.append(grip_n * factor * reflex.factor * lift.raised(time_s))
             force_n += (closed[step] * commands.popleft() - force_n) * STEP_S / _LAG_S
             pull_n = lift.pull_n(time_s, most_n - weight_n)
-            felt.append(gripper.step(force_n, heights_m[step], pull_n))
+            felt.append(gripper.step(force_n, heights_m[step], pull_n, lift.tap_n(time_s)))
         pads = Pads(*np.array(felt).swapaxes(0, 1))
         if time_s > WATCHED_S:
             grips_n.append(force_n)
@@ -397,7 +423,7 @@ def film(path: Path, lift: Lift, detector: SlipDetector) -> None:
             for values, colour in zip(both, (style.VERMILION, style.BLUE), strict=True):
                 axes.plot(times_s[:last], values[:last], color=colour, linewidth=1)
             axes.set_title(title, fontsize=8, loc="left")
-            axes.set(xlim=(_LIFT_S, _END_S), ylim=(0, 1.05 * max(map(max, both))))
+            axes.set(xlim=(_LIFT_S, lift.end_s), ylim=(0, 1.05 * max(map(max, both))))
             axes.tick_params(labelsize=7, labelbottom=row == 2)
             axes.set_xlabel("s" if row == 2 else "", fontsize=7)
         figure.savefig(file := BytesIO(), format="png", dpi=100)

@@ -27,6 +27,7 @@ CASES = [
     pytest.param(("paper", "float32"), marks=pytest.mark.slow),
     ("general, several views", "float32"),
     pytest.param(("general, several views", "float64"), marks=pytest.mark.slow),
+    pytest.param(("general, several views in factors", "float32"), marks=pytest.mark.slow),
 ]
 
 
@@ -46,7 +47,7 @@ class Backends(NamedTuple):
         return [found[name] for name in ("score", *FLAGS)]
 
 
-def several_views(detector):
+def several_views(detector, in_factors=False):
     """The detector with some of its columns scaled once more, and a quadratic part on others."""
     again = range(3, len(detector.scaler.minimum), 2)
     scaler, head, chosen = repeated(detector.scaler, again), detector.head, list(again)
@@ -55,6 +56,9 @@ def several_views(detector):
     bend = size * torch.from_numpy(rng.standard_normal((17, 17)))
     linear = torch.cat([head.linear, -head.linear[chosen]])
     views = QuadraticForm(bend + bend.T, linear, head.constant)
+    if in_factors:
+        signs = torch.tensor([1.0, -1.0, 1.0])
+        views = QuadraticForm(bend[:3] / size**0.5, linear, head.constant, signs)
     parts = detector.pool, detector.channel_filter, detector.selected, scaler, views, detector.info
     imputation = torch.cat([detector.imputation, 0.5 * detector.imputation[chosen]])
     return SlipDetector(*parts, imputation, detector.pooling, sensing=detector.sensing)
@@ -66,7 +70,7 @@ def backends(request, graphs_of, tmp_path_factory):
     recipe, _, views = name.partition(", ")
     file = request.getfixturevalue(recipe).file
     if views:
-        made = several_views(SlipDetector.load(file))
+        made = several_views(SlipDetector.load(file), "factors" in views)
         file = tmp_path_factory.mktemp("views") / "detector.pt"
         made.save(file)
         model = bin_graph(made, precision).model()

@@ -22,11 +22,11 @@ def noise(num_bins, seed=0, num_samples=150):
     return torch.from_numpy(size * rng.standard_normal((num_bins, 24, num_samples)) + offset)
 
 
-def random_detector(seed=0, compress=False, num_repeated=0, num_quadratic=None):
+def random_detector(seed=0, compress=False, num_repeated=0, num_quadratic=None, num_factors=None):
     """A detector nobody trained: three features of each kind, a scaler that fits, a random head.
 
     The last columns are scaled once more, more compressed; the quadratic part may be of the first
-    scaled columns alone.
+    scaled columns alone, and in a few factors.
     """
     rng = np.random.default_rng(seed)
     pool = FeaturePool(HandLayout.paper24())
@@ -47,7 +47,12 @@ def random_detector(seed=0, compress=False, num_repeated=0, num_quadratic=None):
     quadratic = torch.from_numpy(rng.standard_normal((num, num))) / num
     quadratic = quadratic[:num_quadratic, :num_quadratic]
     linear = torch.from_numpy(rng.standard_normal(num))
-    head = QuadraticForm(quadratic + quadratic.T, linear, torch.tensor(0.1, dtype=torch.float64))
+    constant = torch.tensor(0.1, dtype=torch.float64)
+    if num_factors is None:
+        head = QuadraticForm(quadratic + quadratic.T, linear, constant)
+    else:
+        signs = torch.tensor([1.0, -1.0]).repeat(num_factors)[:num_factors]
+        head = QuadraticForm(quadratic[:num_factors], linear, constant, signs)
     info = {"simulated": True, "seed": seed, "penalty": 0.3, "train_recordings": ["M1/0"]}
     return SlipDetector(pool, channel_filter, selected, scaler, head, info)
 
@@ -70,6 +75,14 @@ VARIANTS = {
         "compress": True,
         "num_repeated": 5,
         "num_quadratic": 7,
+    },
+    "factors": {"num_factors": 5},
+    "factors as many as columns": {"num_factors": 12},
+    "repeated columns, few of them in factors": {
+        "compress": True,
+        "num_repeated": 5,
+        "num_quadratic": 11,
+        "num_factors": 10,
     },
 }
 """Arguments of ``random_detector`` for every kind of head and scaler."""
@@ -96,8 +109,11 @@ def test_the_score_is_the_head_of_scaled_features_and_the_same_from_a_file(varia
     low, high = detector.scaler.minimum.numpy(), detector.scaler.maximum.numpy()
     z = np.clip(2 * (features - low) / (high - low) - 1, -1, 1)
     state = {name: value.numpy() for name, value in detector.head.state_dict().items()}
-    first = z[:, : len(state["quadratic"])]
-    expected = np.einsum("ni,ij,nj->n", first, state["quadratic"], first)
+    first = z[:, : state["quadratic"].shape[1]]
+    if "signs" in state:
+        expected = np.square(first @ state["quadratic"].T) @ state["signs"]
+    else:
+        expected = np.einsum("ni,ij,nj->n", first, state["quadratic"], first)
     expected += z @ state["linear"] + 0.1
     np.testing.assert_allclose(detector(bins).numpy(), expected, rtol=1e-9, atol=1e-11)
     detector.save(tmp_path / "detector.pt")

@@ -17,6 +17,7 @@ from tactslip_torch.model.kernels import (
     Polynomial,
     QuadraticForm,
     collapse,
+    factors_of,
     kernel_from_dict,
 )
 
@@ -103,6 +104,90 @@ def test_a_quadratic_part_of_the_first_features_leaves_the_others_linear(rng):
 def test_a_head_whose_parts_disagree_is_refused_with_their_shapes(shapes):
     with pytest.raises(ValueError, match=re.escape("{}, {} and {}".format(*shapes))):
         QuadraticForm(*map(torch.zeros, shapes))
+
+
+def test_factors_of_the_first_features_are_the_form_that_they_add_up_to(rng):
+    factors, linear = (torch.from_numpy(rng.standard_normal(s)) for s in ((2, 3), (5,)))
+    signs, constant = torch.tensor([1.0, -1.0]), torch.tensor(0.3, dtype=torch.float64)
+    head = QuadraticForm(factors, linear, constant, signs)
+    matrix = torch.outer(factors[0], factors[0]) - torch.outer(factors[1], factors[1])
+    z = torch.from_numpy(rng.standard_normal((3, 4, 5))).requires_grad_()
+    dense = QuadraticForm(matrix, linear, constant)
+    torch.testing.assert_close(head(z), dense(z), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(head.matrix, dense.matrix, rtol=1e-12, atol=1e-12)
+    assert torch.autograd.gradcheck(head, z)
+    assert torch.autograd.gradgradcheck(head, z)
+    assert (head.num_features, head.is_linear, head.cost) == (5, False, (13, 8 * 14))
+    none = QuadraticForm(factors[:0], linear, constant, signs[:0])
+    torch.testing.assert_close(none(z), z @ linear + 0.3, rtol=1e-12, atol=1e-12)
+    assert none.is_linear
+
+
+@pytest.mark.parametrize(
+    ("shape", "signs", "message"),
+    [
+        (
+            (2, 3),
+            [1.0],
+            "signs [r], linear [K], m at most K, and a scalar constant, got (2, 3), (1",
+        ),
+        ((2, 6), [1.0, 1.0], "got (2, 6), (2,), (5,) and ()"),
+        ((2, 3), [[1.0, 1.0]], "got (2, 3), (1, 2), (5,) and ()"),
+        ((2, 3), [1.0, 0.5], "signs of factors must be 1 or -1, got 0.5"),
+        ((2, 3), [math.nan, 1.0], "signs of factors must be 1 or -1, got nan"),
+    ],
+)
+def test_factors_and_signs_that_make_no_form_are_refused_in_one_line(shape, signs, message):
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        QuadraticForm(torch.zeros(shape), torch.zeros(5), torch.tensor(0.0), torch.tensor(signs))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["fewer bins", "more bins", "bins twice", "no weight"])
+def test_all_factors_are_the_whole_sum(kind, rng):
+    support, beta = terms_of(rng, 30 if kind == "more bins" else 12, 20)
+    if kind == "bins twice":
+        support[6:] = support[:6]
+    if kind == "no weight":
+        beta.zero_()
+    factors, signs = factors_of(support, beta, tolerance=0.0)
+    rank = {"fewer bins": 12, "more bins": 20, "bins twice": 6, "no weight": 0}[kind]
+    assert factors.shape == (rank, 20)
+    head = QuadraticForm(factors, torch.zeros(20).double(), torch.tensor(0.0).double(), signs)
+    expected = np.einsum("i,ij,ik->jk", beta, support, support)
+    np.testing.assert_allclose(head.matrix.numpy(), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("num_bins", [15, 60])
+def test_factors_are_the_fewest_within_the_tolerance_and_at_most_so_many(num_bins, rng):
+    support, beta = terms_of(rng, num_bins, 25)
+    support *= 0.7 ** torch.arange(25)
+    values, vectors = np.linalg.eigh(np.einsum("i,ij,ik->jk", beta, support, support))
+    order = np.argsort(-np.abs(values))
+    terms = (support.numpy() @ vectors[:, order]) ** 2 * values[order]
+    spread = terms.sum(1).std()
+    errors = [np.sqrt(np.mean(terms[:, num:].sum(1) ** 2)) / spread for num in range(25)]
+    for tolerance in (0.1, 0.005):
+        factors, signs = factors_of(support, beta, tolerance=tolerance)
+        assert 0 < len(factors) == len(signs) == np.argmax(np.array(errors) <= tolerance) < 15
+    few, signs_of_few = factors_of(support, beta, most=2)
+    np.testing.assert_allclose((few**2).sum(1), np.abs(values[order[:2]]), rtol=1e-9)
+    assert signs_of_few.tolist() == np.sign(values[order[:2]]).tolist()
+
+
+@pytest.mark.parametrize(
+    ("shapes", "options", "message"),
+    [
+        (((3, 2), (2,)), {}, r"expected support \[N, m\] .* got \(3, 2\) and \(2,\)"),
+        (((0, 2), (0,)), {}, r"N at least 1, got \(0, 2\) and \(0,\)"),
+        (((3, 2), (3,)), {"most": 0}, "most must be at least 1 .* got 0 and 0.005"),
+        (((3, 2), (3,)), {"tolerance": math.nan}, "tolerance at least 0, got 64 and nan"),
+    ],
+)
+def test_what_has_no_factors_is_refused_in_one_line(shapes, options, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        factors_of(*map(torch.ones, shapes), **options)
+    assert "\n" not in str(caught.value)
 
 
 # Fit -----------------------------------------------------------------------------------------

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 from small_detector import HAND, raw_bins, small_detector
+from test_detector import noise as noisy_bins
+from test_detector import random_detector
 
 from tactslip_torch import FeaturePool, HandLayout, native
 from tactslip_torch.features.bank import make_plan
@@ -88,6 +90,22 @@ def test_a_bin_alone_has_exactly_the_columns_it_has_among_others(level, setting,
     np.testing.assert_array_equal(np.concatenate(alone), found)
     assert np.isnan(found).any(1).nonzero()[0].tolist() == [4]
     assert (found[1, of_channel >= 0] == 0.4).all()
+
+
+@needs_engine
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("num_factors", [None, 3, 11])
+def test_a_bin_alone_has_exactly_the_score_it_has_among_others(level, num_factors, monkeypatch):
+    """More factors and columns than a vector holds, and than a multiple of vectors."""
+    monkeypatch.setenv("TACTSLIP_NATIVE", level)
+    heads = {"num_quadratic": 19, "num_factors": num_factors}
+    detector, bins = random_detector(compress=True, num_repeated=12, **heads), noisy_bins(43)
+    bins[2:9, detector.needed_index[1]] = torch.nan
+    found = detector.score_raw(bins)
+    alone = torch.cat([detector.score_raw(one) for one in bins.split(1)])
+    assert torch.equal(alone, found)
+    by_torch = detector.score_raw(bins.requires_grad_()).detach()
+    torch.testing.assert_close(found, by_torch, rtol=1e-9, atol=1e-9)
 
 
 # Manners -------------------------------------------------------------------------------------

@@ -453,6 +453,20 @@ def test_survives_json(head):
     assert torch.equal(read.onset.score_recording(x), made.score_recording(x))
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_head_in_factors_scores_and_survives_json_as_the_form_it_is(backend):
+    made = CLASSIFIERS["quadratic"]
+    factors, signs = made.head.quadratic[:3], torch.tensor([1.0, -1.0, 1.0])
+    head = QuadraticForm(factors, made.head.linear, made.head.constant, signs)
+    dense = QuadraticForm(head.matrix, head.linear, head.constant)
+    in_factors, whole = replace(made, head=head), replace(made, head=dense)
+    expected = whole.score_recording(SAMPLES)
+    found = OnsetStream(in_factors, backend=backend).push(SAMPLES)
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    plain = json.loads(json.dumps(in_factors.to_dict()))
+    assert plain == whole.to_dict()
+
+
 def kept(change, hand=None):
     """Settings with the classifier after a round to plain data that is changed on the way."""
     plain = settings_with(CLASSIFIERS["network"]).to_dict()

@@ -8,7 +8,7 @@ import torch
 from oracles import pooled
 
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.pooling import STATISTICS, ChannelPooling, pooled_names
+from tactslip_torch.features.pooling import STATISTICS, ChannelPooling
 from tactslip_torch.hand import HandLayout
 
 HAND = HandLayout.from_rows(
@@ -108,4 +108,4 @@ def test_gradients_flow_and_are_finite_where_channels_agree(rng):
 @pytest.mark.parametrize("setting", ["largest", [], ["mean", "mode"]])
 def test_unknown_statistics_are_refused(setting):
     with pytest.raises(ValueError, match=r"features\.pooling must be sorted, null or some of mean"):
-        pooled_names(HAND, POOL.names, setting)
+        ChannelPooling.fit(HAND, POOL.names, torch.zeros(1, len(POOL.names)), setting)

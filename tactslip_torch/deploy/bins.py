@@ -428,14 +428,20 @@ def scaled(features: Value, scaler: FeatureScaler) -> Value:
 
 def machine(z: Value, head: QuadraticForm, dtype: np.dtype[Any]) -> Value:
     """The score of scaled columns, in its dtype: ``[B, S] -> [B]``."""
-    z, num = z.cast(dtype), len(head.quadratic)
+    z, num = z.cast(dtype), head.quadratic.shape[1]
     pull: Value = z.graph.constant(head.linear.double(), dtype)
-    if num == head.num_features:
+    is_whole = num == head.num_features and head.signs is None
+    if is_whole:
         pull = z @ head.quadratic.double() + pull
     score = (pull * z).sum(1) + float(head.constant)
-    if 0 < num < head.num_features:
+    if not (is_whole or head.is_linear):
         first: Value = z.slice(0, num, 1)
-        score = score + (first @ head.quadratic.double() * first).sum(1)
+        if head.signs is None:
+            score = score + (first @ head.quadratic.double() * first).sum(1)
+        else:
+            products: Value = first @ head.quadratic.double().mT
+            signs = z.graph.constant(head.signs.double(), dtype)
+            score = score + (products * products * signs).sum(1)
     largest = float(np.finfo(dtype).max)
     return score.clamp(-largest, largest).cast(dtype)
 

@@ -113,7 +113,7 @@ def statistics_of(setting: str | Sequence[str], num_channels: int) -> tuple[str,
     return tuple(dict.fromkeys(listed)) if num_channels > 1 else ("mean",)
 
 
-def pooled_names(
+def _pooled_names(
     hand: HandLayout, names: Sequence[FeatureName], setting: str | Sequence[str]
 ) -> tuple[FeatureName, ...]:
     """What pooling makes of features: each descriptor of a kind, by statistic.
@@ -242,7 +242,7 @@ class ChannelPooling(nn.Module):
         Raises:
             ValueError: as ``statistics_of``.
         """
-        pooled = pooled_names(hand, names, setting)
+        pooled = _pooled_names(hand, names, setting)
         place = {name: index for index, name in enumerate(names)}
         layer = cls(
             hand, pooled, torch.ones(len(set(map(_family, pooled)))), torch.zeros(len(pooled))

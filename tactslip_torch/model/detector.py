@@ -574,6 +574,7 @@ class _Engine:
         if type(head) is QuadraticForm:
             quadratic, linear = head.quadratic.double(), head.linear.double()
             more["head"] = (quadratic.numpy(), linear.numpy(), float(head.constant))
+            more["signs"] = None if head.signs is None else head.signs.double().numpy()
         hand, sensing = detector.pool.hand, detector.sensing
         of_channel = detector.channel_index.numpy()
         of_channel = np.where(of_channel < len(hand), of_channel, -1)

@@ -228,35 +228,49 @@ class SolveReport:
 class QuadraticForm(nn.Module):
     """``x' Q x + l' z + a``, with the first ``m`` of the K features ``z`` in ``x``.
 
+    With signs ``Q`` is given by factors, and ``x' Q x`` is ``sum_k signs_k (F_k . x)^2``; a form
+    of low rank is then scored and stored in ``r (m + 1)`` numbers.
+
     Args:
-        quadratic: ``[m, m]``, symmetric; of a linear machine empty, ``[0, 0]``.
+        quadratic: ``Q [m, m]``, symmetric, or the factors ``F [r, m]``; of a linear machine empty,
+            ``[0, 0]``.
         linear: ``[K]``.
         constant: a scalar tensor.
+        signs: ``[r]``, 1 or -1; ``None``: there are none.
 
     Attributes:
         solved: how its numbers were solved for; ``None`` if read from a file or made by hand.
 
     Raises:
-        ValueError: if shapes disagree.
+        ValueError: if shapes disagree, or a sign is neither 1 nor -1.
     """
 
     quadratic: Tensor
     linear: Tensor
     constant: Tensor
+    signs: Tensor | None
 
-    def __init__(self, quadratic: Tensor, linear: Tensor, constant: Tensor) -> None:
+    def __init__(
+        self, quadratic: Tensor, linear: Tensor, constant: Tensor, signs: Tensor | None = None
+    ) -> None:
         super().__init__()
         self.solved: SolveReport | None = None
         num = quadratic.shape[-1] if quadratic.ndim else -1
-        is_known = quadratic.shape == (num, num) and linear.ndim == 1 and num <= len(linear)
-        if not is_known or constant.shape != ():
+        rows = num if signs is None else signs.numel()
+        is_known = quadratic.shape == (rows, num) and linear.ndim == 1 and num <= len(linear)
+        if not is_known or constant.shape != () or (signs is not None and signs.ndim != 1):
+            wanted = "[m, m]" if signs is None else "[r, m], signs [r]"
+            given = (quadratic, *(() if signs is None else (signs,)), linear)
             raise ValueError(
-                "expected quadratic [m, m], linear [K], m at most K, and a scalar constant, got "
-                f"{tuple(quadratic.shape)}, {tuple(linear.shape)} and {tuple(constant.shape)}"
+                f"expected quadratic {wanted}, linear [K], m at most K, and a scalar constant, got "
+                f"{', '.join(str(tuple(x.shape)) for x in given)} and {tuple(constant.shape)}"
             )
+        if signs is not None and bool((is_other := signs.abs() != 1).any()):
+            raise ValueError(f"signs of factors must be 1 or -1, got {signs[is_other][0]:g}")
         self.register_buffer("quadratic", quadratic.clone())
         self.register_buffer("linear", linear.clone())
         self.register_buffer("constant", constant.clone())
+        self.register_buffer("signs", None if signs is None else signs.to(quadratic, copy=True))
 
     @property
     def num_features(self) -> int:
@@ -269,9 +283,17 @@ class QuadraticForm(nn.Module):
         return self.quadratic.numel() == 0
 
     @property
+    def matrix(self) -> Tensor:
+        """``Q``, of factors their sum: ``[m, m]``."""
+        if self.signs is None:
+            return self.quadratic
+        return self.quadratic.mT @ (self.quadratic * self.signs[:, None])
+
+    @property
     def cost(self) -> _Cost:
         """Multiply-adds a bin and bytes, whatever the number of training bins."""
         num_values = self.num_features + self.quadratic.numel()
+        num_values += 0 if self.signs is None else len(self.signs)
         return _Cost(num_values, (num_values + 1) * self.linear.element_size())
 
     def forward(self, z: Tensor) -> Tensor:
@@ -281,15 +303,17 @@ class QuadraticForm(nn.Module):
             - z: ``[*, K]``
             - output: ``[*]``
         """
-        if (num := len(self.quadratic)) == self.num_features:
+        num = self.quadratic.shape[-1]
+        if self.signs is None and num == self.num_features:
             pull = nn.functional.linear(z, self.quadratic, self.linear)  # as few calls as can be
             whole: Tensor = torch.linalg.vecdot(pull, z) + self.constant
             return whole
         score: Tensor = torch.linalg.vecdot(self.linear, z) + self.constant
-        if num:
+        if not self.is_linear:
             first = z[..., :num]
             pull = nn.functional.linear(first, self.quadratic)
-            score = score + torch.linalg.vecdot(pull, first)
+            other = first if self.signs is None else pull * self.signs
+            score = score + torch.linalg.vecdot(pull, other)
         return score
 
 
@@ -314,3 +338,54 @@ def collapse(support: Tensor, beta: Tensor, kernel: Polynomial = PAPER_KERNEL) -
         return QuadraticForm(support.new_zeros(0, 0), pull, kernel.offset * total)
     bend = support.mT @ (support * beta[:, None])
     return QuadraticForm(bend, 2 * kernel.offset * pull, kernel.offset**2 * total)
+
+
+def factors_of(
+    support: Tensor, beta: Tensor, *, most: int = 64, tolerance: float = 0.005
+) -> tuple[Tensor, Tensor]:
+    """Factors and signs of ``sum_i beta_i (z_i . z)^2``, those of the largest eigenvalues.
+
+    They are the fewest whose error at the bins ``z_i``, root mean square, is at most ``tolerance``
+    of the standard deviation of the sum there, or ``most``. No ``[m, m]`` is formed where there
+    are fewer bins than columns. For ``QuadraticForm``; in float64 and without derivatives.
+
+    Args:
+        support: scaled training bins, the columns of the quadratic part alone.
+        beta: their output weights.
+        most: number of factors, at least 1.
+        tolerance: at least 0; with 0 none is left out but by ``most`` and by rounding.
+
+    Shape:
+        - support: ``[N, m]``; beta: ``[N]``; output: ``[r, m]`` and ``[r]``
+
+    Raises:
+        ValueError: if shapes disagree, or a number is outside its range.
+    """
+    if support.ndim != 2 or beta.shape != support.shape[:1] or not len(beta):
+        raise ValueError(
+            f"expected support [N, m] and beta [N], N at least 1, got {tuple(support.shape)} and "
+            f"{tuple(beta.shape)}"
+        )
+    if most < 1 or not tolerance >= 0:
+        raise ValueError(
+            f"most must be at least 1 and tolerance at least 0, got {most} and {tolerance}"
+        )
+    with torch.no_grad():
+        support, beta = support.double(), beta.double()
+        bins, basis = support, None  # coordinates of bins, and the directions that they belong to
+        if len(support) < support.shape[1]:
+            squares, vectors = torch.linalg.eigh(support @ support.mT)
+            is_kept = squares > len(squares) * torch.finfo(squares.dtype).eps * squares.amax()
+            sizes, vectors = squares[is_kept].sqrt(), vectors[:, is_kept]
+            bins, basis = vectors * sizes, (vectors / sizes).mT @ support
+        values, vectors = torch.linalg.eigh(bins.mT @ (bins * beta[:, None]))
+        order = values.abs().argsort(descending=True)
+        values, vectors = values[order], vectors[:, order]
+        terms = (bins @ vectors).square() * values
+        left_out = terms.flip(1).cumsum(1).flip(1).square().mean(0).sqrt()  # without the first r
+        allowed = tolerance * terms.sum(1).std(correction=0)
+        is_enough = torch.cat([left_out <= allowed, allowed.new_ones(1, dtype=torch.bool)])
+        num = min(int(is_enough.nonzero()[0]), most)
+        vectors = vectors[:, :num] * values[:num].abs().sqrt()
+        factors = vectors.mT if basis is None else vectors.mT @ basis
+        return factors.contiguous(), torch.where(values[:num] < 0, -1.0, 1.0).to(factors)

@@ -96,10 +96,10 @@ class _Machine(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in (
             "num_channels", "num_inputs", "num_columns", "num_scaled", "num_quadratic",
-            "num_singles", "num_pools", "most_channels")),
+            "num_factors", "num_singles", "num_pools", "most_channels")),
         *((name, ctypes.c_void_p) for name in (
             "single_inputs", "single_columns", "pools", "fill", "sources", "minimum", "maximum",
-            "compression", "imputation", "channels", "quadratic", "linear")),
+            "compression", "imputation", "channels", "quadratic", "signs", "linear")),
         ("constant", ctypes.c_double),
     )  # fmt: skip
 
@@ -399,6 +399,7 @@ class Machine(_Kept):
             ``[S]``; None: they stay as they are.
         head: quadratic part ``[m, m]`` of the first m scaled columns (or empty), linear part
             ``[S]`` and constant; None: no score.
+        signs: of the factors, ``[r]``, which are then the quadratic part, ``[r, m]``.
     """
 
     def __init__(
@@ -413,6 +414,7 @@ class Machine(_Kept):
         scaling: tuple[Array, Array, Array | None, Array | None] | None = None,
         imputation: tuple[Array, Array] | None = None,
         head: tuple[Array, Array, float] | None = None,
+        signs: Array | None = None,
     ) -> None:
         super().__init__()
         minimum, maximum, compression, sources = scaling or (None,) * 4
@@ -435,7 +437,7 @@ class Machine(_Kept):
         self._held.append(made)
         places = np.array(singles, np.int64).reshape(-1, 2)
         self.of = _Machine(
-            num_channels, num_inputs, num_columns, self.num_scaled, 0, len(places), len(pools),
+            num_channels, num_inputs, num_columns, self.num_scaled, 0, 0, len(places), len(pools),
             max((len(pool.channels) for pool in pools), default=0),
             *(self._array(each, np.int64) for each in places.T), ctypes.addressof(made),
         )  # fmt: skip
@@ -454,12 +456,19 @@ class Machine(_Kept):
             quadratic, linear, constant = head
             self.of.linear = self._filled_up(linear, np.float64, 0.0)
             self.of.constant = constant
-            if num := len(quadratic):
-                lower = np.tril(quadratic + quadratic.T)
-                lower[np.diag_indices_from(lower)] /= 2
-                rows = np.pad(lower, [(0, -num % _WHOLE), (0, 0)]).reshape(-1, _WHOLE, num)
-                self.of.num_quadratic = num
-                self.of.quadratic = self._array(rows.swapaxes(1, 2), np.float64)
+            rows = quadratic
+            if signs is None:
+                rows = np.tril(quadratic + quadratic.T)
+                rows[np.diag_indices_from(rows)] /= 2
+            elif len(signs):
+                self.of.num_factors = len(signs)
+                self.of.signs = self._filled_up(signs, np.float64, 0.0)
+                rows = np.pad(rows, [(0, 0), (0, -rows.shape[1] % _WHOLE)])
+            if len(rows):
+                blocks = np.pad(rows, [(0, -len(rows) % _WHOLE), (0, 0)])
+                blocks = blocks.reshape(-1, _WHOLE, rows.shape[1]).swapaxes(1, 2)
+                self.of.num_quadratic = rows.shape[1]
+                self.of.quadratic = self._array(blocks, np.float64)
 
     def columns(self, inputs: Array, is_lost: Array | None = None) -> Array:
         """Columns of bins, scaled if there is a scaling, ``[M, S]``.

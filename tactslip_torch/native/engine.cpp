@@ -904,12 +904,13 @@ struct Judge {
     for (int64_t i = m.num_scaled; i < filled_up(m.num_scaled); ++i)
       for (int k = 0; k < (ACROSS == BINS ? DL : 1); ++k) of<ACROSS>(z, i, k) = 0;
     D sums = D{} + m.constant;
+    int64_t num_quadratic = m.signs ? 0 : m.num_quadratic;
     for (int64_t i = 0; i < m.num_scaled; i += rows) {
       D pull[num];
       for (int v = 0; v < num; ++v) pull[v] = constants<ACROSS>(m.linear + i + v * step<ACROSS>());
-      const double* block = m.quadratic + i / WHOLE * WHOLE * m.num_quadratic + i % WHOLE;
-      int64_t reach = i + rows < m.num_quadratic ? i + rows : m.num_quadratic;
-      for (int64_t j = 0; i < m.num_quadratic && j < reach; ++j) {
+      const double* block = m.quadratic + i / WHOLE * WHOLE * num_quadratic + i % WHOLE;
+      int64_t reach = i + rows < num_quadratic ? i + rows : num_quadratic;
+      for (int64_t j = 0; i < num_quadratic && j < reach; ++j) {
         D other = ACROSS == BINS ? z[j] : D{} + of<ACROSS>(z, j, 0);
 #pragma GCC unroll 4
         for (int v = 0; v < num; ++v)
@@ -921,7 +922,34 @@ struct Judge {
         for (int k = 0; ACROSS == ONE_BIN && k < DL; ++k) sums[0] += terms[k];
       }
     }
+    if (m.signs) factors<ACROSS>(sums);
     return sums;
+  }
+
+  // Add the squares of the products with the factors. There are few rows and many columns, so each
+  // product is summed in PARTS, which do not wait for each other.
+  template <Across ACROSS> void factors(D& sums) {
+    const Machine& m = machine;
+    constexpr int PARTS = 4, rows = ACROSS == BINS ? 4 : WHOLE, num = rows / step<ACROSS>();
+    for (int64_t i = 0; i < m.num_factors; i += rows) {
+      const double* block = m.quadratic + i / WHOLE * WHOLE * m.num_quadratic + i % WHOLE;
+      D pull[PARTS][num] = {};
+      for (int64_t j = 0; j < m.num_quadratic; j += PARTS) {
+#pragma GCC unroll 4
+        for (int p = 0; p < PARTS; ++p) {
+          D other = ACROSS == BINS ? z[j + p] : D{} + of<ACROSS>(z, j + p, 0);
+#pragma GCC unroll 4
+          for (int v = 0; v < num; ++v)
+            pull[p][v] += other * constants<ACROSS>(block + WHOLE * (j + p) + v * step<ACROSS>());
+        }
+      }
+      for (int v = 0; v < num; ++v) {
+        D whole = (pull[0][v] + pull[1][v]) + (pull[2][v] + pull[3][v]);
+        D terms = whole * whole * constants<ACROSS>(m.signs + i + v * step<ACROSS>());
+        if (ACROSS == BINS) sums += terms;
+        for (int k = 0; ACROSS == ONE_BIN && k < DL; ++k) sums[0] += terms[k];
+      }
+    }
   }
 };
 

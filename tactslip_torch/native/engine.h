@@ -76,7 +76,7 @@ struct Pool {
 // From inputs (features) to columns, to scaled columns, and to a score.
 struct Machine {
   int64_t num_channels, num_inputs, num_columns, num_scaled, num_quadratic;
-  int64_t num_singles, num_pools, most_channels;
+  int64_t num_factors, num_singles, num_pools, most_channels;
   const int64_t *single_inputs, *single_columns;  // of columns that are not pooled
   const Pool* pools;
   const double* fill;       // [columns], where no channel is in use; null: nothing is pooled
@@ -84,9 +84,11 @@ struct Machine {
   const double *minimum, *maximum, *compression;  // [scaled]; null: not scaled, not compressed
   const double* imputation;  // [scaled], of a lost channel; null: they stay as they are
   const int64_t* channels;   // [scaled], -1: of several; null without imputation
-  // of the first scaled columns: lower triangle, off its diagonal twice, [blocks, columns, WHOLE
-  // rows of a block]; null: none
+  // of the first num_quadratic scaled columns, [blocks, columns, WHOLE rows of a block]; null: none.
+  // Without signs: lower triangle, off its diagonal twice. With them: factors, as many columns as a
+  // multiple of WHOLE has.
   const double* quadratic;
+  const double* signs;   // [factors], 1 or -1; null: there are no factors
   const double* linear;  // [scaled]; null: no score
   double constant;
 };

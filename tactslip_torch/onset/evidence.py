@@ -706,7 +706,7 @@ class OnsetClassifier:
             }
         else:
             of_head = {
-                "quadratic": _packed(self.head.quadratic),
+                "quadratic": _packed(self.head.matrix),
                 "linear": _packed(self.head.linear),
                 "constant": float(self.head.constant),
             }
@@ -870,7 +870,7 @@ def engine_of(
         layers = [(w.detach().double().numpy(), b.detach().double().numpy()) for w, b in pairs]
         form = None
     else:
-        quadratic = np.empty((0, 0)) if head.is_linear else head.quadratic.double().numpy()
+        quadratic = np.empty((0, 0)) if head.is_linear else head.matrix.double().numpy()
         layers, form = [], (quadratic, head.linear.double().numpy(), float(head.constant))
     return OnsetEngine(
         fast=evidence.hand.fast,

@@ -9,6 +9,7 @@ more as it falls, so the bound holds although it is chosen on the same recording
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -393,6 +394,6 @@ def _joined(recordings: Sequence[ScoredRecording], budget: Budget) -> BudgetScor
 
 def _shifted(head: QuadraticForm, by: float) -> QuadraticForm:
     """The machine whose score is lower by so much."""
-    made = QuadraticForm(head.quadratic, head.linear, head.constant - by)
-    made.solved = head.solved
+    made = copy.deepcopy(head)
+    made.constant -= by
     return made

@@ -71,6 +71,7 @@ NO_DETECTORS = {  # what is changed in metadata, or which tensor becomes what
     "index dtype": lambda content, tensors: tensors.update(
         {"scaler.columns": torch.zeros_like(tensors["scaler.minimum"])}
     ),
+    "signs": lambda content, tensors: tensors.update({"head.signs": torch.ones(3)}),
     "dtype": lambda content, tensors: tensors.update({"head.constant": torch.tensor(1)}),
     "number": lambda content, tensors: tensors.update({"head.constant": torch.tensor(torch.nan)}),
 }
