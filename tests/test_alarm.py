@@ -421,7 +421,7 @@ def test_a_threshold_that_is_never_reached_is_refused():
 
 
 def test_bins_over_the_edge_of_a_slide_have_no_label():
-    kept, is_slip = alarm.labelled([stream_of(torch.arange(60.0), [(0.2, 0.4)])], TIMING)
+    kept, is_slip = alarm._labelled([stream_of(torch.arange(60.0), [(0.2, 0.4)])], TIMING)
     starts, expected = np.arange(60) * 0.01, {}
     for number, (start, end) in enumerate(zip(starts, starts + 0.05, strict=True)):
         inside = start >= 0.2 - 1e-9 and end <= 0.4 + 1e-9

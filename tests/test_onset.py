@@ -32,7 +32,7 @@ from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence, OnsetStream, Perceptron
 from tactslip_torch.onset.rules import NOTHING_YET, KOfN
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.onset import OnsetTraining, columns_of, labels_of
+from tactslip_torch.training.onset import OnsetTraining, _columns_of, _labels_of
 
 RATE = 2000.0
 STEP = 1e-3
@@ -604,13 +604,13 @@ def test_hops_are_learned_as_what_they_are():
         unlabelled_s=((4.001, 4.101),),
     )
     at = np.arange(5, 5001, 5)
-    label = labels_of(times, at / 1000)
+    label = _labels_of(times, at / 1000)
     # from half of the load to 300 ms behind it, or the end of the slide
     assert at[label > 0].tolist() == ms((1025, 1320), (2255, 2400))
     left_out = ms((1005, 1020), (1325, 1750), (2405, 2650), (3005, 3450), (4005, 4350))
     assert at[label == 0].tolist() == left_out
     plain = SmallTimeline(onsets_s=(1.021,), sliding_s=((1.021, 1.5),))
-    label = labels_of(plain, at / 1000)  # no release is known
+    label = _labels_of(plain, at / 1000)  # no release is known
     assert at[label > 0].tolist() == ms((1025, 1320))
     assert at[label == 0].tolist() == ms((1325, 1750))
 
@@ -675,7 +675,7 @@ def test_a_slip_of_a_new_material_scores_above_all_that_is_none(learned):
     slips, others = [], []
     for recording in source.ids:
         score = classifier.score_recording(source.load(recording).samples).numpy()
-        label = labels_of(source.timeline(recording), (1 + np.arange(len(score))) * 0.005)
+        label = _labels_of(source.timeline(recording), (1 + np.arange(len(score))) * 0.005)
         known = score > NOTHING_YET
         slips += [score[known & (label > 0)].max()] if (label > 0).any() else []
         others.append(score[known & (label < 0)].max())
@@ -717,7 +717,7 @@ def test_training_reads_the_columns_that_a_stream_has(kinds):
     evidence = evidence_of(kinds)
     x = samples_of(evidence, 1.0)
     x[:, 700:720] = torch.nan
-    found, is_usable = columns_of(evidence, x)
+    found, is_usable = _columns_of(evidence, x)
     first = x.shape[1] // 10 - len(found)
     lost = np.isnan(found).any(1)
     assert lost[70 - first : 72 - first].all()

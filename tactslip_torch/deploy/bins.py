@@ -116,7 +116,7 @@ class Timing:
             return cls(raw, *times, raw.length - 1, size)
         evidence = settings.onset.evidence
         tail = max(raw.length, evidence.context + evidence.hop_samples) - 1
-        size += 1 + len(OF_LAST_BIN) + num_channels + memory_size(settings.onset)
+        size += 1 + len(OF_LAST_BIN) + num_channels + sum(memory_sizes(settings.onset))
         return cls(raw, *times, tail, size, evidence.hop_samples)
 
     def decisions(self, num: int) -> int:
@@ -126,13 +126,8 @@ class Timing:
         return 0 if num < max(self.first, self.frame) else (num - self.first) // self.hop + 1
 
 
-def memory_size(onset: OnsetClassifier) -> int:
-    """Numbers that are kept of a stream's evidence."""
-    return sum(memory_sizes(onset))
-
-
 def memory_sizes(onset: OnsetClassifier) -> list[int]:
-    """Lost and known blocks, scores, the rows of ``memory_shapes`` and the floors."""
+    """Numbers kept of a stream: lost and known blocks, scores, ``memory_shapes``, floors."""
     num_floors = len(FLOORS_S) * onset.evidence.num_filters * len(onset.evidence.hand.fast)
     num_floors += onset.evidence.step_matrix.shape[1] * len(onset.evidence.hand.slow)
     rows = [rows * width for rows, width in memory_shapes(onset)]

@@ -26,7 +26,6 @@ from tactslip_torch.deploy.bins import (
     dtype_of,
     machine,
     memory_shapes,
-    memory_size,
     memory_sizes,
     rule_start,
     scaled,
@@ -97,7 +96,7 @@ def stream_graph(
     if onset is not None:
         no_bin = [0.0, *([math.nan] * 3), 0.0, 0.0, math.inf, *([0.0] * num_channels)]
         start, given = graph.concat(start, graph.constant(no_bin, F64), axis=0), state
-        small = timing.state_size - memory_size(onset)
+        small = timing.state_size - sum(memory_sizes(onset))
         state = given.slice(0, small, 0)
     else:
         small = timing.state_size

@@ -79,7 +79,7 @@ _NUMBERS: Mapping[str, Any] = {
 }
 
 
-class Blocks(NamedTuple):
+class _Blocks(NamedTuple):
     """What is measured of a stream in blocks of ``hop_samples``, ``m`` of them.
 
     Attributes:
@@ -95,12 +95,12 @@ class Blocks(NamedTuple):
     means: Tensor
     moves: Tensor
 
-    def only(self, places: Any) -> Blocks:
+    def only(self, places: Any) -> _Blocks:
         """Some of the blocks."""
-        return Blocks(*(each[places] for each in self))
+        return _Blocks(*(each[places] for each in self))
 
 
-class Memory(NamedTuple):
+class _Memory(NamedTuple):
     """What is kept between two hops.
 
     Attributes:
@@ -197,7 +197,7 @@ class OnsetEvidence:
 
     @property
     def delay(self) -> int:
-        """Blocks by which floors lag behind: the longest window."""
+        """_Blocks by which floors lag behind: the longest window."""
         return self.windows[-1]
 
     @cached_property
@@ -306,7 +306,7 @@ class OnsetEvidence:
     @cached_property
     def num_columns(self) -> int:
         """``K``."""
-        blocks = Blocks(
+        blocks = _Blocks(
             torch.zeros(1, self.num_filters, len(self.hand.fast)).double(),
             torch.zeros(1, self.num_filters, self.pairs.shape[1]).double(),
             torch.zeros(1, len(self.hand.slow)).double(),
@@ -330,7 +330,7 @@ class OnsetEvidence:
 
     # what is measured -----------------------------------------------------------------------------
 
-    def blocks(self, samples: Tensor) -> Blocks:
+    def blocks(self, samples: Tensor) -> _Blocks:
         """Of every whole block that has its context.
 
         Args:
@@ -354,15 +354,15 @@ class OnsetEvidence:
             first, second = torch.from_numpy(self.pairs.copy())
             products = (filtered[:, :, first] * filtered[:, :, second]).mean(-1)
             moves = (own[fast] != own[fast][..., :1]).any(-1).mT | (hop < FEWEST_BLOCK_SAMPLES)
-        return Blocks(logs, products, own[list(self.hand.slow)].mean(-1).mT, moves)
+        return _Blocks(logs, products, own[list(self.hand.slow)].mean(-1).mT, moves)
 
-    def blocks_of_recording(self, samples: Tensor) -> Blocks:
+    def blocks_of_recording(self, samples: Tensor) -> _Blocks:
         """Of a whole recording ``[C, T]``: those that have their context."""
         start = -(-self.context // self.hop_samples) * self.hop_samples - self.context
         return self.blocks(samples[:, start:])
 
-    def is_lost(self, blocks: Blocks, in_use: Tensor) -> Tensor:
-        """Blocks in which too few channels are alive, ``[m]``, bool.
+    def is_lost(self, blocks: _Blocks, in_use: Tensor) -> Tensor:
+        """_Blocks in which too few channels are alive, ``[m]``, bool.
 
         A fast one is alive where it is finite, moves and is not silent, a slow one where it is
         finite.
@@ -379,14 +379,14 @@ class OnsetEvidence:
         still = torch.tensor(self.is_still or (False,) * len(self.hand.fast))
         return (known & (moves | still)).sum(-1) < self.min_alive
 
-    def begin(self, blocks: Blocks, num_lagged: int = 0) -> Memory:
+    def begin(self, blocks: _Blocks, num_lagged: int = 0) -> _Memory:
         """What is kept where a block is the first: all that was before is equal to it."""
         first = blocks.only(slice(0, 1))
         num_fast, num_slow = len(self.hand.fast), len(self.hand.slow)
         num_steps = self.step_matrix.shape[1]
         zeros = first.logs.new_zeros
         no_step = (0.0 * first.means).unsqueeze(1)  # NaN where a channel is missing
-        return Memory(
+        return _Memory(
             zeros(()),
             first.logs.expand(self.delay, -1, -1),
             first.products.expand(self.delay, -1, -1),
@@ -398,8 +398,8 @@ class OnsetEvidence:
         )
 
     def columns(
-        self, blocks: Blocks, memory: Memory | None = None, in_use: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Memory]:
+        self, blocks: _Blocks, memory: _Memory | None = None, in_use: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, _Memory]:
         """The evidence of each of some blocks in a row, at least one, of which none is lost.
 
         A channel is left out of the pools where one of its blocks that a column rests on is not
@@ -443,7 +443,7 @@ class OnsetEvidence:
             used[list(self.hand.fast)],
             used[list(self.hand.slow)],
         )
-        kept = Memory(
+        kept = _Memory(
             count[-1],
             logs[-delay:],
             products[-delay:],
@@ -670,8 +670,8 @@ class OnsetClassifier:
         return torch.cat([scaled, *(rows[len(rows) - num - lag :][:num] for lag in lags)], 1)
 
     def scores(
-        self, blocks: Blocks, memory: Memory | None = None, in_use: Tensor | None = None
-    ) -> tuple[Tensor, Memory]:
+        self, blocks: _Blocks, memory: _Memory | None = None, in_use: Tensor | None = None
+    ) -> tuple[Tensor, _Memory]:
         """Of hops in a row of which none is lost; NaN where there is no evidence.
 
         Arguments and shapes are those of ``OnsetEvidence.columns``.
@@ -796,7 +796,7 @@ class OnsetStream:
         self._most_lost = most_lost(window, most_lost_samples, evidence.hop_samples)
         is_native = backend_of(backend) == "native"
         self._engine = engine_of(classifier, self._most_lost) if is_native else None
-        self._memory: Memory | None = None  # of torch; the engine has its own
+        self._memory: _Memory | None = None  # of torch; the engine has its own
         self._num_lost = 0
         self._hop = 0  # of the next score
         self._skipped = 0  # samples before those that are held
@@ -806,7 +806,7 @@ class OnsetStream:
 
     @property
     def state_bytes(self) -> int:
-        """Memory of what is remembered."""
+        """_Memory of what is remembered."""
         kept = [] if self._memory is None else [8 * x.numel() for x in self._memory]
         engine = 0 if self._engine is None else self._engine.memory.nbytes
         return sum(kept) + engine + (0 if self._held is None else self._held.nbytes)

@@ -190,7 +190,7 @@ def _scored(
     return streams
 
 
-def labelled(streams: Sequence[Stream], timing: Timing) -> tuple[Tensor, Tensor]:
+def _labelled(streams: Sequence[Stream], timing: Timing) -> tuple[Tensor, Tensor]:
     """Scores of valid bins that are wholly slip or non-slip, ``[N]``, and which they are.
 
     A bin is slip if it lies in a slide, and non-slip if it meets none.
@@ -310,7 +310,7 @@ def _reliability(
     by_material: dict[str, Any] = {}
     for name in (None, *dict.fromkeys(stream.recording.material for stream in streams)):
         own = [stream for stream in streams if name in (None, stream.recording.material)]
-        scores, is_slip = labelled(own, timing)
+        scores, is_slip = _labelled(own, timing)
         if bool(is_slip.any()) and not bool(is_slip.all()):
             stated = probability(settings.calibration.llr(scores), settings.slip_share)
             weights = weights_at_share(is_slip, settings.slip_share)
@@ -794,7 +794,7 @@ class CalibratedAlarm:
             ValueError: if our scores cannot be calibrated, or a budget not be shown.
         """
         ours, timing = streams[OURS], timings[OURS]
-        calibration = fit_platt(*labelled(ours, timing))
+        calibration = fit_platt(*_labelled(ours, timing))
         rule = self.made_rule(timing.bin_samples)
         methods = {SLIPPING_NOW: (OURS, self.calibrated(rule, calibration, ours, timing, onset))}
         alone = self.calibrated(rule, calibration, ours, timing)

@@ -266,17 +266,17 @@ def _hops_of(
 ) -> tuple[Array, Array, Array]:
     """Columns, labels and ends of the hops of a recording whose blocks are not lost."""
     samples = source.load(recording).samples
-    columns, is_usable = columns_of(evidence, samples)
+    columns, is_usable = _columns_of(evidence, samples)
     number = np.arange(len(columns)) - len(columns) + samples.shape[-1] // evidence.hop_samples
     time_s = (number + 1) * evidence.hop_samples / evidence.sample_rate_hz
-    label = labels_of(source.timeline(recording), time_s)
+    label = _labels_of(source.timeline(recording), time_s)
     label[~is_usable] = 0
     known = ~np.isnan(columns).any(1)
     narrow = np.clip(columns[known], -6e4, 6e4).astype(np.float16)
     return narrow, label[known], time_s[known]
 
 
-def columns_of(evidence: OnsetEvidence, samples: Tensor) -> tuple[Array, Array]:
+def _columns_of(evidence: OnsetEvidence, samples: Tensor) -> tuple[Array, Array]:
     """Evidence of every block of a recording that has its context, and whether it has a score.
 
     NaN of blocks that are lost, which begin nothing anew.
@@ -304,7 +304,7 @@ def columns_of(evidence: OnsetEvidence, samples: Tensor) -> tuple[Array, Array]:
     return columns, usable
 
 
-def labels_of(times: Timeline, time_s: NDArray[np.float64]) -> NDArray[np.int8]:
+def _labels_of(times: Timeline, time_s: NDArray[np.float64]) -> NDArray[np.int8]:
     """1 where a hand slips, -1 where it does not, 0 where nothing is learned.
 
     Args:
