@@ -11,7 +11,7 @@ import logging
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import lightning as L
 from hydra.utils import instantiate
@@ -23,8 +23,7 @@ from tactslip_torch.data.splits import ROLES
 from tactslip_torch.deploy.check import GraphKind
 from tactslip_torch.deploy.export import export_detector, read_sidecar
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
-from tactslip_torch.onset.decisions import KEY, Scorer
+from tactslip_torch.onset.decisions import KEY
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
@@ -147,7 +146,7 @@ def _experiment(config: DictConfig) -> Experiment:
 def _refuse_simulated_streams(config: DictConfig, source: RecordingSource) -> None:
     """Refuse an alarm that is calibrated on another hand's simulated recordings."""
     streams = config.onset.get("streams") or {}
-    if source.is_simulated or "SimulatedRecordings" not in str(streams.get("_target_")):
+    if source.is_simulated or ".simulation." not in str(streams.get("_target_")):
         return
     raise ValueError(
         "onset=alarms is calibrated on simulated recordings, and these are not; leave onset at "
@@ -178,12 +177,7 @@ def _set_alarm(
 ) -> dict[str, Any]:
     """Set the alarm of a detector; what its calibration measured."""
     if isinstance(alarm, CalibratedAlarm):
-        names = get_args(BaselineName) if detector.pool.hand.fast else ()
-        baselines: dict[str, Scorer] = {
-            name.replace("_", " "): BaselineDetector(name, detector.pool, detector.channel_filter)
-            for name in names
-        }
-        return alarm(detector, baselines, num_workers)
+        return alarm(detector, num_workers=num_workers)
     if detector.calibration is None:
         what = f"{detector.info['split']}: {_NO_ALARM}"
         log.warning("%s, or these do not tell slip from non-slip", what)
