@@ -451,6 +451,30 @@ def test_debounced_settings_are_kept_in_the_file_with_no_rate(tmp_path):
         alarm.DebouncedAlarm()(detector)
 
 
+def test_enough_labelled_slips_of_ones_own_get_a_classifier_and_fewer_keep_the_rule(caplog):
+    source = Worlds()
+    detector = loudness_detector()
+    detector.info["train_recordings"] = {str(recording): "" for recording in source.ids}
+    detector.info["calibration"] = Platt(2.0, -0.5).to_dict()
+    made = alarm.DebouncedAlarm(classifier=LEARNED, fewest_slips=4)
+    made(detector)
+    report = made.fit(detector, source, num_workers=0)
+    settings = AlarmSettings.of(detector)
+    assert (report["slips"], settings.target_per_hour) == (4, None)
+    assert settings.onset.threshold == report["heads"]["quadratic"]["threshold"]
+    again, _, _ = LEARNED(source, source.ids, 0)
+    assert settings.onset.to_dict()["head"] == again.to_dict()["head"]
+    few = loudness_detector()
+    few.info |= {"calibration": detector.info["calibration"]}
+    made(few)
+    assert made.fit(few, source, num_workers=0) == {}  # two of these slips were trained on
+    assert AlarmSettings.of(few).onset is None
+    assert (
+        "2 labelled slips are too few for a classifier of slipping now, which needs 4"
+        in caplog.text
+    )
+
+
 def test_a_debounced_hop_is_half_a_bin_or_so_many_milliseconds():
     assert alarm.DebouncedAlarm().hop_samples(2000.0, 100) == 50
     assert alarm.DebouncedAlarm().hop_samples(2000.0, 1) == 1

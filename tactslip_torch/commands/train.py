@@ -127,7 +127,7 @@ def _experiment(config: DictConfig) -> Experiment:
         maker=maker,
         folds=folds,
         recipe=recipe,
-        alarm=alarm and partial(_set_alarm, alarm, config.num_workers),
+        alarm=alarm and partial(_set_alarm, alarm, source, config.num_workers),
         trainer=partial(make_trainer, config.trainer),
         cache=config.cache,
         metadata={
@@ -173,7 +173,10 @@ def _reading_settings(config: DictConfig) -> dict[str, Any]:
 
 
 def _set_alarm(
-    alarm: CalibratedAlarm | DebouncedAlarm, num_workers: int | None, detector: SlipDetector
+    alarm: CalibratedAlarm | DebouncedAlarm,
+    source: RecordingSource,
+    num_workers: int | None,
+    detector: SlipDetector,
 ) -> dict[str, Any]:
     """Set the alarm of a detector; what its calibration measured."""
     if isinstance(alarm, CalibratedAlarm):
@@ -183,6 +186,8 @@ def _set_alarm(
         log.warning("%s, or these do not tell slip from non-slip", what)
     else:
         alarm(detector)
+        if alarm.classifier is not None:
+            alarm.fit(detector, source, num_workers)
     return {}
 
 

@@ -914,6 +914,9 @@ class CalibratedAlarm:
 class DebouncedAlarm:
     """Sets the alarm of a fitted detector at no given rate: k of the last n decisions say slip.
 
+    With a classifier of slipping now, fitted on the detector's own training recordings, alarms come
+    from that, at a threshold of about ten false alarms an hour of those that were left out.
+
     Args:
         hop_ms: distance of two decisions; ``None`` for half a bin.
         k: so many decisions must say slip,
@@ -922,6 +925,8 @@ class DebouncedAlarm:
         slip_share: how much of a stream is slip, for probabilities.
         rearm_s: how long the statistic must stay low before the next alarm.
         refractory_s: shortest time between two alarms.
+        classifier: how a classifier of slipping now is fitted; ``None``: there is none.
+        fewest_slips: labelled slips that it is fitted on, at least; with fewer the rule stays.
 
     Raises:
         ValueError: for a number that cannot be.
@@ -934,11 +939,13 @@ class DebouncedAlarm:
     slip_share: float = 0.5
     rearm_s: float = 0.1
     refractory_s: float = 0.2
+    classifier: OnsetTraining | None = None
+    fewest_slips: int = 30
 
     def __post_init__(self) -> None:
         if self.hop_ms is not None:
             check_number("onset.hop_ms", self.hop_ms)
-        for name in ("k", "n"):
+        for name in ("k", "n", "fewest_slips"):
             check_number(f"onset.{name}", getattr(self, name), whole=True)
         check_share("onset.probability", self.probability)
         self._settings(Platt(1.0, 0.0), 1)  # refuses bad numbers
@@ -967,6 +974,37 @@ class DebouncedAlarm:
             )
         hop = self.hop_samples(detector.pool.sample_rate_hz, detector.pool.bin_samples)
         detector.info[KEY] = self._settings(known[0], hop).to_dict()
+
+    def fit(
+        self, detector: SlipDetector, source: RecordingSource, num_workers: int | None = None
+    ) -> dict[str, Any]:
+        """Give a detector that has its alarm a classifier of slipping now.
+
+        Args:
+            detector: fitted on recordings of the source.
+            source: whose labelled slips begin at known times.
+            num_workers: processes.
+
+        Returns:
+            JSON-able: what the classifier was fitted on; empty where there are too few slips.
+        """
+        assert self.classifier is not None
+        trained = set(detector.info.get("train_recordings", {}))
+        own = [recording for recording in source.ids if str(recording) in trained]
+        num_slips = sum(len(source.timeline(recording).onsets_s) for recording in own)
+        if num_slips < self.fewest_slips:
+            log.warning(
+                "%d labelled slips are too few for a classifier of slipping now, which needs %d; "
+                "the alarm stays at %d of %d decisions on bins",
+                *(num_slips, self.fewest_slips, self.k, self.n),
+            )
+            return {}
+        onset, _, report = self.classifier(source, own, num_workers)
+        chosen = report["heads"].get(report["head"], {})
+        onset = replace(onset, threshold=chosen.get("threshold", 0.0))
+        settings = replace(AlarmSettings.of(detector), onset=onset)
+        detector.info[KEY] = settings.to_dict()
+        return report
 
     def _settings(self, calibration: Platt, hop_samples: int) -> AlarmSettings:
         settings = AlarmSettings(

@@ -445,7 +445,7 @@ def _train(head: nn.Module, batches: _Batches, epochs: int) -> None:
 
 
 def _found(classifier: OnsetClassifier, hops: _Hops, materials: Sequence[str]) -> dict[str, float]:
-    """Slips of some materials found at ten false alarms an hour of the others' confounders."""
+    """Slips of some materials found at the threshold of ten false alarms an hour beside them."""
     evidence = classifier.evidence
     hop_s = evidence.hop_samples / evidence.sample_rate_hz
     rearm = math.ceil(_REARM_S / hop_s)
@@ -475,4 +475,9 @@ def _found(classifier: OnsetClassifier, hops: _Hops, materials: Sequence[str]) -
         for score, time_s, firsts_s in slips
         for first_s in firsts_s
     ]
-    return {"found": float(np.mean(found)) if found else 0.0, "slips": len(found), "hours": hours}
+    return {
+        "found": float(np.mean(found)) if found else 0.0,
+        "slips": len(found),
+        "hours": hours,
+        "threshold": threshold,
+    }
