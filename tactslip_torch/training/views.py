@@ -171,6 +171,16 @@ class Choice:
     nested: dict[str, Any] | None = None
     calibration: tuple[dict[str, Any] | None, ...] = ()
 
+    @property
+    def shares(self) -> dict[str, float]:
+        """The weight of each view, by its name."""
+        return dict(zip((view.name for view in self.views), self.weights, strict=True))
+
+    @property
+    def penalty(self) -> float:
+        """C of the view that weighs most."""
+        return self.penalties[max(range(len(self.views)), key=self.weights.__getitem__)]
+
 
 @dataclass(frozen=True)
 class ViewSettings:
