@@ -104,8 +104,8 @@ def test_a_file_without_an_array_is_refused(small, tmp_path):
 def test_a_method_never_sees_the_group_that_it_scores(small):
     seen = []
 
-    def fit(train, is_class, seed):
-        seen.append((set(train.group.tolist()), len(is_class), seed))
+    def fit(train, known, seed):
+        seen.append((set(train.group.tolist()), len(known), seed))
         return lambda x: x[:, 0, 0]
 
     scores, cpu_s = left_out_scores(small, fit, 7)
