@@ -35,6 +35,7 @@ from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, 
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.calibration import Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
+from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.training.bins import RecordingBins, join_groups
 from tactslip_torch.training.recipe import POOLING, ClassFit, Fit, General
@@ -210,6 +211,7 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
                 f"hand must be a HandLayout or None, got {type(self.hand).__name__}; make one, such"
                 " as HandLayout.paper24()"
             )
+        check_choice("use", self.use, ("channel", "pooled", "both", None))
         windows = self._read(X, self.hand)
         hand, frames = self.hand, FRAMES if self.frames is None else self.frames
         if hand is None:

@@ -86,7 +86,7 @@ def test_pipelines_grids_and_groups_left_out(data: Any) -> None:
     with sklearn.config_context(enable_metadata_routing=True):
         routed = clone(classifier).set_fit_request(groups=True)
         assert cross_val_score(routed, X, y, params={"groups": groups}, cv=logo).mean() > 0.9
-    quick = classifier.set_params(penalties=0.1, degree=1, num_features=None)
+    quick = classifier.set_params(penalties=0.1)
     choices = {"features__frames": [{}, {"SG": 25}]}
     best = GridSearchCV(quick, choices, cv=logo).fit(X, y, groups=groups).best_estimator_
     assert best.detector_.channel_filter.context in (0, 12)
@@ -204,7 +204,7 @@ def loud_windows(num: int) -> tuple[Array, Array]:
     return X, is_slip
 
 
-QUICK: dict[str, Any] = {"num_features": None, "degree": 1, "penalties": 0.1}
+QUICK: dict[str, Any] = {"penalties": 0.1}
 SAY: list[tuple[Any, Any, int]] = [
     ("Slip", "non-slip", 0),
     ("no slip", "slipping", 1),
@@ -242,9 +242,7 @@ GROUPS = {
 @pytest.mark.parametrize("kind", GROUPS)
 def test_groups_are_put_together_until_both_labels_are_left_out(kind: str) -> None:
     (groups, num), (X, y) = GROUPS[kind], loud_windows(80)
-    model = SlipClassifier(
-        features=TactileFeatures(RATE_HZ, use="pooled"), num_features=None, degree=1
-    )
+    model = SlipClassifier(features=TactileFeatures(RATE_HZ, use="pooled"))
     rows = model.fit(X, y, groups).validation_
     assert len({name for row in rows for name in row["balanced_accuracy"]}) == num
     assert model.score(X, y) > 0.8
