@@ -201,7 +201,7 @@ def _forest(sizes: Real, train: RealSet, known: Array, seed: int) -> Scorer:
     made.set_params(n_estimators=sizes.trees)
     whole.fit(train.X, known)
     if known.max() > 1:
-        return whole.predict_proba
+        return whole.predict_proba  # type: ignore[no-any-return]
     return lambda x: whole.predict_proba(x)[:, 1] - 0.5
 
 
