@@ -186,7 +186,8 @@ def _ours(train: RealSet, known: Array, seed: int) -> Scorer:
 
 
 def _regression(sizes: Real, logs: bool, train: RealSet, known: Array, seed: int) -> Scorer:
-    made = LogisticRegression(class_weight="balanced", solver="newton-cholesky", max_iter=1000)
+    solver = "newton-cholesky" if known.max() == 1 else "lbfgs"  # of more classes the faster one
+    made = LogisticRegression(class_weight="balanced", solver=solver, max_iter=1000)
     whole = make_pipeline(SimpleStatistics(logs), StandardScaler(), made)
     whole.set_params(**_chosen(whole, {"C": sizes.penalties}, train, known, sizes))
     return whole.fit(train.X, known).decision_function  # type: ignore[no-any-return]
