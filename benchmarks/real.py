@@ -46,9 +46,10 @@ FLOOR = 1e-3
 """Added to a statistic before its logarithm is taken, in medians of training windows."""
 
 Scorer = Callable[[Array], Array]
-"""Scores ``[N]`` of windows ``[N, C, T]``, at least 0 for the class."""
+"""Scores of windows ``[N, C, T]``: of two classes ``[N]``, at least 0 for the second; of more
+``[N, K]``, the highest for the class."""
 Fit = Callable[[RealSet, Array, int], Scorer]
-"""To training windows, to which of them are of the class, ``[N]``, bool, and a seed."""
+"""To training windows, the class of each, ``[N]``, from 0, and a seed."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,8 @@ class Real(Benchmark):
 
     title = "Real recordings, objects left out (development data)"
     about = (
-        "slip or not in real windows, each object left out in turn; `biotacsp` and `osu` are "
-        "development data of the default recipe"
+        "slip or not, and directions of slip, in real windows, each object left out in turn; the "
+        "windows of BioTac SP and `osu` are development data of the default recipe"
     )
     page, is_page, is_simulated = "docs/real_data.md", True, False
     libraries = ("aeon", "onnxruntime")
@@ -158,65 +159,74 @@ class SimpleStatistics(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         return np.stack([x.mean(-1), x.std(-1), rms, np.ptp(x, axis=-1), steps], 1)
 
 
-def methods_of(sizes: Real) -> dict[str, Fit]:
-    """All methods by name, ours first."""
+def methods_of(sizes: Real, num_classes: int = 2) -> dict[str, Fit]:
+    """All methods by name, ours first; of more than two classes without MiniRocket."""
+    rocket = {SEEDED[1]: partial(_rocket, sizes)} if num_classes == 2 else {}
     return {
         OURS: _ours,
         "logistic regression": partial(_regression, sizes, False),
         "logistic regression, logs": partial(_regression, sizes, True),
         SEEDED[0]: partial(_forest, sizes),
-        SEEDED[1]: partial(_rocket, sizes),
+        **rocket,
         CONSTANT: _constant,
     }
 
 
-def classifier(train: RealSet, is_class: Array) -> SlipClassifier:
+def classifier(train: RealSet, known: Array) -> SlipClassifier:
     """Ours with its defaults."""
     made = SlipClassifier(sample_rate_hz=float(train.sample_rate_hz), hand=train.layout)
-    return made.fit(train.X, is_class, groups=train.group)
+    return made.fit(train.X, known, groups=train.group)
 
 
-def _ours(train: RealSet, is_class: Array, seed: int) -> Scorer:
-    model = classifier(train, is_class)
+def _ours(train: RealSet, known: Array, seed: int) -> Scorer:
+    model = classifier(train, known)
+    if known.max() > 1:
+        return model.decision_function
     return lambda x: np.where(model.predict_valid(x), model.decision_function(x), -1e-9)
 
 
-def _regression(sizes: Real, logs: bool, train: RealSet, is_class: Array, seed: int) -> Scorer:
-    made = LogisticRegression(class_weight="balanced", solver="newton-cholesky", max_iter=1000)
+def _regression(sizes: Real, logs: bool, train: RealSet, known: Array, seed: int) -> Scorer:
+    solver = "newton-cholesky" if known.max() == 1 else "lbfgs"  # of more classes the faster one
+    made = LogisticRegression(class_weight="balanced", solver=solver, max_iter=1000)
     whole = make_pipeline(SimpleStatistics(logs), StandardScaler(), made)
-    whole.set_params(**_chosen(whole, {"C": sizes.penalties}, train, is_class, sizes))
-    return whole.fit(train.X, is_class).decision_function  # type: ignore[no-any-return]
+    whole.set_params(**_chosen(whole, {"C": sizes.penalties}, train, known, sizes))
+    return whole.fit(train.X, known).decision_function  # type: ignore[no-any-return]
 
 
-def _forest(sizes: Real, train: RealSet, is_class: Array, seed: int) -> Scorer:
+def _forest(sizes: Real, train: RealSet, known: Array, seed: int) -> Scorer:
     few = max(1, sizes.trees // 10)
     made = RandomForestClassifier(few, class_weight="balanced", random_state=seed)
     whole = make_pipeline(SimpleStatistics(), made)
     grid = {"min_samples_leaf": sizes.leaves}
-    whole.set_params(**_chosen(whole, grid, train, is_class, sizes))
+    whole.set_params(**_chosen(whole, grid, train, known, sizes))
     made.set_params(n_estimators=sizes.trees)
-    whole.fit(train.X, is_class)
+    whole.fit(train.X, known)
+    if known.max() > 1:
+        return whole.predict_proba  # type: ignore[no-any-return]
     return lambda x: whole.predict_proba(x)[:, 1] - 0.5
 
 
 def _chosen(
-    whole: Pipeline, grid: Mapping[str, Any], train: RealSet, is_class: Array, sizes: Real
+    whole: Pipeline, grid: Mapping[str, Any], train: RealSet, known: Array, sizes: Real
 ) -> dict[str, Any]:
     """Of values of its last step those that are best on training groups left out."""
     last = {f"{whole.steps[-1][0]}__{name}": values for name, values in grid.items()}
     folds = GroupKFold(min(sizes.inner, len(np.unique(train.group))))
     search = GridSearchCV(whole, last, scoring="balanced_accuracy", cv=folds, refit=False)
-    found: dict[str, Any] = search.fit(train.X, is_class, groups=train.group).best_params_
+    found: dict[str, Any] = search.fit(train.X, known, groups=train.group).best_params_
     return found
 
 
-def _rocket(sizes: Real, train: RealSet, is_class: Array, seed: int) -> Scorer:
+def _rocket(sizes: Real, train: RealSet, known: Array, seed: int) -> Scorer:
     options = {"seed": seed, "num_kernels": sizes.kernels}
-    return others.fit(train.X, is_class, train.group, **options)
+    return others.fit(train.X, known == 1, train.group, **options)
 
 
-def _constant(train: RealSet, is_class: Array, seed: int) -> Scorer:
-    return lambda x: np.full(len(x), 1.0 if is_class.mean() >= 0.5 else -1.0)
+def _constant(train: RealSet, known: Array, seed: int) -> Scorer:
+    counts = np.bincount(known)
+    if len(counts) > 2:
+        return lambda x: np.tile(counts == counts.max(), (len(x), 1)).astype(float)
+    return lambda x: np.full(len(x), 1.0 if counts[1] >= counts[0] else -1.0)
 
 
 # ------------------------------------------------------------------------------------- a set
@@ -224,29 +234,51 @@ def left_out_scores(of: RealSet, fit: Fit, seed: int) -> tuple[Array, list[float
     """Scores of all windows by the fits that left their group out, and CPU seconds of each fold.
 
     Shape:
-        - scores: ``[N, M]``; of two classes the second alone, else one against the others each
+        - scores: ``[N, M]``, M the number of classes, or 1 of two
     """
     names, index = of.classes()
-    columns = range(1, 2) if len(names) == 2 else range(len(names))
-    scores, cpu_s = np.full((len(index), len(columns)), np.nan), []
+    num_columns = 1 if len(names) == 2 else len(names)
+    scores, cpu_s = np.full((len(index), num_columns), np.nan), []
     for group in np.unique(of.group):
         held = of.group == group
-        train, known = of.part(~held), index[~held]
         started = process_time()
-        fitted = [fit(train, known == column, seed) for column in columns]
+        score = fit(of.part(~held), index[~held], seed)
         cpu_s.append(process_time() - started)
-        scores[held] = np.stack([score(of.X[held]) for score in fitted], 1)
+        scores[held] = score(of.X[held]).reshape(-1, num_columns)
     return scores, cpu_s
 
 
 def confusions(of: RealSet, scores: Array) -> Tensor:
     """Windows by recording, true and decided class, ``[N, M] -> [R, K, K]``."""
     names, index = of.classes()
-    decided = scores[:, 0] >= 0 if scores.shape[1] == 1 else scores.argmax(1)
     trial, group = of.trials()
     counts = np.zeros((len(group), len(names), len(names)))
-    np.add.at(counts, (trial, index, decided.astype(int)), 1)
+    np.add.at(counts, (trial, index, _decided(scores)), 1)
     return torch.from_numpy(counts)
+
+
+def recording_confusions(of: RealSet, scores: Array) -> Tensor | None:
+    """The same of whole recordings, decided by the mean of their windows' scores.
+
+    ``None`` where a recording has windows of several classes.
+    """
+    names, index = of.classes()
+    trial, group = of.trials()
+    truth = np.zeros(len(group), dtype=int)
+    truth[trial] = index
+    if (truth[trial] != index).any():
+        return None
+    sums = np.zeros((len(group), scores.shape[1]))
+    np.add.at(sums, trial, scores)
+    counts = np.zeros((len(group), len(names), len(names)))
+    counts[np.arange(len(group)), truth, _decided(sums)] = 1
+    return torch.from_numpy(counts)
+
+
+def _decided(scores: Array) -> Array:
+    """The class of scores ``[N, M]``, ``[N]``."""
+    found: Array = scores[:, 0] >= 0 if scores.shape[1] == 1 else scores.argmax(1)
+    return found.astype(int)
 
 
 def balanced_accuracy(counts: Tensor) -> Tensor:
@@ -259,9 +291,10 @@ def _measured(of: RealSet, name: str, sizes: Real) -> dict[str, Any]:
     chosen = np.flatnonzero(np.isin(of.group, np.unique(of.group)[: sizes.groups]))
     of = of.part(np.sort(np.random.default_rng(0).permutation(chosen)[:: sizes.every]))
     of.check()
-    truth, counts = of.classes()[1], dict[str, Tensor]()
+    truth, counts, whole_recordings = of.classes()[1], dict[str, Tensor](), dict[str, Tensor]()
     rows: dict[str, dict[str, Any]] = {}
-    for method, fit in methods_of(sizes).items():
+    num_classes = len(of.classes()[0])
+    for method, fit in methods_of(sizes, num_classes).items():
         seeds = sizes.seeds if method in SEEDED else sizes.seeds[:1]
         runs = [left_out_scores(of, fit, seed) for seed in seeds]
         counts[method] = torch.stack([confusions(of, scores) for scores, _ in runs], 1)
@@ -275,12 +308,18 @@ def _measured(of: RealSet, name: str, sizes: Real) -> dict[str, Any]:
                 if scores.shape[1] == 1
             ],
             "cpu_s": [seconds for _, folds in runs for seconds in folds],
+            "recordings": None,
         }
+        wholes = [recording_confusions(of, scores) for scores, _ in runs]
+        if known := [whole for whole in wholes if whole is not None]:
+            whole_recordings[method] = torch.stack(known, 1)
     groups = torch.from_numpy(of.trials()[1])
     draws = {
         "recordings": Bootstrap(len(groups), num=sizes.draws),
         "within": Bootstrap(len(groups), num=sizes.draws, groups=groups),
     }
+    for method, found in whole_recordings.items():
+        rows[method]["recordings"] = draws["recordings"].statistic(balanced_accuracy, found)
     ours = counts[OURS]
 
     def lead(both: Tensor) -> Tensor:
@@ -291,7 +330,8 @@ def _measured(of: RealSet, name: str, sizes: Real) -> dict[str, Any]:
         rows[method]["interval"] = draws["recordings"].statistic(balanced_accuracy, found)
         both = torch.cat([ours, found], 1)
         rows[method]["lead"] = {n: drawn.statistic(lead, both) for n, drawn in draws.items()}
-    return {"about": _about(of), "methods": rows, "cost": cost(of, sizes.rounds)}
+    measured = cost(of, sizes.rounds) if num_classes == 2 else None
+    return {"about": _about(of), "methods": rows, "cost": measured}
 
 
 def _about(of: RealSet) -> dict[str, object]:
@@ -316,7 +356,7 @@ def cost(of: RealSet, rounds: int) -> dict[str, Any]:
     """Times of one raw window to its score, and sizes of files, of a fit without the last group."""
     index = of.classes()[1]
     train = of.group != of.group[-1]
-    model = classifier(of.part(train), index[train] == 1)
+    model = classifier(of.part(train), index[train])
     window = of.X[~train][:1]
     with TemporaryDirectory(prefix="tactslip-bench-") as folder, torch.inference_mode():
         model.save(Path(folder) / "detector.pt")
@@ -343,6 +383,10 @@ def _scores(sets: Mapping[str, Any]) -> Table:
         row = {"set": name, "method": method}
         row["balanced accuracy %"] = mean_sd(times(found["balanced_accuracy"], 100))
         row["AUC %"] = mean_sd(times(found["auc"], 100))
+        whole = found["recordings"]
+        row["of recordings, balanced accuracy %"] = (
+            "-" if whole is None else style.interval(whole, 2, scale=100)
+        )
         leads = found["lead"]
         for drawn, words in DRAWN.items():
             row[f"ours ahead by, points; 95 % over {words}"] = (
@@ -351,7 +395,9 @@ def _scores(sets: Mapping[str, Any]) -> Table:
         row["ours is"] = "-" if method == OURS else word(leads)
         rows.append(row)
     note = (
-        "Mean and standard deviation over seeds where a method draws at random. Intervals are by "
+        "Mean and standard deviation over seeds where a method draws at random. A recording is "
+        "decided by the mean of its windows' scores; - where it has windows of several classes. "
+        "Intervals are by "
         "a paired bootstrap: recordings are drawn with all their windows, the same for both "
         "methods, once from all and once within each left-out group. *ahead* or *behind* stands "
         "where neither interval includes 0. Scores are held: other training recordings and other "
@@ -376,15 +422,18 @@ def _costs(sets: Mapping[str, Any]) -> Table:
         found = of["cost"]
         row: dict[str, object] = {"set": name}
         for method in (OURS, SEEDED[1]):
-            row[f"{method}: fit of a fold, CPU s"] = mean(of["methods"][method]["cpu_s"])
-        for way, seconds in found["window_s"].items():
-            row[f"one raw window, {way}, us"] = times(seconds, 1e6)
-        row["detector.pt, MB"] = found["detector_bytes"] / 1e6
-        row["model.onnx, MB"] = found["onnx_bytes"] / 1e6
+            timed = of["methods"].get(method)
+            row[f"{method}: fit of a fold, CPU s"] = None if timed is None else mean(timed["cpu_s"])
+        for way in ("native", "onnxruntime"):
+            seconds = None if found is None else times(found["window_s"][way], 1e6)
+            row[f"one raw window, {way}, us"] = seconds
+        row["detector.pt, MB"] = None if found is None else found["detector_bytes"] / 1e6
+        row["model.onnx, MB"] = None if found is None else found["onnx_bytes"] / 1e6
         rows.append(row)
     note = (
         "On one thread; fits with all that is chosen inside. Limits on `biotacsp`: a fold 15 CPU "
-        "s, a window 300 us and 1,200 us in onnxruntime, files 8 MB."
+        "s, a window 300 us and 1,200 us in onnxruntime, files 8 MB. More than two classes make no "
+        "detector."
     )
     return Table(rows, note)
 

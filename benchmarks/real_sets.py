@@ -1,7 +1,8 @@
-"""Sets of real windows, one ``.npz`` each: ``python -m benchmarks.real_sets DATA OUT`` makes two.
+"""Sets of real windows, one ``.npz`` each: ``python -m benchmarks.real_sets DATA OUT`` makes three.
 
 It reads the folders ``biotacsp-dos`` and ``osu-imu`` of DATA, whichever are there, and writes
-``biotacsp.npz`` and ``osu.npz`` to OUT, which ``python -m benchmarks.real OUT`` takes.
+``biotacsp.npz``, ``biotacsp_direction.npz`` and ``osu.npz`` to OUT, which ``python -m
+benchmarks.real OUT`` takes.
 """
 
 from __future__ import annotations
@@ -126,7 +127,7 @@ def read_set(path: Path) -> RealSet:
 
 
 def made(
-    windows: Iterable[tuple[Array, bool, str, str]],
+    windows: Iterable[tuple[Array, bool | str, str, str]],
     rate_hz: float,
     hand: Iterable[tuple[str, ...]],
     source: str,
@@ -165,6 +166,15 @@ def biotacsp(root: Path) -> RealSet:
     return made(windows, 100.0, hand, source)
 
 
+def biotacsp_direction(root: Path) -> RealSet:
+    """The same windows with the direction of the slip: the folder that its recording lies in.
+
+    ``n``, ``s``, ``e`` and ``w`` are translations, ``cw`` and ``aw`` rotations, ``t`` is a touch.
+    """
+    found = biotacsp(root)
+    return found._replace(y=np.array([name.split("/")[0] for name in found.recording]))
+
+
 def osu(root: Path) -> RealSet:
     """Acceleration and angular rate of two fingertips at about 25 Hz, slip over 1 cm/s."""
     windows = []
@@ -193,11 +203,11 @@ def main(arguments: list[str]) -> int:
             raise ValueError("usage: python -m benchmarks.real_sets DATA OUT")
         data, out = map(Path, arguments)
         out.mkdir(parents=True, exist_ok=True)
-        found = {"biotacsp-dos": biotacsp, "osu-imu": osu}
+        found = {"biotacsp-dos": (biotacsp, biotacsp_direction), "osu-imu": (osu,)}
         if not any((data / name).is_dir() for name in found):
             raise ValueError(f"{data} has no folder {' or '.join(found)}")
-        for name, make in found.items():
-            if (data / name).is_dir():
+        for name, makers in found.items():
+            for make in makers if (data / name).is_dir() else ():
                 path = out / f"{make.__name__}.npz"
                 np.savez_compressed(path, **make(data / name)._asdict())
                 read = read_set(path)

@@ -6,10 +6,12 @@ Both take windows ``[N, C, T]`` as NumPy arrays or torch tensors and work in ``P
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from statistics import mean
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from sklearn.utils.validation import (
     column_or_1d,
 )
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
 from tactslip_torch.deploy.export import export_detector, wanted_graphs
 from tactslip_torch.features.pool import MOST_BIN_SAMPLES, FeaturePool
@@ -32,13 +35,16 @@ from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, 
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.calibration import Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
+from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import Align, ChannelFilter
-from tactslip_torch.training.bins import RecordingBins
-from tactslip_torch.training.recipe import POOLING, Fit, General
+from tactslip_torch.training.bins import RecordingBins, join_groups
+from tactslip_torch.training.recipe import POOLING, ClassFit, Fit, General
+from tactslip_torch.training.views import ViewBins
 
 FRAMES: Mapping[str, int] = {"SG": 51, "PVDF": 11}
 """Savitzky-Golay frames of the paper's kinds of channels, samples at 2 kHz; others are as given."""
 _FOLDS = 5  # of validation without groups
+_PART = 1024  # windows whose columns are in memory at once
 _BLOCK = 50  # windows that lose the same channels in a second copy (``drop_channels``)
 _UNCALIBRATED = Platt(2.0, 0.0)  # (1 + score) / 2 in the middle, for targets of -1 and 1
 
@@ -205,6 +211,7 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
                 f"hand must be a HandLayout or None, got {type(self.hand).__name__}; make one, such"
                 " as HandLayout.paper24()"
             )
+        check_choice("use", self.use, ("channel", "pooled", "both", None))
         windows = self._read(X, self.hand)
         hand, frames = self.hand, FRAMES if self.frames is None else self.frames
         if hand is None:
@@ -267,13 +274,18 @@ class TactileFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
 
 class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
-    """Slip or not, of windows ``[N, C, T]``.
+    """Slip or not, or several kinds of slip, of windows ``[N, C, T]``.
 
     The mean of the scores of up to three kernel ridge machines, each on a view of the windows
-    (``recipe.General``). Both classes weigh the same, however many windows they have. Penalties,
+    (``recipe.General``). All classes weigh the same, however many windows they have. Penalties,
     the weights of the views and the threshold are chosen by leaving out groups. Without ``groups``
     five blocks of consecutive rows of each class are left out in turn; with fewer than two rows of
     a class nothing is, and views weigh alike, with the middle C.
+
+    Of more than two labels, such as directions, each has machines of its own against all others, on
+    the same features and with the same views and penalties; the highest score decides. Such a
+    classifier has no ``detector_``, so no file, stream or ONNX graph: pickle it, or fit one label
+    against the others, ``y == label``.
 
     Args:
         sample_rate_hz: of the windows.
@@ -284,20 +296,19 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         num_features: columns of each view, the best together; ``None``: all.
         penalties: values of C to choose from; small ones are the strong penalties.
         threshold: part of the validated shift of the threshold that is applied: ``zero``, ``half``
-            or ``full``.
+            or ``full``; of two labels only.
         drop_channels: of every window the view ``pooled`` is trained on a second copy, without up
             to this part of its channels, so that a broken one does little harm.
         slip_label: the label of ``y`` that is slip. ``None``: ``True``, 1 of 0 and 1 or of -1 and
             1, or the one whose name says slip (``"Slip"``, of ``"slip"`` and ``"non-slip"`` the
-            first); of other labels it must be given.
+            first); of two other labels it must be given, of more than two it may not.
 
     Attributes:
-        classes_: the two labels, ascending.
-        slip_label_: the one that is slip.
+        classes_: the labels, ascending.
+        slip_label_: the one that is slip; ``None`` of more than two.
         views_: the weight of each view, 0 of one that is dropped.
         penalty_: C of the view that weighs most.
         validation_: one row for each view and penalty: its balanced accuracy by group.
-        detector_: the ``SlipDetector``, for streams, ONNX and the commands.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -336,10 +347,10 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
         Args:
             X: windows.
-            y: any two labels.
+            y: two labels or more.
             groups: of each row, such as its material, recording or day: a choice is evaluated on
                 groups that it was not fitted to. ``None`` and NaN are a group too. More than ten
-                are put together, and so are groups of one label where no two have both. In
+                are put together, and so are groups where no two have all labels. In
                 ``cross_val_score`` they come by ``params={"groups": groups}``; with metadata
                 routing after ``set_fit_request(groups=True)``.
 
@@ -348,9 +359,9 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
         Raises:
             TypeError: if ``features`` are no ``TactileFeatures``.
-            ValueError: if there is no rate, or one beside ``features``; for other shapes, NaN,
-                another number of classes than two, labels that do not say which is slip, or groups
-                of which no two parts with both labels can be made.
+            ValueError: if there is no rate, or one beside ``features``; for other shapes, NaN, a
+                single class, labels that do not say which is slip, or groups of which no two parts
+                with all labels can be made.
         """
         features = self._described_by()
         windows = features._lay_out(X)
@@ -358,12 +369,17 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         check_consistent_length(windows, y)
         check_classification_targets(y)
         self.classes_ = np.unique(y)
-        if len(self.classes_) != 2:
+        if len(self.classes_) < 2:
+            raise ValueError("y must have two classes or more, got 1 class; give rows of others")
+        is_binary = len(self.classes_) == 2
+        if is_binary:
+            place = _place_of_slip(self.classes_.tolist(), self.slip_label)
+        elif self.slip_label is not None:
             raise ValueError(
-                f"Only binary classification is supported: y must have two classes, got "
-                f"{len(self.classes_)} class{'es' * (len(self.classes_) != 1)}; relabel it"
+                f"slip_label is for two labels, and y has {len(self.classes_)}; leave it out, or "
+                "fit y == slip_label"
             )
-        self.slip_label_ = self.classes_[_place_of_slip(self.classes_.tolist(), self.slip_label)]
+        self.slip_label_: Any = self.classes_[place] if is_binary else None
         recipe = features._recipe(
             views=features._views(self.views),
             num_features=self.num_features,
@@ -372,23 +388,49 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             drop_channels=self.drop_channels,
             sample_bins=max(len(windows), 2),
         )
-        pool, is_slip = features._pool, torch.from_numpy(np.asarray(y == self.slip_label_))
+        pool, (group, names) = features._pool, _groups(y, groups)
         with torch.no_grad():
             x = pool(features._bins(windows), torch.float64)
-            fit = _fitted(recipe, pool, x, is_slip, *_groups(y, groups))
-        self._slope: Platt = _UNCALIBRATED
-        if fit.calibration is not None:
-            self._slope = Platt(fit.calibration["slope"], 0.0)  # a score of 0 says nothing
-        info = fit.metadata | {
-            "recipe": recipe.name,
-            "calibration": self._slope.to_dict(),
-            "classes": self._ordered(self.classes_.tolist()),
-        }
-        detector = fit.detector(pool, features._filter, info)
+            if is_binary:
+                is_slip = torch.from_numpy(np.asarray(y == self.slip_label_))
+                fit = _fitted(recipe, pool, x, is_slip, group, names)
+                detector = fit.detector(pool, features._filter, self._calibrated(fit, recipe))
+            else:
+                labels = torch.from_numpy(np.searchsorted(self.classes_, y))
+                fits = _fitted_to_classes(recipe, pool, x, labels, group, names)
+                detector = fits.detector(pool, features._filter, self._calibrated_heads(fits))
         stuck = _stuck_samples(pool, windows)
         detector.sensing = replace(detector.sensing, stuck_samples=stuck)
         self._set(detector, features)
         return self
+
+    def _calibrated(self, fit: Fit, recipe: General) -> dict[str, Any]:
+        """Take the calibration of a fit of two labels; metadata of its detector."""
+        self._slope: Platt = _UNCALIBRATED
+        if fit.calibration is not None:
+            self._slope = Platt(fit.calibration["slope"], 0.0)  # a score of 0 says nothing
+        return fit.metadata | {
+            "recipe": recipe.name,
+            "calibration": self._slope.to_dict(),
+            "classes": self._ordered(self.classes_.tolist()),
+        }
+
+    def _calibrated_heads(self, fits: ClassFit) -> dict[str, Any]:
+        """Take the heads of more than two labels and one calibration of all; metadata.
+
+        Of one calibration the most probable label is that of the highest score.
+        """
+        self._heads, choice = fits.heads, fits.choice
+        known = [each for each in choice.calibration if each is not None]
+        self._slope = _UNCALIBRATED
+        if known:
+            slope, offset = (mean(each[name] for each in known) for name in ("slope", "offset"))
+            self._slope = Platt(slope, offset)
+        return {
+            "views": choice.shares,
+            "penalty": choice.penalty,
+            "validation": list(choice.rows),
+        }
 
     def _described_by(self) -> TactileFeatures:
         """How windows are described, not fitted."""
@@ -407,25 +449,40 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return described
 
     def decision_function(self, X: ArrayLike | Tensor) -> Array:
-        """Scores ``[N]``; above 0 means ``classes_[1]``, 0 where the decision is not valid."""
+        """Scores, of two labels ``[N]``; above 0 means ``classes_[1]``, 0: not valid.
+
+        Of more labels ``[N, L]``: the highest decides, and all are 0 where it is not valid.
+        """
         score = self._score(X)[0]
-        return score if self.slip_label_ == self.classes_[1] else -score
+        is_first = self._is_binary and self.slip_label_ == self.classes_[0]
+        return -score if is_first else score
 
     def predict(self, X: ArrayLike | Tensor) -> Array:
-        """Labels ``[N]``: slip where the score is at least 0, and the decision is valid."""
+        """Labels ``[N]``: slip where the score is at least 0, and the decision is valid.
+
+        Of more than two labels that of the highest score, the first where it is not valid.
+        """
         score, is_valid = self._score(X)
+        if not self._is_binary:
+            best: Array = self.classes_[score.argmax(1)]
+            return best
         is_slip = (score >= 0) & is_valid
         other = self.classes_[self.classes_ != self.slip_label_][0]
         found: Array = np.where(is_slip, self.slip_label_, other).astype(self.classes_.dtype)
         return found
 
     def predict_proba(self, X: ArrayLike | Tensor) -> Array:
-        """Probabilities of ``classes_``, ``[N, 2]``.
+        """Probabilities of ``classes_``, ``[N, L]``, for classes that are equally frequent.
 
-        Calibrated on the scores of groups that were left out (Platt's slope); one half is where the
-        decision changes, and where it is not valid.
+        Calibrated on the scores of groups that were left out (Platt's slope); of two labels one
+        half is where the decision changes. Equal where the decision is not valid. Of more than two
+        labels the probability of each against the others, divided by their sum.
         """
         score = torch.from_numpy(self._score(X)[0])
+        if not self._is_binary:
+            log_odds = self._slope.llr(score) - math.log(len(self.classes_) - 1)
+            each: Array = logsigmoid(log_odds).softmax(1).numpy()
+            return each
         slip = probability(self._slope.llr(score), 0.5).numpy()
         return np.stack(self._ordered([1 - slip, slip]), axis=1)
 
@@ -463,7 +520,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``detector_``, which every command takes; what only another fit needs is lost."""
         check_is_fitted(self)
-        self.detector_.save(path)
+        self._whole().save(path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SlipClassifier:
@@ -482,21 +539,53 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             The paths; each has its metadata beside it, ``<file>.json``.
         """
         check_is_fitted(self)
-        return export_detector(self.detector_, folder, wanted_graphs(None, self.detector_))
+        detector = self._whole()
+        return export_detector(detector, folder, wanted_graphs(None, detector))
+
+    @property
+    def detector_(self) -> SlipDetector:
+        """The ``SlipDetector``, for streams, ONNX and the commands; of two labels only."""
+        return self._whole()
+
+    def _whole(self) -> SlipDetector:
+        """The detector, which scores as the classifier does.
+
+        Raises:
+            AttributeError: if it is not fitted, or to more than two labels.
+        """
+        if not hasattr(self, "_detector"):
+            raise AttributeError("not fitted yet; call fit")
+        if not self._is_binary:
+            raise AttributeError(
+                f"a classifier of {len(self.classes_)} labels is no detector: files, streams and "
+                "ONNX are of two; pickle it, or fit one label against the others, y == label"
+            )
+        return self._detector
+
+    @property
+    def _is_binary(self) -> bool:
+        return len(self.classes_) == 2
 
     def _set(self, detector: SlipDetector, features: TactileFeatures) -> None:
-        self.detector_, self._features = detector, features
+        self._detector, self._features = detector, features
         self.views_: dict[str, float] = detector.info.get("views", {})
         self.penalty_: Any = detector.info.get("penalty")
         self.validation_: list[dict[str, Any]] = detector.info.get("validation", [])
 
     def _score(self, X: Any) -> tuple[Array, Array]:
-        """Scores, positive for slip, in float64, 0 where not valid; and which are."""
+        """Scores, positive for slip or for each label, float64, 0 where not valid; which are."""
         check_is_fitted(self)
         windows = self._features._read(X, self._features.hand_, may_miss=True)
         with torch.no_grad():
-            found = self.detector_.predict(self._features._bins(windows))
-        score = torch.where(found.is_valid, found.score.double(), 0.0)
+            bins = self._features._bins(windows)
+            found = self._detector.predict(bins)
+            if self._is_binary:
+                score = torch.where(found.is_valid, found.score.double(), 0.0)
+            else:
+                parts = zip(bins.split(_PART), found.channels_lost.split(_PART), strict=True)
+                columns = (self._detector.scaled_bins(*part) for part in parts)
+                score = torch.cat([torch.stack([h(u) for h in self._heads], -1) for u in columns])
+                score = torch.where(found.is_valid[:, None], score, 0.0)
         return score.numpy(), found.is_valid.numpy()
 
     def _ordered(self, pair: list[Any]) -> list[Any]:
@@ -504,12 +593,10 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return pair if self.slip_label_ == self.classes_[1] else pair[::-1]
 
     def __sklearn_is_fitted__(self) -> bool:
-        return hasattr(self, "detector_")
+        return hasattr(self, "_detector")
 
     def __sklearn_tags__(self) -> Any:
-        tags = _of_windows(super().__sklearn_tags__())
-        tags.classifier_tags.multi_class = False
-        return tags
+        return _of_windows(super().__sklearn_tags__())
 
 
 def _of_windows(tags: Any) -> Any:
@@ -560,7 +647,7 @@ def _groups(y: Array, groups: Any) -> tuple[Tensor, tuple[str, ...]]:
     """Which validation group each row is of, ``[N]``, from 0, and names of the groups.
 
     Raises:
-        ValueError: if there are other numbers of rows, or no two groups with both labels.
+        ValueError: if there are other numbers of rows, or a label is in one group alone.
     """
     of_class = np.unique(y, return_inverse=True)[1]
     if groups is None:
@@ -577,13 +664,15 @@ def _groups(y: Array, groups: Any) -> tuple[Tensor, tuple[str, ...]]:
     if groups.dtype == object:  # None, NaN and words have no order
         groups = np.array(["none" if str(each) in _MISSING else str(each) for each in groups])
     values, index = np.unique(groups, return_inverse=True)
-    has = np.zeros((len(values), 2), bool)
+    has = np.zeros((len(values), of_class.max() + 1), bool)
     has[index, of_class] = True
-    if len(values) > 1 and has.sum(0).min() < 2:
+    rarest = int(has.sum(0).argmin())
+    if len(values) > 1 and (num := has[:, rarest].sum()) < 2:
+        label = np.unique(y)[rarest].item()
         raise ValueError(
-            "validation leaves out groups and needs two parts that have both labels; of the "
-            f"{len(values)} groups {has[:, 0].sum()} have the smaller label, {has[:, 1].sum()} the "
-            "larger; give groups that have both, or groups=None for blocks of rows"
+            "validation leaves out groups and needs two parts that have all labels; of the "
+            f"{len(values)} groups {num} has the label {label!r}; give groups of which two have "
+            "it, or groups=None for blocks of rows"
         )
     return torch.from_numpy(index), tuple(str(value).replace("|", "/") for value in values)
 
@@ -603,3 +692,20 @@ def _fitted(
         for part, some in enumerate((group == index).nonzero()[:, 0].split(_BLOCK))
     ]
     return recipe.fit(bins, pool)
+
+
+def _fitted_to_classes(
+    recipe: General,
+    pool: FeaturePool,
+    features: Tensor,
+    labels: Tensor,
+    group: Tensor,
+    names: tuple[str, ...],
+) -> ClassFit:
+    """The fit to features ``[N, F]`` of any number of labels, whole numbers ``[N]``."""
+    weights = torch.ones(len(labels), dtype=torch.float64)
+    group, names = join_groups(group, labels, weights, names)
+    stratum = group * (int(labels.max()) + 1) + labels
+    copies = recipe.second_copies("sample", len(labels), pool)
+    bins = ViewBins(features, labels, group, names, weights, stratum, copies)
+    return recipe.fit_classes(bins, pool)

@@ -132,6 +132,17 @@ def test_groups_of_one_class_are_joined_to_groups_of_both():
         assert len(joined.is_slip[joined.group == place].unique()) == 2
 
 
+def test_groups_are_not_joined_where_a_class_would_be_left_out_with_all_its_groups():
+    """Slip is in two groups alone, which quiet bins would deal to the same place."""
+    sizes = [(40 - number, 0) for number in range(MOST_GROUPS)]
+    sizes += [(20, 0)] * 10
+    sizes[0], sizes[19] = (40, 2), (18, 1)
+    bins = sample_of(sizes)
+    joined = bins.joined()
+    of_slip = joined.group[joined.is_slip].unique()
+    assert len(of_slip) == 2
+
+
 def test_ten_groups_stay_as_they_are():
     bins = sample_of([(4, 3)] * MOST_GROUPS)
     assert bins.joined() is bins

@@ -11,14 +11,21 @@ import pytest
 import sklearn
 import torch
 from numpy.typing import NDArray
+from scipy.signal import butter, sosfilt
 from sklearn.base import clone
 from sklearn.linear_model import LogisticRegression
-from sklearn.model_selection import GridSearchCV, LeaveOneGroupOut, cross_val_score
+from sklearn.model_selection import (
+    GridSearchCV,
+    LeaveOneGroupOut,
+    cross_val_predict,
+    cross_val_score,
+)
 from sklearn.pipeline import make_pipeline
-from sklearn.utils import estimator_checks
+from sklearn.utils import estimator_checks, get_tags
 from small_set import SMALL_HAND
 
 from tactslip_torch import SlipClassifier, SlipDetector, TactileFeatures
+from tactslip_torch.estimators import _fitted_to_classes
 
 RATE_HZ = 2000.0
 Array = NDArray[Any]
@@ -176,7 +183,7 @@ def test_what_the_fit_is_given_is_checked(data: Any) -> None:
     model = SlipClassifier(features=features_of())
     with pytest.raises(ValueError, match="one for each of the 72 rows"):
         model.fit(X, y, groups[:2])
-    with pytest.raises(ValueError, match="must have two classes, got 1 class;"):
+    with pytest.raises(ValueError, match="must have two classes or more, got 1 class;"):
         model.fit(X[::2], y[::2])
     with pytest.raises(ValueError, match="slip_label='slide' is none of the labels"):
         clone(model).set_params(slip_label="slide").fit(X, y)
@@ -245,6 +252,128 @@ def test_groups_are_put_together_until_both_labels_are_left_out(kind: str) -> No
 def test_groups_that_cannot_be_put_together_are_refused(kind: str) -> None:
     X, y = loud_windows(80)
     groups = y if kind == "a group a label" else np.where(y, 1000, np.arange(80))
-    with pytest.raises(ValueError, match="two parts that have both labels") as caught:
+    with pytest.raises(ValueError, match="two parts that have all labels") as caught:
         SlipClassifier(RATE_HZ).fit(X, y, groups)
     assert "recipe" not in str(caught.value)
+
+
+BANDS = {"rolls": (0.02, 0.08), "slides": (0.15, 0.4), "touch": (0.6, 0.9)}
+"""Of three kinds of contact, as parts of half the rate; each is as loud as the others."""
+
+
+@pytest.fixture(scope="module")
+def kinds() -> tuple[Array, Array, Array]:
+    """Windows of three kinds on four objects, of which each has loudnesses of its own."""
+    rng = np.random.default_rng(1)
+    y, groups = np.tile(list(BANDS), 40), np.repeat(["can", "cup", "pen", "tin"], 30)
+    X = rng.standard_normal((120, 2, 200))
+    for kind, band in BANDS.items():
+        X[y == kind] = sosfilt(butter(2, band, "band", output="sos"), X[y == kind])
+    X /= X.std(-1, keepdims=True)
+    gain = {"can": 1.0, "cup": 3.0, "pen": 0.4, "tin": 1.5}
+    X *= np.array([gain[group] for group in groups])[:, None, None]
+    return X + 0.2 * rng.standard_normal(X.shape), y, groups
+
+
+@pytest.fixture(scope="module")
+def of_kinds(kinds: Any) -> tuple[SlipClassifier, Array]:
+    """A classifier that was not fitted to the last object, and which rows are of it."""
+    X, y, groups = kinds
+    held = groups == "tin"
+    return SlipClassifier(RATE_HZ).fit(X[~held], y[~held], groups[~held]), held
+
+
+def test_kinds_of_slip_are_told_on_an_object_that_was_left_out(kinds: Any, of_kinds: Any) -> None:
+    (X, y, _), (model, held) = kinds, of_kinds
+    assert model.score(X[held], y[held]) > 0.9
+    assert list(model.classes_) == sorted(BANDS)
+    assert get_tags(model).classifier_tags.multi_class
+
+
+def test_probabilities_of_kinds_add_up_and_agree_with_the_decision(
+    kinds: Any, of_kinds: Any
+) -> None:
+    X, (model, _) = kinds[0], of_kinds
+    found, scores = model.predict_proba(X), model.decision_function(X)
+    assert scores.shape == found.shape == (len(X), 3)
+    np.testing.assert_allclose(found.sum(1), 1)
+    assert (found > 0).all()
+    for values in (found, scores):
+        np.testing.assert_array_equal(model.classes_[values.argmax(1)], model.predict(X))
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(model)).predict_proba(X), found)
+
+
+def test_probabilities_of_kinds_are_about_what_happens_on_an_object_left_out(kinds: Any) -> None:
+    """Where noise hides the kind, a third of what is said with probability 2/3 is wrong."""
+    rng, (X, y, groups) = np.random.default_rng(2), kinds
+    X = X / X.std(-1, keepdims=True) + 5 * rng.standard_normal(X.shape)
+    folds = LeaveOneGroupOut()
+    models = SlipClassifier(RATE_HZ, views="simple")
+    found = cross_val_predict(models, X, y, groups=groups, cv=folds, method="predict_proba")
+    is_right = np.array(sorted(BANDS))[found.argmax(1)] == y
+    assert 0.4 < is_right.mean() < 0.95
+    assert found.max(1).mean() == pytest.approx(is_right.mean(), abs=0.12)
+
+
+def test_a_window_with_a_lost_channel_is_scored_without_it_and_a_silent_one_is_not_valid(
+    kinds: Any, of_kinds: Any
+) -> None:
+    (X, y, _), (model, held) = kinds, of_kinds
+    broken, silent = X[held].copy(), np.zeros_like(X[:2])
+    broken[:, 1] = np.nan
+    assert model.predict_valid(broken).all()
+    assert model.score(broken, y[held]) > 0.6
+    assert not model.predict_valid(silent).any()
+    np.testing.assert_array_equal(model.decision_function(silent), 0)
+    np.testing.assert_allclose(model.predict_proba(silent), 1 / 3)
+
+
+def test_two_labels_by_the_machines_of_several_are_the_machine_of_two(
+    data: Any,
+) -> None:
+    X, y, groups = data
+    model = SlipClassifier(features=features_of(), drop_channels=0.0, slip_label="stick")
+    expected = clone(model).fit(X, y, groups).decision_function(X)
+    described = features_of()
+    windows = described._lay_out(X)
+    recipe, pool = described._recipe(drop_channels=0.0), described._pool
+    rows = pool(described._bins(windows), torch.float64)
+    labels, group = (torch.from_numpy(np.unique(of, return_inverse=True)[1]) for of in (y, groups))
+    fit = _fitted_to_classes(recipe, pool, rows, labels, group, ("a", "b", "c"))
+    (head,) = fit.heads
+    np.testing.assert_allclose(head(fit.selection(rows)).numpy(), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda model, path: model.save(path / "kinds.pt"),
+        lambda model, path: model.export_onnx(path),
+        lambda model, path: model.detector_,
+    ],
+    ids=["save", "export_onnx", "detector_"],
+)
+def test_kinds_of_slip_make_no_detector_and_leave_no_file(
+    of_kinds: Any, tmp_path: Path, ask: Any
+) -> None:
+    with pytest.raises(AttributeError, match=r"of 3 labels is no detector: .* y == label") as said:
+        ask(of_kinds[0], tmp_path)
+    assert "\n" not in str(said.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_several_kinds_cannot_be_fitted_to_is_refused(kinds: Any) -> None:
+    X, y, groups = kinds
+    with pytest.raises(ValueError, match="slip_label is for two labels, and y has 3; leave it out"):
+        SlipClassifier(RATE_HZ, slip_label="rolls").fit(X, y, groups)
+    rare = np.where((y == "touch") & (groups != "cup"), "rolls", y)
+    message = "of the 4 groups 1 has the label 'touch'; give groups of which two have it"
+    with pytest.raises(ValueError, match=message):
+        SlipClassifier(RATE_HZ).fit(X, rare, groups)
+
+
+def test_recordings_of_one_kind_each_are_put_together_to_ten_groups(kinds: Any) -> None:
+    X, y, _ = kinds
+    recordings = np.arange(120) // 6 * 3 + np.arange(120) % 3  # 60 of two windows
+    model = SlipClassifier(RATE_HZ, views="simple").fit(X, y, recordings)
+    assert {len(row["balanced_accuracy"]) for row in model.validation_} == {10}

@@ -10,9 +10,10 @@ from benchmarks.real import (
     balanced_accuracy,
     confusions,
     left_out_scores,
+    recording_confusions,
     word,
 )
-from benchmarks.real_sets import RealSet, biotacsp, main, osu, read_set
+from benchmarks.real_sets import RealSet, biotacsp, biotacsp_direction, main, osu, read_set
 
 
 def write_biotacsp(root, **num_rows):
@@ -34,6 +35,9 @@ def test_a_biotac_recording_is_tared_on_half_a_second_and_cut_every_half_window(
     assert found.y.tolist() == [True, True, False]
     assert found.group.tolist() == ["bottle", "bottle", "striped"]
     assert found.recording.tolist() == ["cw/bottle0"] * 2 + ["t/strippes1"]
+    directions = biotacsp_direction(tmp_path)
+    assert directions.y.tolist() == ["cw", "cw", "t"]
+    np.testing.assert_array_equal(directions.X, found.X)
 
 
 def test_a_row_without_a_label_and_a_window_with_a_gap_are_left_out(tmp_path):
@@ -104,8 +108,8 @@ def test_a_file_without_an_array_is_refused(small, tmp_path):
 def test_a_method_never_sees_the_group_that_it_scores(small):
     seen = []
 
-    def fit(train, is_class, seed):
-        seen.append((set(train.group.tolist()), len(is_class), seed))
+    def fit(train, known, seed):
+        seen.append((set(train.group.tolist()), len(known), seed))
         return lambda x: x[:, 0, 0]
 
     scores, cpu_s = left_out_scores(small, fit, 7)
@@ -125,6 +129,19 @@ def test_balanced_accuracy_is_scikit_learns(small, words, rng):
     assert counts.shape[0] == 6
     expected = balanced_accuracy_score(of.classes()[1], decided)
     assert balanced_accuracy(counts.sum(0)[None, None]).item() == pytest.approx(expected)
+
+
+def test_a_recording_is_decided_by_the_mean_of_its_windows_and_not_by_their_number(small):
+    of = small._replace(y=small.recording)  # "1" and "2": two windows of each recording
+    first, second = of.recording == "1", of.recording == "2"
+    scores = np.where(second, 1.0, -1.0)[:, None]
+    first_of_cup = np.flatnonzero(first & (of.group == "cup"))
+    scores[first_of_cup, 0] = -1.0, 3.0  # their mean is 1
+    counts = recording_confusions(of, scores).sum(0)
+    assert counts.tolist() == [[2, 1], [0, 3]]
+    both = np.concatenate([-scores, scores], 1)  # one score for each class
+    np.testing.assert_array_equal(recording_confusions(of, both).sum(0), counts)
+    assert recording_confusions(small, scores) is None  # windows of both classes
 
 
 def test_simple_statistics_of_a_ramp_with_floors_of_training_windows():

@@ -318,6 +318,16 @@ class SlipDetector(nn.Module):
         scaled: Tensor = self.scaler(columns).to(self.imputation.dtype)
         return scaled if is_lost is None else self.imputed(scaled, is_lost)
 
+    def scaled_bins(self, bins: Tensor, is_lost: Tensor) -> Tensor:
+        """Scaled columns of filtered bins, for other heads on the same columns.
+
+        Shape:
+            - bins: ``[*, C, n]``, filtered; is_lost: ``[*, C]``, bool, as ``predict`` found it
+            - output: ``[*, S]``
+        """
+        bins = torch.where(is_lost[..., None], 0.0, self.pool.widen(bins))
+        return self.scaled(self._features(bins), is_lost)
+
     def imputed(self, scaled: Tensor, is_lost: Tensor) -> Tensor:
         """Scaled columns ``[*, S]`` with imputation values in those of lost channels ``[*, C]``."""
         pooled = torch.zeros_like(is_lost[..., :1])  # a pooled column is of the other channels

@@ -340,6 +340,24 @@ def collapse(support: Tensor, beta: Tensor, kernel: Polynomial = PAPER_KERNEL) -
     return QuadraticForm(bend, 2 * kernel.offset * pull, kernel.offset**2 * total)
 
 
+def coordinates_of(support: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Bins in coordinates of the directions that they span, at most as many as there are bins.
+
+    Returns:
+        Coordinates ``[N, r]`` and directions ``[r, m]``, whose product is ``support``; directions
+        are ``None``, and coordinates the columns, where there are no more columns than bins.
+
+    Shape:
+        - support: ``[N, m]``, float64
+    """
+    if len(support) >= support.shape[1]:
+        return support, None
+    squares, vectors = torch.linalg.eigh(support @ support.mT)
+    is_kept = squares > len(squares) * torch.finfo(squares.dtype).eps * squares.amax()
+    sizes, vectors = squares[is_kept].sqrt(), vectors[:, is_kept]
+    return vectors * sizes, (vectors / sizes).mT @ support
+
+
 def factors_of(
     support: Tensor, beta: Tensor, *, most: int = 64, tolerance: float = 0.005
 ) -> tuple[Tensor, Tensor]:
@@ -372,12 +390,7 @@ def factors_of(
         )
     with torch.no_grad():
         support, beta = support.double(), beta.double()
-        bins, basis = support, None  # coordinates of bins, and the directions that they belong to
-        if len(support) < support.shape[1]:
-            squares, vectors = torch.linalg.eigh(support @ support.mT)
-            is_kept = squares > len(squares) * torch.finfo(squares.dtype).eps * squares.amax()
-            sizes, vectors = squares[is_kept].sqrt(), vectors[:, is_kept]
-            bins, basis = vectors * sizes, (vectors / sizes).mT @ support
+        bins, basis = coordinates_of(support)
         values, vectors = torch.linalg.eigh(bins.mT @ (bins * beta[:, None]))
         order = values.abs().argsort(descending=True)
         values, vectors = values[order], vectors[:, order]

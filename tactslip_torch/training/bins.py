@@ -74,36 +74,57 @@ class SampledBins:
         return 2 * (self.group * len(self.scene_names) + self.scene) + self.is_slip.long()
 
     def joined(self, most: int = MOST_GROUPS) -> SampledBins:
-        """The same bins in at most so many groups, those joined called ``cup and 4 more``.
+        """The same bins in at most so many groups (``join_groups``)."""
+        label, names = self.is_slip.long(), self.group_names
+        group, named = join_groups(self.group, label, self.weight, names, most)
+        return self if named is names else replace(self, group=group, group_names=named)
 
-        In fewer where no two groups have both classes, so that as many as can have them do. Groups
-        are dealt out from the largest on, each to where bins of its commoner class are fewest; of
-        equal ones the name decides.
-        """
-        num = len(self.group_names)
-        counts = torch.zeros(num, 2, dtype=torch.float64)
-        counts.index_put_((self.group, self.is_slip.long()), self.weight, accumulate=True)
-        has = counts > 0
-        if int(has.all(1).sum()) < 2 <= int(has.sum(0).min()):
-            most = min(most, int(has.sum(0).min()))
-        if num <= most:
-            return self
-        joined = torch.zeros(most, 2, dtype=torch.float64)
-        members = [list[int]() for _ in range(most)]
-        order = sorted(range(num), key=lambda group: (-float(counts[group].sum()), group))
-        for group in order:
-            of_class = joined[:, int(counts[group].argmax())].tolist()
-            place = min(range(most), key=lambda one: (of_class[one], len(members[one])))
-            members[place].append(group)
-            joined[place] += counts[group]
-        members = sorted(sorted(own) for own in members)
-        to = torch.empty(num, dtype=torch.long)
-        for place, own in enumerate(members):
-            to[own] = place
-        names = [self.group_names[own[0]] for own in members]
-        more = [f" and {len(own) - 1} more" if len(own) > 1 else "" for own in members]
-        named = tuple(name + behind for name, behind in zip(names, more, strict=True))
-        return replace(self, group=to[self.group], group_names=named)
+
+def join_groups(
+    group: Tensor, label: Tensor, weight: Tensor, names: tuple[str, ...], most: int = MOST_GROUPS
+) -> tuple[Tensor, tuple[str, ...]]:
+    """At most so many groups, ``[N]``, and their names; those joined are ``cup and 4 more``.
+
+    In fewer where no two groups have every class, so that as many as can have them do. Groups are
+    dealt out from the largest on, each to where bins of its commoner class are fewest; of equal
+    ones the name decides. Where that would leave a class in one group alone, which it is not in
+    before, nothing is joined.
+
+    Args:
+        group: of each bin, index into ``names``.
+        label: class of each bin, from 0.
+        weight: of each bin.
+        names: of the groups, ascending.
+        most: groups.
+
+    Shape:
+        - group, label, weight: ``[N]``
+    """
+    num = len(names)
+    counts = torch.zeros(num, max(int(label.max()) + 1, 2), dtype=torch.float64)
+    counts.index_put_((group, label), weight, accumulate=True)
+    has = counts > 0
+    if int(has.all(1).sum()) < 2 <= int(has.sum(0).min()):
+        most = min(most, int(has.sum(0).min()))
+    if num <= most:
+        return group, names
+    joined = torch.zeros(most, counts.shape[1], dtype=torch.float64)
+    members = [list[int]() for _ in range(most)]
+    order = sorted(range(num), key=lambda one: (-float(counts[one].sum()), one))
+    for one in order:
+        of_class = joined[:, int(counts[one].argmax())].tolist()
+        place = min(range(most), key=lambda each: (of_class[each], len(members[each])))
+        members[place].append(one)
+        joined[place] += counts[one]
+    if bool((((joined > 0).sum(0) < 2) & (has.sum(0) >= 2)).any()):
+        return group, names
+    members = sorted(sorted(own) for own in members)
+    to = torch.empty(num, dtype=torch.long)
+    for place, own in enumerate(members):
+        to[own] = place
+    firsts = [names[own[0]] for own in members]
+    more = [f" and {len(own) - 1} more" if len(own) > 1 else "" for own in members]
+    return to[group], tuple(name + behind for name, behind in zip(firsts, more, strict=True))
 
 
 class _Stratum(NamedTuple):

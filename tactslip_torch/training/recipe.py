@@ -64,7 +64,6 @@ from tactslip_torch.training.views import (
     base_views,
     choose_views,
     merged,
-    parts_of,
     sums_by_group,
 )
 
@@ -133,20 +132,59 @@ class Fit:
             channel_filter: of the bins.
             metadata: to be kept with it, JSON-able.
         """
-        whole = FeaturePool(pool.hand, **pool.config(), backend=pool.backend)
-        selection = self.selection
-        return SlipDetector(
-            whole,
-            channel_filter,
-            tuple(pool.selected[index] for index in selection.selected),
-            selection.scaler,
-            self.head,
-            metadata,
-            self.imputation,
-            selection.pooling,
-            sensing=self.sensing,
-            backend=whole.backend,
-        )
+        return _detector(self, self.head, pool, channel_filter, metadata)
+
+
+@dataclass(frozen=True)
+class ClassFit:
+    """Machines of several classes, one for each, on the same columns.
+
+    Attributes:
+        selection: as ``Fit`` has it.
+        heads: one for each class, above 0 for it; of two classes one, for the second.
+        imputation: as ``Fit`` has it.
+        sensing: as ``Fit`` has it.
+        choice: of views, with what validation says and the calibration of each head.
+    """
+
+    selection: FeatureSelection
+    heads: tuple[QuadraticForm, ...]
+    imputation: Tensor
+    sensing: Sensing
+    choice: Choice
+
+    def detector(
+        self,
+        pool: FeaturePool,
+        channel_filter: ChannelFilter,
+        metadata: Mapping[str, Any],
+    ) -> SlipDetector:
+        """A detector with the first of the heads; arguments as in ``Fit.detector``."""
+        return _detector(self, self.heads[0], pool, channel_filter, metadata)
+
+
+def _detector(
+    fit: Fit | ClassFit,
+    head: QuadraticForm,
+    pool: FeaturePool,
+    channel_filter: ChannelFilter,
+    metadata: Mapping[str, Any],
+) -> SlipDetector:
+    """The detector with a head of a fit."""
+    whole = FeaturePool(pool.hand, **pool.config(), backend=pool.backend)
+    selection = fit.selection
+    return SlipDetector(
+        whole,
+        channel_filter,
+        tuple(pool.selected[index] for index in selection.selected),
+        selection.scaler,
+        head,
+        metadata,
+        fit.imputation,
+        selection.pooling,
+        sensing=fit.sensing,
+        backend=whole.backend,
+    )
 
 
 @dataclass(frozen=True)
@@ -240,18 +278,19 @@ class _Recipe(ABC):
     def _sensing(
         self,
         pool: FeaturePool,
-        sample: SampledBins,
+        features: Tensor,
+        longest_run: int | None,
         selection: FeatureSelection,
         alive_fraction: float,
     ) -> Sensing:
-        """Of the channels that a selection reads."""
+        """Of the channels that a selection reads, by features of training bins ``[N, F]``."""
         channels = pool.hand.names
         used = sorted({channels.index(pool.names[i].channel) for i in selection.selected})
         num_counted = len(counted_channels(pool.hand, used, selection.pooling is not None))
         return Sensing.fit(
-            SpanFeatures(pool.hand, pool.names, pool.bin_samples)(sample.features),
+            SpanFeatures(pool.hand, pool.names, pool.bin_samples)(features),
             self.min_alive or least_alive(num_counted, alive_fraction),
-            most_stuck_samples(pool.sample_rate_hz, sample.longest_run),
+            most_stuck_samples(pool.sample_rate_hz, longest_run),
         )
 
 
@@ -400,30 +439,22 @@ class General(_Recipe):
 
         def solve() -> tuple[Choice, FeatureSelection, QuadraticForm]:
             choice = choose_views(drawn, views, self.settings(), sums, show)
-            parts = {
-                view.name: parts_of(view, drawn, penalty)
-                for view, penalty, share in zip(
-                    choice.views, choice.penalties, choice.weights, strict=True
-                )
-                if share
-            }
-            selection, (head,) = merged(choice, parts)
+            selection, (head,) = merged(choice, choice.parts(drawn))
             return choice.told(), selection, head
 
         choice, selection, head = from_first_process(solve)
         assert selection.fill is not None  # of views
-        fraction = 1 - self.drop_channels if selection.pooling and self.drop_channels else 0.5
-        shares = dict(zip((v.name for v in choice.views), choice.weights, strict=True))
-        largest = max(range(len(choice.views)), key=choice.weights.__getitem__)
+        fraction = self._alive_fraction(selection)
+        shares = choice.shares
         return Fit(
             selection=selection,
             head=head,
             imputation=selection.fill,
-            sensing=self._sensing(pool, sample, selection, fraction),
+            sensing=self._sensing(pool, sample.features, sample.longest_run, selection, fraction),
             num_bins=round(float(sample.weight.sum())),
             sample=sample,
             weights=weights,
-            penalty=choice.penalties[largest],
+            penalty=choice.penalty,
             made={
                 "views": shares,
                 "penalties": dict(zip(shares, choice.penalties, strict=True)),
@@ -434,6 +465,23 @@ class General(_Recipe):
             nested=choice.nested,
             calibration=next(iter(choice.calibration), None),
         )
+
+    def fit_classes(self, bins: ViewBins, pool: FeaturePool) -> ClassFit:
+        """Choose and fit a machine for each of several classes, by bins in memory.
+
+        Views, penalties and weights are those of the best mean recall of the class of the highest
+        score; features and factorisations are shared by all machines.
+        """
+        choice = self.choose(bins, pool)
+        selection, heads = merged(choice, choice.parts(bins))
+        assert selection.fill is not None  # of views
+        fraction = self._alive_fraction(selection)
+        sensing = self._sensing(pool, bins.features, None, selection, fraction)
+        return ClassFit(selection, tuple(heads), selection.fill, sensing, choice.told())
+
+    def _alive_fraction(self, selection: FeatureSelection) -> float:
+        """Part of the channels that must be alive for a valid decision."""
+        return 1 - self.drop_channels if selection.pooling and self.drop_channels else 0.5
 
     def choose(self, bins: ViewBins, pool: FeaturePool, show: bool = False) -> Choice:
         """Views, penalties and weights by bins in memory, of two classes or more."""
@@ -586,7 +634,7 @@ class Paper(_Recipe):
             selection=selection,
             head=head,
             imputation=_class_mean(trained.features, sample.is_slip, weight),
-            sensing=self._sensing(pool, sample, selection, 0.5),
+            sensing=self._sensing(pool, sample.features, sample.longest_run, selection, 0.5),
             num_bins=2 * min(counts),
             sample=sample,
             weights={PAPER_SCENE: fractions},

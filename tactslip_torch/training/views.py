@@ -25,7 +25,13 @@ from torch import Tensor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import forward_selection
 from tactslip_torch.features.sensing import SpanFeatures
-from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, QuadraticForm, factors_of
+from tactslip_torch.model.kernels import (
+    PAPER_KERNEL,
+    Polynomial,
+    QuadraticForm,
+    coordinates_of,
+    factors_of,
+)
 from tactslip_torch.model.ridge import ClassSums, balanced_weights, class_targets, solve_dual
 from tactslip_torch.runtime import one_thread, steps, trim_memory
 from tactslip_torch.training.choice import platt_or_none
@@ -176,6 +182,21 @@ class Choice:
     rows: tuple[dict[str, Any], ...] = ()
     nested: dict[str, Any] | None = None
     calibration: tuple[dict[str, Any] | None, ...] = ()
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The weight of each view, by its name."""
+        return dict(zip((view.name for view in self.views), self.weights, strict=True))
+
+    @property
+    def penalty(self) -> float:
+        """C of the view that weighs most."""
+        return self.penalties[max(range(len(self.views)), key=self.weights.__getitem__)]
+
+    def parts(self, bins: ViewBins) -> dict[str, list[Part]]:
+        """The machines of the views that are kept, one for each target."""
+        penalties = zip(self.views, self.penalties, strict=True)
+        return {v.name: parts_of(v, bins, c) for v, c in penalties if self.shares[v.name]}
 
     def told(self) -> Choice:
         """Without what is large and no longer needed."""
@@ -611,10 +632,11 @@ def _dual_parts(view: View, bins: ViewBins, penalty: float) -> list[Part]:
     rows = _Rows.of(view, bins, z, MOST_KERNEL_BINS)
     gram = rows.kernel(rows.u, rows.u)
     (found,) = solve_dual(gram, rows.labels, rows.weights, [1 / penalty], targets)
-    parts = []
+    parts, offset = [], rows.kernel.offset
+    coordinates, basis = coordinates_of(rows.u)  # once for all targets
     for beta, constant in zip(found.weights.mT, found.intercept, strict=True):
-        offset = rows.kernel.offset
-        factors, signs = factors_of(rows.u, beta, most=MOST_FACTORS, tolerance=LEFT_OUT)
+        factors, signs = factors_of(coordinates, beta, most=MOST_FACTORS, tolerance=LEFT_OUT)
+        factors = factors if basis is None else factors @ basis
         linear = 2 * offset * (rows.u.mT @ beta)
         parts.append(Part(linear, constant + offset**2 * beta.sum(), factors, signs))
     return parts
