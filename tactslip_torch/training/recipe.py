@@ -477,6 +477,8 @@ class General(_Recipe):
         """Add the bins of a recording to the sums of the views of degree 1."""
         labels = bins.is_slip.long()
         weight = torch.tensor(weights[bins.scene]).double()[labels]
+        if bins.weight is not None:
+            weight = weight * bins.weight
         for view in views:
             if view.name not in sums:
                 continue
