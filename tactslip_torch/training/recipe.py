@@ -295,7 +295,7 @@ class General(_Recipe):
     penalties: float | Sequence[float] = (0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
     views: str | Sequence[str] = VIEWS
     num_features: int | None = None
-    threshold: str = "zero"
+    threshold: str = "half"
     descriptors: Sequence[str] | None = (
         "mean",
         "range",
