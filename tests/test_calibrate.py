@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from dataclasses import replace
 
 import hosts
 import numpy as np
@@ -332,23 +333,36 @@ def test_another_hand_is_refused(command, general, tmp_path):
 # The refit ---------------------------------------------------------------------------------------
 
 
-def odd_samples(trial, *, loudness=1.6):
+def odd_samples(trial, *, slips=True):
     """Of an object whose slip is no louder than its rest, but lower in frequency."""
     rng = np.random.default_rng([ord("G"), trial])
-    samples = 0.1 * loudness * rng.standard_normal((3 * RATE_HZ, len(CHANNELS)))
+    samples = 0.16 * rng.standard_normal((3 * RATE_HZ, len(CHANNELS)))
     low = np.apply_along_axis(np.convolve, 0, samples, np.ones(8) / np.sqrt(8), "same")
     slide = slice(*(round(end * RATE_HZ) for end in SLIDE_S))
-    samples[slide] = low[slide]
+    if slips:
+        samples[slide] = low[slide]
     return (samples + 1).astype(np.float32)
 
 
-def write_odd(folder, trials):
-    """Recordings of that object, all of which slip."""
+def loud_samples(trial):
+    """Of an object whose slip is so loud that nothing misses it."""
+    rng = np.random.default_rng([ord("H"), trial])
+    samples = 0.1 * rng.standard_normal((3 * RATE_HZ, len(CHANNELS)))
+    samples[slice(*(round(end * RATE_HZ) for end in SLIDE_S))] *= 4
+    return (samples + 1).astype(np.float32)
+
+
+def write_new(folder, trials, samples_of_trial=odd_samples, num_quiet=0):
+    """Recordings of a new object, all of which slip but for the last ones, which are quiet."""
     folder.mkdir()
-    rows = [["file", "material", "trial", "sliding_s"]]
+    rows = [["file", "material", "trial", "label", "sliding_s"]]
+    slide = f"{SLIDE_S[0]}-{SLIDE_S[1]}"
     for trial in trials:
-        path = write_recording(folder / f"G_{trial}.csv", odd_samples(trial))
-        rows.append([path.name, "G", trial, f"{SLIDE_S[0]}-{SLIDE_S[1]}"])
+        path = write_recording(folder / f"G_{trial}.csv", samples_of_trial(trial))
+        rows.append([path.name, "G", trial, "", slide])
+    for trial in range(1000, 1000 + num_quiet):
+        path = write_recording(folder / f"G_{trial}.csv", odd_samples(trial, slips=False))
+        rows.append([path.name, "G", trial, "non-slip", ""])
     with (folder / names.MANIFEST).open("w", newline="") as file:
         csv.writer(file).writerows(rows)
     return folder
@@ -375,7 +389,7 @@ def accuracy_on_odd(detector, trials):
 def refitted(command, general, tmp_path_factory):
     """With recordings of a new object: what was printed, the folder and the report."""
     place = tmp_path_factory.mktemp("refitted")
-    root = write_odd(place / "odd", range(6))
+    root = write_new(place / "odd", range(6))
     printed = command.well(place, "calibrate", *told(general.file, root, "refit=true"))
     return printed, place / "run", json.loads((place / "run" / "calibration.json").read_text())
 
@@ -409,44 +423,30 @@ def test_a_refitted_detector_says_what_it_was_trained_on(command, refitted, tmp_
 
 
 def test_a_refit_that_is_not_better_is_not_written(command, general, tmp_path):
-    """Slips so loud that the detector misses nothing: no refit can be better."""
-    root = tmp_path / "loud"
-    root.mkdir()
-    rows = [["file", "material", "trial", "sliding_s"]]
-    for trial in range(3):
-        samples, rng = odd_samples(trial, loudness=1.0), np.random.default_rng(trial)
-        slide = slice(*(round(end * RATE_HZ) for end in SLIDE_S))
-        samples[slide] = 1 + 0.4 * rng.standard_normal(samples[slide].shape)
-        path = write_recording(root / f"H_{trial}.csv", samples)
-        rows.append([path.name, "H", trial, f"{SLIDE_S[0]}-{SLIDE_S[1]}"])
-    with (root / names.MANIFEST).open("w", newline="") as file:
-        csv.writer(file).writerows(rows)
+    """Slips so loud that a threshold is right everywhere: that is moved, the machine stays."""
+    root = write_new(tmp_path / "loud", range(3), loud_samples)
     printed = command.well(tmp_path, "calibrate", *told(general.file, root, "refit=true"))
     report = json.loads((tmp_path / "run" / "calibration.json").read_text())
     assert report["refit"]["before"] == 1.0
     assert "not refitted, as that is not better" in printed
-    assert not (tmp_path / "run" / names.DETECTOR).exists()
-    assert not (tmp_path / "run" / BINS).exists()
+    assert report["bins"]["is_set"]
+    detector = SlipDetector.load(tmp_path / "run" / names.DETECTOR)
+    assert torch.equal(detector.head.linear, general.detector.head.linear)
+    assert detector.info["train_materials"] == ["A", "B", "C"]
+    kept = KeptBins.load(tmp_path / "run" / BINS, detector)  # those of before
+    assert set(kept.sample.group_names) == {"A", "B", "C"}
 
 
-def test_an_alarm_of_a_refit_is_set_by_scores_of_recordings_left_out(
-    command, general, refitted, tmp_path
-):
-    root = write_use(tmp_path / "use", with_slips=True)
-    odd = refitted[1].parent / "odd"
-    rows = list(csv.reader((odd / names.MANIFEST).open()))[1:]
-    for name, *_ in rows:
-        (root / name).write_bytes((odd / name).read_bytes())
-    with (root / names.MANIFEST).open("a", newline="") as file:
-        csv.writer(file).writerows([[a, b, c, "", d] for a, b, c, d in rows])
+def test_an_alarm_of_a_refit_is_set_for_a_rate_and_must_be_again(command, general, tmp_path):
+    root = write_new(tmp_path / "new", range(4), num_quiet=3)
     given = told(general.file, root, "refit=true", "per_hour=2000")
     command.well(tmp_path, "calibrate", *given)
-    detector = SlipDetector.load(tmp_path / "run" / names.DETECTOR)
+    model = tmp_path / "run" / names.DETECTOR
+    detector = SlipDetector.load(model)
     assert detector.info["refitted"]["is_set"]
     alarm = detector.info["calibrated"]["alarm"]
     assert alarm["bound"] <= 2000 == AlarmSettings.of(detector).target_per_hour
-    rated = told(tmp_path / "run" / names.DETECTOR, odd, "refit=true")
-    ran = command(tmp_path, "calibrate", *rated)
+    ran = command(tmp_path, "calibrate", *told(model, root, "refit=true"))
     assert (ran.status, "per_hour=RATE" in ran.err) == (2, True)
 
 
@@ -500,7 +500,7 @@ def test_bins_that_are_damaged_or_not_there_are_refused_in_a_line(
     ],
 )
 def test_a_refit_refuses_what_cannot_be_tried(command, general, tmp_path, trials, more, expected):
-    root = write_odd(tmp_path / "odd", trials)
+    root = write_new(tmp_path / "odd", trials)
     ran = command(tmp_path, "calibrate", *told(general.file, root, "refit=true", *more))
     assert (ran.status, ran.err.count("\n")) == (2, 1)
     assert expected in ran.err
@@ -543,6 +543,26 @@ def test_a_file_of_bins_is_never_larger_than_its_cap(general, tmp_path, monkeypa
     for one in kept.sample.stratum.unique():
         stands_for = fewer.weight[fewer.stratum == one].sum()
         torch.testing.assert_close(stands_for, kept.sample.weight[kept.sample.stratum == one].sum())
+
+
+def test_a_kept_bin_counts_as_many_as_it_stands_for(general):
+    """The machine of bins of weight 4 is that of each of them four times, in recordings apart."""
+    kept = KeptBins.load(general.folder / BINS, general.detector)
+    pool, bins = kept.pool(general.detector), kept.sample.by_recording()
+    recipe = replace(kept.recipe, views=("simple",), penalties=(1.0,), drop_channels=0.0)
+
+    def scores(some):
+        fit = recipe.fit(some, pool)
+        return fit.head(fit.selection(kept.sample.features))
+
+    four = [replace(of, weight=4 * of.weight) if of.group == "A" else of for of in bins]
+    apart = [
+        replace(of, name=f"{of.name} {part}")
+        for of in bins
+        for part in range(4 if of.group == "A" else 1)
+    ]
+    alike, wanted, plain = scores(four), scores(apart), scores(bins)
+    assert (alike - wanted).norm() < 0.2 * (plain - wanted).norm()
 
 
 def test_paper_keeps_no_bins(paper):
