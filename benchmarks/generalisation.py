@@ -218,11 +218,12 @@ def _measured(name: str, given: Sequence[str], job: Job, sizes: Generalisation) 
     folder, cache = job.folder / f"{name}-{given[0]}".replace("=", "-"), job.folder / "cache"
     metrics = trained([f"+exp={name}", *given], folder, cache)
     detector = SlipDetector.load(folder / "detector.pt")
-    chosen = next(row for row in metrics["validation"] if row.get("chosen"))
+    chosen = [row for row in metrics["validation"] if row.get("chosen")]
     found: dict[str, Any] = {
         "nested validation": _nested(metrics),
-        "chosen": f"{chosen['use']}, {chosen['num_features'] or 'all'}, degree "
-        f"{chosen['kernel']['degree']}, C={chosen['penalty']:g}",
+        "chosen": ", ".join(
+            f"{row['view']} {row['weight']:.2f} (C={row['penalty']:g})" for row in chosen
+        ),
         "numbers": len(metrics["selected"]),
         "per material": {
             m: 100 * s["balanced_accuracy"]

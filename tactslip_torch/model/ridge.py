@@ -87,6 +87,14 @@ class ClassSums:
         rest.weight, rest.total, rest.product = (mine - theirs for mine, theirs in pairs)
         return rest
 
+    def take(self, columns: Sequence[int], factor: Tensor | float = 1.0) -> ClassSums:
+        """Of some of the columns alone, times a factor."""
+        part = ClassSums(len(self.weight), len(columns))
+        part.weight = self.weight
+        part.total = self.total[:, columns] * factor
+        part.product = self.product[:, columns][:, :, columns] * factor**2
+        return part
+
     @property
     def has_all(self) -> bool:
         """Whether every class has a bin."""

@@ -61,10 +61,11 @@ from tactslip_torch.training.views import (
     View,
     ViewBins,
     ViewSettings,
+    base_views,
     choose_views,
-    dual_parts,
     merged,
-    primal_parts,
+    parts_of,
+    sums_by_group,
 )
 
 log = logging.getLogger(__name__)
@@ -280,7 +281,7 @@ class General(_Recipe):
         threshold: part of the validated shift of the threshold that is applied, ``zero``, ``half``
             or ``full``.
         pooling: statistics over the channels of a kind, as ``features.pooling`` has them.
-        tolerance: of balanced accuracy, within which a stronger penalty is as good.
+        tolerance: a stronger penalty is as good where it makes at most this part more errors.
         scene_weights: weight of a kind of scene beside the paper's: of all its bins of a class
             together, as a part of the protocol's bins of that class. Scenes that are not named
             count bin by bin.
@@ -311,7 +312,7 @@ class General(_Recipe):
         "band_energy_ratio",
     )
     pooling: str | Sequence[str] | None = POOLING
-    tolerance: float = 0.002
+    tolerance: float = 0.03
     scene_weights: Mapping[str, float] = field(default_factory=dict)
     drop_channels: float = 0.5
 
@@ -382,29 +383,34 @@ class General(_Recipe):
                 found.update(some)
         sample = _merged(found).bins()
         weights = self.weights(sample)
-        chosen: tuple[ViewBins, Choice] = from_first_process(
-            lambda: self._chosen(sample, weights, pool, show)
+        drawn, group_of = self._drawn(sample, weights, pool)
+        views: list[View] = from_first_process(
+            lambda: base_views(drawn, pool, self.allowed_by_view(pool), self.settings())
         )
-        drawn, choice = chosen
-        kept = [view for view, share in zip(choice.views, choice.weights, strict=True) if share]
-        sums = {view.name: ClassSums(2, view.selection.size) for view in kept if view.degree == 1}
+        sums = {view.name: sums_by_group(view, drawn) for view in views if view.degree == 1}
         with one_thread():
             for some in bins:
-                self._add(sums, kept, some, weights, pool)
-        for each in sums.values():
-            add_over_processes(*each.tensors)
+                for view in views:
+                    if view.name in sums:
+                        of_view = sums[view.name]
+                        own = of_view[group_of.get(some.group, 0) if len(of_view) > 1 else 0]
+                        self._add(own, view, some, weights, pool)
+        for own in itertools.chain(*sums.values()):
+            add_over_processes(*own.tensors)
 
-        def solve() -> tuple[FeatureSelection, QuadraticForm]:
-            parts = {}
-            for view, penalty in zip(choice.views, choice.penalties, strict=True):
-                if view.name in sums:
-                    parts[view.name] = primal_parts(sums[view.name], penalty)
-                elif view in kept:
-                    parts[view.name] = dual_parts(view, drawn, penalty)
+        def solve() -> tuple[Choice, FeatureSelection, QuadraticForm]:
+            choice = choose_views(drawn, views, self.settings(), sums, show)
+            parts = {
+                view.name: parts_of(view, drawn, penalty)
+                for view, penalty, share in zip(
+                    choice.views, choice.penalties, choice.weights, strict=True
+                )
+                if share
+            }
             selection, (head,) = merged(choice, parts)
-            return selection, head
+            return choice.told(), selection, head
 
-        selection, head = from_first_process(solve)
+        choice, selection, head = from_first_process(solve)
         assert selection.fill is not None  # of views
         fraction = 1 - self.drop_channels if selection.pooling and self.drop_channels else 0.5
         shares = dict(zip((v.name for v in choice.views), choice.weights, strict=True))
@@ -431,7 +437,9 @@ class General(_Recipe):
 
     def choose(self, bins: ViewBins, pool: FeaturePool, show: bool = False) -> Choice:
         """Views, penalties and weights by bins in memory, of two classes or more."""
-        return choose_views(bins, pool, self.allowed_by_view(pool), self.settings(), show)
+        settings = self.settings()
+        views = base_views(bins, pool, self.allowed_by_view(pool), settings)
+        return choose_views(bins, views, settings, show=show)
 
     def second_copies(self, name: str, num_bins: int, pool: FeaturePool) -> Tensor | None:
         """Channels that second copies of bins are without, ``[N, C]``, bool; ``None``: no copies.
@@ -445,49 +453,45 @@ class General(_Recipe):
             return None
         return _dropped(name, num_bins, len(pool.hand), self.drop_channels)
 
-    def _chosen(
-        self,
-        sample: SampledBins,
-        weights: Mapping[str, tuple[float, float]],
-        pool: FeaturePool,
-        show: bool,
-    ) -> tuple[ViewBins, Choice]:
+    def _drawn(
+        self, sample: SampledBins, weights: Mapping[str, tuple[float, float]], pool: FeaturePool
+    ) -> tuple[ViewBins, dict[str, int]]:
+        """The sample that choices are made by, and the number of each group's joined one."""
         table = torch.tensor([weights[scene] for scene in sample.scene_names]).double()
         weight = sample.weight * table[sample.scene, sample.is_slip.long()]
-        sample = sample.joined()
+        joined = sample.joined()
+        pairs = zip(sample.group.tolist(), joined.group.tolist(), strict=True)
         drawn = ViewBins(
-            sample.features,
-            sample.is_slip.long(),
-            sample.group,
-            sample.group_names,
+            joined.features,
+            joined.is_slip.long(),
+            joined.group,
+            joined.group_names,
             weight / weight.mean(),
-            sample.stratum,
-            self.second_copies("sample", len(sample.is_slip), pool),
+            joined.stratum,
+            self.second_copies("sample", len(joined.is_slip), pool),
         )
-        return drawn, self.choose(drawn, pool, show)
+        return drawn, {sample.group_names[group]: number for group, number in pairs}
 
     def _add(
         self,
-        sums: Mapping[str, ClassSums],
-        views: Sequence[View],
+        sums: ClassSums,
+        view: View,
         bins: RecordingBins,
         weights: Mapping[str, tuple[float, float]],
         pool: FeaturePool,
     ) -> None:
-        """Add the bins of a recording to the sums of the views of degree 1."""
+        """Add the bins of a recording to the sums of a view."""
         labels = bins.is_slip.long()
+        if not len(labels):
+            return
         weight = torch.tensor(weights[bins.scene]).double()[labels]
         if bins.weight is not None:
             weight = weight * bins.weight
-        for view in views:
-            if view.name not in sums:
-                continue
-            u, own, each = view.units(bins.features), labels, weight
-            is_lost = self.second_copies(bins.name, len(u), pool)
-            if is_lost is not None and view.name == "pooled":
-                u = torch.cat([u, view.units(bins.features, is_lost)])
-                own, each = labels.repeat(2), weight.repeat(2) / 2
-            sums[view.name].update(u, own, each)
+        u, is_lost = view.units(bins.features), self.second_copies(bins.name, len(labels), pool)
+        if is_lost is not None and view.name == "pooled":
+            u = torch.cat([u, view.units(bins.features, is_lost)])
+            labels, weight = labels.repeat(2), weight.repeat(2) / 2
+        sums.update(u, labels, weight)
 
     def weights(self, sample: SampledBins) -> dict[str, tuple[float, float]]:
         """The weight of each bin of a scene, non-slip and slip, with both classes balanced.

@@ -41,6 +41,9 @@ NO_WORSE, LITTLE = 0.001, 0.1
 MOST_KERNEL_BINS, MOST_CHOICE_BINS = 4000, 2000
 """A machine of degree 2 is fitted to so many bins, drawn by group and class, and chosen by so
 many."""
+MOST_SUMMED = 2000
+"""With more columns machines of degree 1 are chosen by the dual of the bins in memory: the products
+of each group would take too much of it."""
 MOST_FACTORS, LEFT_OUT = 32, 0.01
 """Of a quadratic part so many factors are kept at most: the fewest that leave out so small a part
 of its spread."""
@@ -93,8 +96,9 @@ class View:
         selection: of its scaled columns ``z``.
         center: ``[S]``.
         gain: ``[S]``.
-        held_out: score of each bin by the machine without its group, for each penalty,
-            ``[P, N, R]``; NaN of a group that cannot be left out.
+        held_out: score of each bin, and of its second copy if it has one, by the machine without
+            its group, for each penalty, ``[1 or 2, P, N, R]``; NaN where there is none.
+        sums: of the columns of all training bins, for degree 1; ``None``: those in memory are all.
     """
 
     name: str
@@ -102,6 +106,7 @@ class View:
     center: Tensor
     gain: Tensor
     held_out: Tensor
+    sums: ClassSums | None = None
 
     @property
     def degree(self) -> int:
@@ -155,6 +160,11 @@ class Choice:
     nested: dict[str, Any] | None = None
     calibration: tuple[dict[str, Any] | None, ...] = ()
 
+    def told(self) -> Choice:
+        """Without what is large and no longer needed."""
+        none = torch.zeros(0)
+        return replace(self, views=tuple(replace(v, held_out=none, sums=None) for v in self.views))
+
 
 @dataclass(frozen=True)
 class ViewSettings:
@@ -163,7 +173,7 @@ class ViewSettings:
     Args:
         views: some of ``columns.VIEWS``.
         penalties: values of C, ascending: the strongest penalty first.
-        tolerance: of balanced accuracy, within which a stronger penalty is as good.
+        tolerance: a stronger penalty is as good where it makes at most this part more errors.
         threshold: one of ``THRESHOLDS``.
         num_features: columns of each view, by forward selection; ``None``: all.
         pooling: statistics over channels.
@@ -177,30 +187,59 @@ class ViewSettings:
     pooling: str | Sequence[str] | None = None
 
 
+def base_views(
+    bins: ViewBins, pool: FeaturePool, allowed: Mapping[str, Tensor], settings: ViewSettings
+) -> list[View]:
+    """Views with all of their columns, standardised, before anything is chosen.
+
+    Args:
+        bins: that columns are learned from.
+        pool: of their features.
+        allowed: which features each view may use, ``[F]``, bool.
+        settings: which views.
+    """
+    made = list[View]()
+    for name in settings.views:
+        args = pool, allowed[name], bins.features, bins.weights, settings.pooling
+        selection = view_columns(name, *args)
+        center, gain = _standard(name, selection.in_parts(bins.features), bins.weights)
+        made.append(View(name, selection, center, gain, gain.new_zeros(0)))
+    return made
+
+
+def sums_by_group(view: View, bins: ViewBins) -> list[ClassSums]:
+    """Sums of a view of degree 1 by group, to be added to; of too many columns all in one."""
+    num = len(bins.group_names) if view.selection.size <= MOST_SUMMED else 1
+    return [ClassSums(bins.num_classes, view.selection.size) for _ in range(num)]
+
+
 def choose_views(
     bins: ViewBins,
-    pool: FeaturePool,
-    allowed: Mapping[str, Tensor],
+    views: Sequence[View],
     settings: ViewSettings,
+    sums: Mapping[str, Sequence[ClassSums]] | None = None,
     show: bool = False,
 ) -> Choice:
-    """Fit the columns of views, choose their penalties, weigh them.
+    """Choose columns and penalties of views, and weigh them.
 
     Args:
         bins: of two classes or more.
-        pool: of their features.
-        allowed: which features each view may use, ``[F]``, bool.
+        views: as ``base_views`` makes them.
         settings: how.
+        sums: of views of degree 1, of all training bins, as ``sums_by_group`` lays them out; by
+            default of the bins in memory.
         show: a progress bar.
     """
-    views, part = list[View](), THRESHOLDS[settings.threshold]
-    with steps("validation, groups left out", "view", len(settings.views), show=show) as shown:
-        for name in settings.views:
-            views.append(_fit_view(name, bins, pool, allowed[name], settings))
+    given, part = sums or {}, THRESHOLDS[settings.threshold]
+    bases, views = views, list[View]()
+    with steps("validation, groups left out", "view", len(bases), show=show) as shown:
+        for base in bases:
+            views.append(_validated(base, bins, settings, given.get(base.name)))
             shown.update()
             trim_memory()
     penalties, labels = tuple(settings.penalties), bins.labels
-    known = torch.stack([view.held_out.isfinite().all(-1).all(0) for view in views]).all(0)
+    every = torch.ones_like(labels, dtype=torch.bool)
+    known = _known([view.held_out for view in views], every)
     if len(labels[known].unique()) < bins.num_classes:
         log.warning(
             "no recordings are left out to choose by: that needs two groups with every class, got "
@@ -211,7 +250,9 @@ def choose_views(
         )
         return Choice(tuple(views), (middle,) * len(views), (1 / len(views),) * len(views))
     helds = [view.held_out for view in views]
-    found = _decided(helds, labels, known, settings.tolerance)
+    found = _decided(helds, labels, every, settings.tolerance)
+    kept = [held for held, weight in zip(helds, found.weights, strict=True) if weight]
+    known = _known(kept, every)
     score = _mean_score(helds, found)[known] - part * found.shift
     truths = class_targets(bins.num_classes)[labels[known]] > 0
     calibration = tuple(
@@ -225,30 +266,39 @@ def choose_views(
         shift=part * found.shift,
         accuracy=_accuracy(score, labels[known]),
         rows=tuple(
-            _row(view, index, penalty, weight, bins, known, penalty == penalties[chosen])
+            _row(view, index, penalty, weight, bins, penalty == penalties[chosen])
             for view, chosen, weight in zip(views, found.chosen, found.weights, strict=True)
             for index, penalty in enumerate(penalties)
         ),
-        nested=_nested(helds, bins, known, settings.tolerance, part),
+        nested=_nested(helds, bins, settings.tolerance, part),
         calibration=calibration,
     )
 
 
 @one_thread()
-def _fit_view(
-    name: str, bins: ViewBins, pool: FeaturePool, allowed: Tensor, settings: ViewSettings
+def _validated(
+    view: View, bins: ViewBins, settings: ViewSettings, sums: Sequence[ClassSums] | None
 ) -> View:
-    selection = view_columns(name, pool, allowed, bins.features, bins.weights, settings.pooling)
-    z, num = selection.in_parts(bins.features), settings.num_features
-    unknown = z.new_zeros(0)
-    if num is not None and num < selection.size:
-        rows = _Rows.of(View(name, selection, *_standard(name, z, bins.weights), unknown), bins, z)
-        held_out = _left_out(rows, bins, settings.penalties, num)
-        taken = rows.best(torch.ones_like(rows.labels, dtype=torch.bool), num)
-        selection, z = selection.take(taken), z[:, taken]
-        return View(name, selection, *_standard(name, z, bins.weights), held_out)
-    view = View(name, selection, *_standard(name, z, bins.weights), unknown)
-    return replace(view, held_out=_left_out(_Rows.of(view, bins, z), bins, settings.penalties))
+    """A view with its held-out scores, and of its columns those that are selected."""
+    num = settings.num_features
+    if num is not None and num >= view.selection.size:
+        num = None
+    z = view.selection.in_parts(bins.features)
+    rows = _Rows.of(view, bins, z)
+    held_out = _left_out(rows, bins, settings.penalties, num, sums)
+    whole = None if sums is None else ClassSums.added(sums)
+    if num is None:
+        return replace(view, held_out=held_out, sums=whole)
+    taken = rows.best(torch.ones_like(rows.labels, dtype=torch.bool), num)
+    factor = rows.unit(taken)
+    return View(
+        view.name,
+        view.selection.take(taken),
+        view.center[taken],
+        view.gain[taken] * factor,
+        held_out,
+        None if whole is None else whole.take(taken, factor),
+    )
 
 
 def _standard(name: str, z: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -310,11 +360,10 @@ class _Rows:
         u = u / u.std(0).clamp(min=_NO_SPREAD)
         return forward_selection(u, class_targets(num_classes)[labels], balanced, num)
 
-    def take(self, columns: Sequence[int]) -> _Rows:
-        """With some of the columns alone, of unit size again."""
-        u = self.u[:, columns]
-        share = self.weights / self.weights.sum()
-        return replace(self, u=u * _unit(self.name, u - share @ u, share))
+    def unit(self, columns: Sequence[int]) -> Tensor:
+        """By what some of the columns are multiplied to be of unit size."""
+        u, share = self.u[:, columns], self.weights / self.weights.sum()
+        return _unit(self.name, u - share @ u, share)
 
     def sums(self, mask: Tensor, num_classes: int) -> ClassSums:
         """Sums of some of the rows."""
@@ -329,52 +378,77 @@ def kernel_of(view: str) -> Polynomial:
 
 
 def _left_out(
-    rows: _Rows, bins: ViewBins, penalties: Sequence[float], num_features: int | None = None
+    rows: _Rows,
+    bins: ViewBins,
+    penalties: Sequence[float],
+    num_features: int | None,
+    sums: Sequence[ClassSums] | None,
 ) -> Tensor:
-    """Held-out scores of all bins for each penalty, ``[P, N, R]``; NaN where there is none.
+    """Held-out scores for each penalty, ``[1 or 2, P, N, R]``: of bins, then of their copies.
 
     With ``num_features`` columns are selected anew without each group.
     """
     targets, ridges = class_targets(bins.num_classes), [1 / penalty for penalty in penalties]
-    held = rows.u.new_full((len(penalties), len(bins.labels), targets.shape[1]), torch.nan)
+    is_copy = torch.arange(len(rows.u)) >= rows.num_bins
+    shape = 1 + int(is_copy.any()), len(penalties), len(bins.labels), targets.shape[1]
+    held = rows.u.new_full(shape, torch.nan)
     groups = rows.groups.unique().tolist()
-    is_dual = DEGREE[rows.name] == 2 or (num_features or rows.u.shape[1]) > len(rows.u)
-    gram, sums = None, dict[int, ClassSums]()
-    if num_features is None and is_dual:
-        gram = rows.kernel(rows.u, rows.u)
+    is_dual = DEGREE[rows.name] == 2 or rows.u.shape[1] > MOST_SUMMED
+    whole, gram = None, None
+    if not is_dual:
+        if sums is None:
+            sums = [rows.sums(rows.groups == g, len(targets)) for g in range(len(bins.group_names))]
+        whole = ClassSums.added(sums)
     elif num_features is None:
-        sums = {group: rows.sums(rows.groups == group, len(targets)) for group in groups}
-        whole = ClassSums.added(list(sums.values()))
+        gram = rows.kernel(rows.u, rows.u)
     for group in groups:
         is_in = rows.groups != group
         if len(rows.labels[is_in].unique()) < len(targets):
             continue
-        own = rows if num_features is None else rows.take(rows.best(is_in, num_features))
-        out = (~is_in[: rows.num_bins]).nonzero()[:, 0]
-        across = own.u[out]
-        if is_dual:
-            u = own.u[is_in]
-            inner = own.kernel(u, u) if gram is None else gram[is_in][:, is_in]
-            solved = solve_dual(inner, own.labels[is_in], own.weights[is_in], ridges, targets)
-            across = own.kernel(across, u)
+        u, taken, factor = rows.u, None, torch.tensor(1.0)
+        if num_features is not None:
+            taken = rows.best(is_in, num_features)
+            factor = rows.unit(taken)
+            u = u[:, taken] * factor
+        out = (~is_in).nonzero()[:, 0]
+        across = u[out]
+        if whole is not None and sums is not None:
+            rest = whole.without(sums[group])
+            solved = (rest if taken is None else rest.take(taken, factor)).solve(ridges, targets)
         else:
-            rest = whole.without(sums[group]) if sums else own.sums(is_in, len(targets))
-            solved = rest.solve(ridges, targets)
+            inner = rows.kernel(u[is_in], u[is_in]) if gram is None else gram[is_in][:, is_in]
+            solved = solve_dual(inner, rows.labels[is_in], rows.weights[is_in], ridges, targets)
+            across = rows.kernel(across, u[is_in])
         for index, each in enumerate(solved):
-            held[index, rows.place[out]] = across @ each.weights + each.intercept
+            held[is_copy[out].long(), index, rows.place[out]] = (
+                across @ each.weights + each.intercept
+            )
     return held
 
 
 # What held-out scores decide ---------------------------------------------------------------------
 
 
-def _decided(helds: Sequence[Tensor], labels: Tensor, known: Tensor, tolerance: float) -> Decision:
-    """Penalties, weights and threshold by the held-out scores of the bins that are known."""
+def _known(helds: Sequence[Tensor], rows: Tensor) -> Tensor:
+    """Which of some bins have held-out scores of several views, ``[N]``, bool."""
+    return torch.stack([rows, *(held[0].isfinite().all(-1).all(0) for held in helds)]).all(0)
+
+
+def _decided(helds: Sequence[Tensor], labels: Tensor, rows: Tensor, tolerance: float) -> Decision:
+    """Penalties, weights and threshold by the held-out scores of some bins.
+
+    A penalty is chosen by bins and by their second copies, as it is trained on both; a view weighs
+    by bins alone.
+    """
     indices, best = list[int](), list[float]()
     for held in helds:
-        found = [_accuracy(scores[known], labels[known]) for scores in held]
-        best.append(max(found))
-        indices.append(next(i for i, each in enumerate(found) if each >= best[-1] - tolerance))
+        own = _known([held], rows)
+        each = torch.tensor([[_accuracy(s[own], labels[own]) for s in part] for part in held])
+        mean = each.mean(0)
+        least = mean.max() - tolerance * (1 - mean.max())
+        indices.append(int((mean >= least).nonzero()[0]))
+        best.append(float(each[0].max()))
+    shared = _known(helds, rows)
 
     def of(weights: Sequence[float]) -> Decision:
         return Decision(tuple(indices), tuple(best), tuple(weights), 0.0)
@@ -383,15 +457,16 @@ def _decided(helds: Sequence[Tensor], labels: Tensor, known: Tensor, tolerance: 
     weights = _shares(best, kept)
 
     def accuracy(some: set[int]) -> float:
-        return _accuracy(_mean_score(helds, of(_shares(best, some)))[known], labels[known])
+        return _accuracy(_mean_score(helds, of(_shares(best, some)))[shared], labels[shared])
 
     for view in sorted(kept, key=weights.__getitem__):
         if weights[view] >= LITTLE or accuracy(kept - {view}) < accuracy(kept) - NO_WORSE:
             break
         kept.remove(view)
         weights = _shares(best, kept)
-    score = _mean_score(helds, of(weights))[known]
-    shift = _best_shift(score[:, 0], labels[known]) if score.shape[1] == 1 else 0.0
+    shared = _known([held for held, weight in zip(helds, weights, strict=True) if weight], rows)
+    score = _mean_score(helds, of(weights))[shared]
+    shift = _best_shift(score[:, 0], labels[shared]) if score.shape[1] == 1 else 0.0
     return of(weights)._replace(shift=shift)
 
 
@@ -405,7 +480,7 @@ def _shares(best: Sequence[float], kept: set[int]) -> list[float]:
 def _mean_score(helds: Sequence[Tensor], decision: Decision) -> Tensor:
     """Weighted mean of the views' held-out scores, ``[N, R]``."""
     parts = zip(helds, decision.chosen, decision.weights, strict=True)
-    return torch.stack([held[index] * weight for held, index, weight in parts if weight]).sum(0)
+    return torch.stack([held[0, index] * weight for held, index, weight in parts if weight]).sum(0)
 
 
 def _accuracy(scores: Tensor, labels: Tensor) -> float:
@@ -430,13 +505,14 @@ def _best_shift(scores: Tensor, labels: Tensor) -> float:
 
 
 def _nested(
-    helds: Sequence[Tensor], bins: ViewBins, known: Tensor, tolerance: float, part: float
+    helds: Sequence[Tensor], bins: ViewBins, tolerance: float, part: float
 ) -> dict[str, Any] | None:
     """Balanced accuracy on each group of what is decided without it.
 
     The machines of other groups have seen it, so this is a little too good.
     """
     by_name, labels = dict[str, float](), bins.labels
+    known = _known(helds, torch.ones_like(labels, dtype=torch.bool))
     for group, name in enumerate(bins.group_names):
         inside = (bins.groups == group) & known
         others = known & ~inside
@@ -457,11 +533,11 @@ def _row(
     penalty: float,
     weight: float,
     bins: ViewBins,
-    known: Tensor,
     is_chosen: bool,
 ) -> dict[str, Any]:
     """A view at a penalty and its scores, for files."""
-    held, labels = view.held_out[index], bins.labels
+    held, labels = view.held_out[0, index], bins.labels
+    known = held.isfinite().all(-1)
     by_group = {}
     for group, name in enumerate(bins.group_names):
         inside = (bins.groups == group) & known
@@ -502,15 +578,17 @@ class Part(NamedTuple):
 
 
 def parts_of(view: View, bins: ViewBins, penalty: float) -> list[Part]:
-    """The machine of a view, one for each target, from bins in memory."""
+    """The machine of a view, one for each target: from its sums, else from bins in memory."""
+    if view.sums is not None:
+        return _primal_parts(view.sums, penalty)
     if view.degree == 2:
-        return dual_parts(view, bins, penalty)
+        return _dual_parts(view, bins, penalty)
     rows = _Rows.of(view, bins, view.selection.in_parts(bins.features))
     every = torch.ones_like(rows.labels, dtype=torch.bool)
-    return primal_parts(rows.sums(every, bins.num_classes), penalty)
+    return _primal_parts(rows.sums(every, bins.num_classes), penalty)
 
 
-def dual_parts(view: View, bins: ViewBins, penalty: float) -> list[Part]:
+def _dual_parts(view: View, bins: ViewBins, penalty: float) -> list[Part]:
     """The machine of degree 2 of a view, one for each target, from bins in memory."""
     z, targets = view.selection.in_parts(bins.features), class_targets(bins.num_classes)
     rows = _Rows.of(view, bins, z, MOST_KERNEL_BINS)
@@ -525,7 +603,7 @@ def dual_parts(view: View, bins: ViewBins, penalty: float) -> list[Part]:
     return parts
 
 
-def primal_parts(sums: ClassSums, penalty: float) -> list[Part]:
+def _primal_parts(sums: ClassSums, penalty: float) -> list[Part]:
     """The machine of degree 1 of a view, one for each target, from the sums of all bins."""
     (found,) = sums.solve([1 / penalty], class_targets(len(sums.weight)))
     none = found.weights.new_zeros(0, len(found.weights)), found.weights.new_zeros(0)
