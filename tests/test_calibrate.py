@@ -11,6 +11,7 @@ import pytest
 import torch
 from contract import names
 from contract.recordings import CHANNELS, RATE_HZ, SLIDE_S, of_set, samples_of, write_recording
+from contract.running import train
 from drawing import assert_png
 
 from tactslip_torch.data.labels import LabelRule
@@ -565,5 +566,10 @@ def test_a_kept_bin_counts_as_many_as_it_stands_for(general):
     assert (alike - wanted).norm() < 0.2 * (plain - wanted).norm()
 
 
-def test_paper_keeps_no_bins(paper):
+def test_no_bins_are_kept_of_the_papers_recipe_or_where_that_is_not_wanted(
+    command, general, paper, tmp_path
+):
     assert not (paper.folder / BINS).exists()
+    words = {"keep_bins": False, "recipe.views": ["simple"], "recipe.penalties": [1.0]}
+    made = train(command, tmp_path, general.overrides, **words)
+    assert not (made.folder / BINS).exists()
