@@ -47,11 +47,11 @@ WATCHED_S = 0.8
 _LIFT_S, _LOADED_S, _REST_S = 1.2, (2.3, 2.7), 0.7
 _LAG_S = 0.01  # of the actuator behind its delay: a first-order lag
 _MARGIN = 1.5  # of the force that the controller takes over the one that the object should need
-_SLIDES_MM_S = 2.0  # of a pad
-_RECENT_S = 0.25
-_TAP_S = 0.015
+_TAP_S = 0.015  # half a sine
+_SLIDES_MM_S = 2.0  # of a pad, from when on it counts as sliding
+_PAUSE_S = 0.02  # of a slide, at which it still goes on
+_RECENT_S = 0.25  # behind a slide, in which a tightening is not false
 _FILMED_HOPS, _FILM_SIZE = 10, (230, 150)  # a frame each 50 ms; height and width
-_PAUSE_S = 0.02  # of a slide that goes on
 
 
 @dataclass(frozen=True)
@@ -337,10 +337,8 @@ def run_lift(
                 ends_s = time_s
         if listens or seen:
             normal_n, friction_n, slip_mm_s, inertia_n = (of[:, pad_of] for of in pads)
-            normal_n, friction_n, inertia_n = (
-                fraction * force_n for force_n in (normal_n, friction_n, inertia_n)
-            )
-            volts = signals.push(normal_n, friction_n, slip_mm_s, inertia_n)
+            forces = fraction * np.stack([normal_n, friction_n, inertia_n])
+            volts = signals.push(forces[0], forces[1], slip_mm_s, forces[2])
         level = trigger.hear(volts, pads)
         if time_s > WATCHED_S and reflex.tightens(time_s, level):
             false[level] += time_s - recent_s > _RECENT_S

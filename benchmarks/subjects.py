@@ -102,8 +102,8 @@ def onset_settings(detector: SlipDetector, samples: Array) -> AlarmSettings:
     """
     rule, pool = Cusum(drift=3.0, evidence=0.5, ceiling=600.0), detector.pool
     settings = AlarmSettings(50, Platt(1.0, 0.0), rule, 400.0, target_per_hour=1.0)
-    plain = OnsetEvidence(pool.hand, pool.sample_rate_hz, 10, (1e-4,) * 4, (1e-3,) * 6)
-    columns, _ = plain.columns(plain.blocks_of_recording(torch.from_numpy(samples.T)))
+    plain = OnsetEvidence(pool.hand, pool.sample_rate_hz)
+    columns, _, _ = plain.columns(plain.blocks_of_recording(torch.from_numpy(samples.T)))
     draw = np.random.default_rng(0).standard_normal
     quadratic = draw((plain.num_columns,) * 2) / plain.num_columns
     numbers = quadratic + quadratic.T, draw(plain.num_columns), np.array(0.0)

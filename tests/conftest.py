@@ -120,7 +120,7 @@ def cache(once: Callable[..., Path]) -> Path:
 
 @pytest.fixture(scope="session")
 def general(once: Callable[..., Path], command: Runner, recordings: Path, cache: Path) -> Trained:
-    """A detector of the default recipe: pooled features and single ones, with an alarm."""
+    """A detector of the default recipe, with an alarm."""
     return _trained(once, "general", command, recordings, cache)
 
 

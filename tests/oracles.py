@@ -371,3 +371,35 @@ def pooled(values: np.ndarray, in_use: np.ndarray, scale: float, statistic: str)
     else:
         fraction = {"min": 0.0, "median": 0.5, "max": 1.0}[statistic]
     return float(np.quantile(y, fraction))
+
+
+def class_ridge(
+    u: np.ndarray, labels: np.ndarray, weights: np.ndarray, ridge: float, targets: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes ``[S, R]`` and intercept ``[R]`` of bins ``[N, S]``, as one least-squares problem.
+
+    All classes weigh the same together; slopes are penalised and the intercept is not.
+    """
+    totals = np.array([weights[labels == label].sum() for label in range(len(targets))])
+    v = weights * weights.sum() / (len(targets) * totals[labels])
+    rows = np.sqrt(v)[:, None] * np.column_stack([u, np.ones(len(u))])
+    slopes = np.sqrt(ridge) * np.eye(u.shape[1], u.shape[1] + 1)
+    wanted = np.sqrt(v)[:, None] * targets[labels]
+    zeros = np.zeros((len(slopes), targets.shape[1]))
+    found = np.linalg.lstsq(np.vstack([rows, slopes]), np.vstack([wanted, zeros]), rcond=None)[0]
+    return found[:-1], found[-1]
+
+
+def class_kernel_machine(
+    gram: np.ndarray, labels: np.ndarray, weights: np.ndarray, ridge: float, targets: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same machine by its kernel: weights of bins ``[N, R]``, which add up to 0, and intercept.
+
+    Where the gradient of the sum vanishes, ``(K + ridge / v) beta + intercept = target``.
+    """
+    totals = np.array([weights[labels == label].sum() for label in range(len(targets))])
+    v = weights * weights.sum() / (len(targets) * totals[labels])
+    one = np.ones((len(gram), 1))
+    system = np.block([[gram + np.diag(ridge / v), one], [one.T, np.zeros((1, 1))]])
+    found = np.linalg.solve(system, np.vstack([targets[labels], np.zeros((1, targets.shape[1]))]))
+    return found[:-1], found[-1]

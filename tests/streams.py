@@ -48,16 +48,17 @@ def detector_of(kind="all", align="centred", backend="auto"):
 
 
 def onset_of(samples, hand=HAND, seed=0, quantile=0.9, rate_hz=2000.0, hop=10):
-    """A classifier of fast evidence, drawn, that so many hops of ``samples [C, T]`` speak against.
+    """A drawn classifier whose threshold so many hops of ``samples [C, T]`` do not reach.
 
     The mains are such that the comb has a part of a sample.
     """
     rng = np.random.default_rng(seed)
-    evidence = OnsetEvidence(hand, rate_hz, hop, (1e-4,) * 4, (1e-3,) * 6, 60.0, 2)
-    columns, _ = evidence.columns(evidence.blocks_of_recording(samples))
+    evidence = OnsetEvidence(hand, rate_hz, hop, (1e-4,) * len(hand), 60.0, 2)
+    columns, _, _ = evidence.columns(evidence.blocks_of_recording(samples))
     scaler, num = FeatureScaler.fit(columns), evidence.num_columns
     bend, linear = rng.standard_normal((num, num)) / num, rng.standard_normal(num)
     numbers = bend + bend.T, linear, np.array(0.1)
     head = QuadraticForm(*map(torch.from_numpy, numbers))
     threshold = float(head(scaler(columns)).quantile(quantile))
-    return OnsetClassifier(evidence, scaler, head, threshold, lead_s=0.004)
+    hint = float(head(scaler(columns)).quantile(0.8 * quantile))
+    return OnsetClassifier(evidence, scaler, head, threshold, hint, lead_s=0.004)

@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,14 +24,15 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.decisions import KEY, AlarmSettings, Decider, score_stream
 from tactslip_torch.onset.events import EventRules, LatencyParts, recording_events
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
-from tactslip_torch.onset.rules import Cusum, KOfN
+from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN
 from tactslip_torch.report.results import _confounder_rows, alarm_figure, alarm_table
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.simulation import CONFOUNDERS
 from tactslip_torch.training import alarm
 from tactslip_torch.training.onset import OnsetTraining
 
 RULE = {"name": "cusum", "drift": 0.5, "evidence": 0.4}
-LEARNED = OnsetTraining(penalty=1e3, scenes=("paper", "held"), cycles=1)
+LEARNED = OnsetTraining(head="quadratic", epochs=3, folds=2)
 TRAINED = [RecordingId(m, 0, s) for m in ("a", "b") for s in ("paper", "held")]
 TIMING = alarm.Timing(RATE_HZ, 20, 100, 25)
 SCENES = ("paper", "held", "taps")
@@ -48,13 +48,15 @@ def times_of(slides=(), duration_s=3.0, **stretches) -> Timeline:
 class Streams(NoiseRecordings):
     """Noise with a burst at onsets, louder in slides, with two knocks in taps; one material new."""
 
+    materials = ("a", "b", "new")
+
     is_simulated = True
 
     def __init__(self, gain_of=None, cycles=6, scenes=SCENES, **_) -> None:
         self.ids = tuple(
             RecordingId(material, cycle, scene)
             for scene in scenes
-            for material in ("a", "b", "new")
+            for material in self.materials
             for cycle in range(cycles)
         )
         self.gain_of = gain_of or (lambda recording: 1.0)
@@ -76,6 +78,18 @@ class Streams(NoiseRecordings):
         noise *= self.gain_of(recording)
 
 
+class Worlds(Streams):
+    """What is learned from: other noise, of two materials."""
+
+    materials = ("a", "b")
+
+    def __init__(self, gain_of=None, cycles=2, **_) -> None:
+        super().__init__(gain_of, cycles)
+
+    def seed(self, recording):
+        return 3 + super().seed(recording)
+
+
 def loudness_detector() -> SlipDetector:
     """One feature: the spread of the fast channel; positive above some 1.5 times that of rest."""
     pool, one = FeaturePool(SMALL_HAND), torch.ones(1).double()
@@ -90,10 +104,11 @@ def loudness_detector() -> SlipDetector:
 
 
 def stage(streams=None, **changes) -> alarm.CalibratedAlarm:
-    values = {"streams": streams or Streams(), "classifier": LEARNED, "rule": RULE, "hop_ms": 25.0}
-    values |= {"slip_free": "held", "check_hours": {"others": 10.0}}
-    values |= {"budget": {"held": 2000.0, "taps_share": 0.6}}
-    values |= {"hours": {"held": 11 / 3600, "taps": 8 / 3600}}
+    values = {"streams": streams or Streams(), "worlds": Worlds(), "classifier": LEARNED}
+    values |= {"rule": RULE, "hop_ms": 25.0, "slip_free": "held", "with_slips": "paper"}
+    values |= {"check_hours": {"others": 10.0}, "hint_per_hour": 3000.0}
+    values |= {"budget": {"confounders": 3000.0, "held": 2000.0}}
+    values |= {"hours": {"held": 11 / 3600, "paper": 8 / 3600, "others": 8 / 3600}}
     return alarm.CalibratedAlarm(**(values | changes))
 
 
@@ -105,8 +120,8 @@ def calibrated():
 
 
 # ------------------------------------------------------------------------------- who calibrates
-def test_fresh_recordings_learn_then_calibrate_then_test_and_held_out_ones_test_alone():
-    """Of 3 s each: 4 of held make up 11 s, and 3 of taps 8 s; the first cycle was trained on."""
+def test_fresh_recordings_calibrate_then_test_and_held_out_ones_test_alone():
+    """Of 3 s each: 4 of held make up 11 s, and 3 of others 8 s; the first cycle was trained on."""
     made = stage(check_hours={"others": 17 / 3600, "held": 8 / 3600})
     found = {
         role: {scene: [(r.cycle, r.material) for r in own if r.scene == scene] for scene in SCENES}
@@ -118,13 +133,12 @@ def test_fresh_recordings_learn_then_calibrate_then_test_and_held_out_ones_test_
 
     new = [(cycle, "new") for cycle in range(6)]
     test = {
-        "paper": pairs(3, 5),  # every other cycle
-        "held": pairs(4, 5)[:3],  # until 8 s are there
-        "taps": [(1, "b"), *pairs(2, 3), (4, "a")],  # until 17 s are there
+        "paper": [(2, "b"), *pairs(3, 4), (5, "a")],  # until 17 s are there
+        "held": pairs(3, 4)[:3],  # until 8 s are there
+        "taps": [(1, "b"), *pairs(2, 3), (4, "a")],
     }
     assert found == {
-        "learn": {"paper": pairs(1), "held": pairs(1), "taps": []},
-        "calibrate": {"paper": pairs(2, 4), "held": pairs(2, 3), "taps": pairs(0, 1)[:3]},
+        "calibrate": {"paper": pairs(1, 2)[:3], "held": pairs(1, 2), "taps": pairs(0, 1)[:3]},
         "test": test,
         "unseen": {"paper": new, "held": new[:3], "taps": new},
     }
@@ -133,16 +147,24 @@ def test_fresh_recordings_learn_then_calibrate_then_test_and_held_out_ones_test_
 def test_too_few_hours_are_told_and_a_scene_without_any_is_refused(caplog):
     stage().roles(loudness_detector())
     assert not caplog.text
-    stage(hours={"held": 1.0, "taps": 8 / 3600}).roles(loudness_detector())
+    of_others = {"paper": 8 / 3600, "others": 8 / 3600}
+    stage(hours={"held": 1.0, **of_others}).roles(loudness_detector())
     assert "0.01 h of held are left to calibrate on, onset.hours asks for 1: give" in caplog.text
-    few = stage(Streams(cycles=2), budget=BARE, classifier=replace(LEARNED, scenes=["paper"]))
-    with pytest.raises(ValueError, match="no recording of scene paper that was not trained on"):
+    few = stage(Streams(cycles=1), budget=BARE, hours={"held": 0.0, **of_others})
+    with pytest.raises(ValueError, match="0 h of held cannot show"):
+        few.roles(loudness_detector())
+    few = stage(
+        Streams(cycles=1), budget={**BARE}, hours={"others": 1.0, "paper": 0.0, "held": 1.0}
+    )
+    few.streams.ids = tuple(r for r in few.streams.ids if r.cycle or r.scene != "held")
+    with pytest.raises(ValueError, match="0 h of held cannot show"):
         few.roles(loudness_detector())
 
 
 BEYOND_THE_HOURS = [
     ({"held": 10.0}, r"0\.00333 h of held cannot show a rate of at most 10 .* 0\.3 h"),
-    ({"held": 2000.0, "taps_share": 0.1}, "6 knocks of taps cannot .* give at least 29 knocks"),
+    ({"held": 2000.0, "confounders": 100.0}, r"0\.0025 h of confounders cannot .* least 0\.03 h"),
+    ({"held": 2000.0, "taps": 100.0}, r"0\.0025 h of taps cannot show .* least 0\.03 h"),
 ]
 
 
@@ -157,12 +179,13 @@ def test_a_budget_that_cannot_be_shown_is_refused_before_anything_is_read(budget
 REFUSED = [
     (stage, {"hop_ms": 0.0}, "onset.hop_ms must be a positive finite number, got 0"),
     (stage, {"hop_ms": 0.3}, r"onset\.hop_ms=0\.3 is 0\.6 samples at 2000 Hz"),
-    (OnsetTraining, {"cycles": 0}, "cycles must be a positive whole number, got 0"),
+    (OnsetTraining, {"epochs": 0}, "epochs must be a positive whole number, got 0"),
+    (stage, {"hint_per_hour": 0.0}, "onset.hint_per_hour must be a positive finite number, got 0"),
     (stage, {"rule": {"name": "sum"}}, "no sequential rule is called 'sum'"),
     (stage, {"rearm_s": -1.0}, "rearm_s must be a finite number of at least 0, got -1"),
     (stage, {"slip_free": "heldd"}, "no scene 'heldd', it has held, paper, taps; take it out"),
     (stage, {"budget": BARE | {"tap": 1.0}}, "onset.streams has no scene 'tap'"),
-    (stage, {"budget": BARE | {"taps": 0.0}}, "onset.budget of taps must be positive, got 0"),
+    (stage, {"budget": BARE | {"taps": 0.0}}, "onset.budget.taps must be a positive finite number"),
     (stage, {"budget": {"taps": 1.0}}, "onset.budget must say what held may have, an hour"),
     (alarm.DebouncedAlarm, {"k": 4}, "k must lie between 1 and n"),
     (alarm.DebouncedAlarm, {"k": "a"}, "onset.k must be a positive whole number, got 'a'"),
@@ -176,13 +199,13 @@ def test_bad_settings_are_refused_in_one_line(made, changes, match):
 
 
 # --------------------------------------------------------------------------- budgets of the file
-def recounted(detector, settings, scene):
+def recounted(detector, settings, scenes):
     """False alarms and quiet hours of what calibrates, one by one, by the rules of events."""
     alarms, hours, source = 0, 0.0, Streams()
     latency = LatencyParts(detector.look_ahead / RATE_HZ, 0.05)
     roles, none = stage().roles(detector), torch.empty(0)
-    _, left_out, _ = LEARNED(source, roles["learn"], 0)
-    for recording in (one for one in roles["calibrate"] if one.scene == scene):
+    _, left_out, _ = LEARNED(Worlds(), Worlds().ids, 0)
+    for recording in (one for one in roles["calibrate"] if one.scene in scenes):
         samples = source.load(recording).samples
         scores = score_stream(detector, samples, settings.hop_samples)
         decider = Decider(settings, RATE_HZ, 100, detector.look_ahead)
@@ -190,26 +213,30 @@ def recounted(detector, settings, scene):
         made = decider.join(bins, left_out[recording.material].score_recording(samples))
         stream = alarm.Stream(recording, source.timeline(recording), none, none, none)
         found = recording_events(alarm.event_record(stream, made), EventRules(), latency)
-        alarms, hours = alarms + len(found.false_alarms_s), hours + found.quiet_s / 3600
+        alarms += len(found.false_alarms_s)
+        hours += float((made.onset_score > NOTHING_YET).sum()) * 0.005 / 3600
     return alarms, hours
 
 
-def test_the_alarm_of_the_file_keeps_every_budget_and_bins_at_most_half_of_each(calibrated):
+def test_the_alarm_of_the_file_keeps_every_budget_and_a_lower_threshold_does_not(calibrated):
     detector, _ = calibrated
     settings = AlarmSettings.of(detector)
-    bins_alone = replace(settings, onset=replace(settings.onset, threshold=math.inf))
     rows = {row["scene"]: row for row in settings.metadata["budget"]}
-    # 12 s at 2000 an hour are 6.67 alarms, and 2 show up to 6.30; of 6 knocks one shows 0.58
-    assert {scene: row["allowed"] for scene, row in rows.items()} == {"held": 2, "taps": 1}
-    # of four streams of 3 s; before the first bin of 50 ms nothing is decided
-    assert rows["held"]["amount"] == pytest.approx((12 - 4 * 0.05) / 3600)
-    assert rows["taps"]["amount"] == 6
-    for scene, row in rows.items():
-        alarms, hours = recounted(detector, settings, scene)
+    # 10.9 s at 2000 an hour are 6.1 alarms, and one shows up to 1560; 8.2 s at 3000: 6.8, two 2770
+    assert {scene: row["allowed"] for scene, row in rows.items()} == {"held": 1, "confounders": 2}
+    for scene, scenes in {"held": ("held",), "confounders": ("taps",)}.items():
+        row = rows[scene]
+        alarms, hours = recounted(detector, settings, scenes)
         assert row["alarms"] == alarms <= row["allowed"]
+        assert row["amount"] == pytest.approx(hours)
         assert row["bound"] <= row["limit"]
-        assert recounted(detector, bins_alone, scene)[0] <= row["allowed"] // 2
-    assert hours == pytest.approx(9 / 3600)
+    lower = settings.at_threshold(settings.onset.threshold - 0.5)
+    counts = {scene: recounted(detector, lower, (scene,))[0] for scene in ("held", "taps")}
+    assert counts["held"] > 1 or counts["taps"] > 2
+    assert settings.onset.hint <= settings.onset.threshold
+    hinted = settings.at_threshold(settings.onset.hint)
+    alarms, hours = recounted(detector, hinted, ("taps",))
+    assert alarms <= 3000 * hours
     told = settings.metadata["calibrated"]
     assert told["rate"]["alarms"] == rows["held"]["alarms"]
 
@@ -225,9 +252,7 @@ def test_thresholds_of_the_curve_give_its_rates(calibrated):
     assert list(rates) == sorted(set(rates), reverse=True)
     assert alarm.LEAST <= rates[-1] <= rates[0] <= alarm.MOST
     for threshold, rate in curve:
-        at = replace(settings, onset=replace(settings.onset, threshold=threshold))
-        alarms, hours = recounted(detector, at, "held")
-        hours -= 4 * 0.05 / 3600  # before the first bin of each of four streams
+        alarms, hours = recounted(detector, settings.at_threshold(threshold), ("held",))
         assert alarms / hours == pytest.approx(rate)
 
 
@@ -235,41 +260,48 @@ def test_evaluated_streams_set_nothing():
     plain, made = loudness_detector(), []
     roles = stage().roles(plain)
     evaluated = {*roles["test"], *roles["unseen"]}
-    for louder in (set(), evaluated, set(roles["calibrate"]), set(roles["learn"])):
-        source = Streams(lambda r, of=louder: 1.3 if r in of else 1.0)
+    learning = set(Worlds().ids[:2])
+    for louder in (set(), evaluated, set(roles["calibrate"])):
+        source = Streams(lambda r, of=louder: of_time if r in of else 1.0)
         stage(source)(plain, num_workers=0)
         made.append(plain.info[KEY])
-    none, of_evaluated, of_calibrating, of_learning = made
+    worlds = Worlds(lambda r: of_time if r in learning else 1.0)
+    stage(worlds=worlds)(plain, num_workers=0)
+    none, of_evaluated, of_calibrating, of_learning = *made, plain.info[KEY]
     assert of_evaluated == none
-    assert of_calibrating["threshold"] != none["threshold"] == of_learning["threshold"]
-    assert of_calibrating["onset"]["linear"] == none["onset"]["linear"]
-    assert of_learning["onset"]["linear"] != none["onset"]["linear"]
+    assert of_calibrating["onset"]["threshold"] != none["onset"]["threshold"]
+    assert of_calibrating["onset"]["head"] == none["onset"]["head"]
+    assert of_learning["onset"]["head"] != none["onset"]["head"]
 
 
 def test_slips_are_found_in_time_and_all_is_told_in_plain_json(calibrated, tmp_path):
     detector, found = calibrated
     assert json.loads(json.dumps(found, allow_nan=False)) == found
-    assert (found["rule"], found["methods"][alarm.JOINT]["onset"]) == (alarm.JOINT, True)
-    ours = found["events"]["test stream"][alarm.JOINT]
-    assert ours["num_onsets"] == ours["num_found"] + ours["num_early"] == 4
-    assert 0 < ours["delay_ms"]["median"]["value"] < 60  # a bin with its look-ahead
+    own = alarm.SLIPPING_NOW
+    assert (found["rule"], found["methods"][own]["onset"]) == (own, True)
+    ours = found["events"]["test stream"][own]
+    assert ours["num_onsets"] == 7
+    assert ours["num_found"] >= 5
+    assert 0 < ours["delay_ms"]["median"]["value"] < 200
     assert set(found["events"]["unseen stream"]) == {
-        alarm.JOINT,
+        alarm.SLIPPING_NOW,
         "cusum",
         alarm.FIRST_TRANSITION,
         "loud",
     }
     taps, streams = found["scenes"]["taps"], found["streams"]
-    assert (taps.keys(), taps["trained"]) == ({"trained", "test", "unseen"}, False)
-    assert taps["test"][alarm.JOINT]["quiet_hours"] == pytest.approx(27 / 3600)
-    assert set(streams) == {"learn", "calibrate", "test", "unseen"}
+    assert (taps.keys(), taps["trained"]) == ({"trained", "test", "unseen"}, True)
+    assert taps["test"][alarm.SLIPPING_NOW]["quiet_hours"] == pytest.approx(27 / 3600)
+    assert set(streams) == {"calibrate", "test", "unseen"}
     held = {"recordings": 4, "hours": 12 / 3600, "slips": 0}
     assert streams["calibrate"]["held"] == pytest.approx(held)
-    assert found["classifier"]["onset paper"] > 0
+    assert found["classifier"]["slips"] == 4
+    rows = {(r["role"], r["scene"], r["method"]): r for r in found["budget"]}
+    assert rows["test", "held", own]["limit"] == 2000
+    assert rows["unseen", "taps", own]["limit"] is None
     assert found["reliability"]["test stream"]["ece"] < 0.2
     assert set(found["reliability"]["test stream"]["per_material"]) == {"a", "b"}
     settings = AlarmSettings.of(detector)
-    assert settings.rule.ceiling == pytest.approx(1.5 * settings.threshold)
     detector.save(tmp_path / "detector.pt")
     read = AlarmSettings.of(SlipDetector.load(tmp_path / "detector.pt"))
     assert read.to_dict() == settings.to_dict() == found["settings"]
@@ -278,7 +310,7 @@ def test_slips_are_found_in_time_and_all_is_told_in_plain_json(calibrated, tmp_p
     metrics = {"simulated": True, "events": found["events"], "alarm": found}
     assert alarm_table(metrics).startswith("SIMULATED")
     row = next(row for row in _confounder_rows(metrics) if row["scene"] == "taps")
-    assert (row["materials"], row["trained on"]) == ("seen", False)
+    assert (row["materials"], row["trained on"]) == ("seen", True)
     alarm_figure(metrics, tmp_path / "alarm.png")
     assert_png(tmp_path / "alarm.png")
 
@@ -290,13 +322,13 @@ def test_the_papers_rule_is_left_out_where_its_hop_cannot_be():
     own = alarm.score_streams(
         made.streams, calibrate, {alarm.OURS: detector}, {alarm.OURS: 40}, onset, 0
     )
-    assert set(made.methods(own, {alarm.OURS: timing}, onset)) == {alarm.JOINT, "cusum"}
+    assert set(made.methods(own, {alarm.OURS: timing}, onset)) == {alarm.SLIPPING_NOW, "cusum"}
 
 
 # -------------------------------------------------------------------------- streams and decisions
 def onset_of() -> OnsetClassifier:
     """A machine that nobody trained."""
-    evidence = OnsetEvidence(SMALL_HAND, RATE_HZ, 10)
+    evidence = OnsetEvidence(SMALL_HAND, RATE_HZ)
     ones = torch.ones(evidence.num_columns, dtype=torch.float64)
     head = QuadraticForm(torch.zeros(0, 0).double(), ones, torch.tensor(0.0).double())
     return OnsetClassifier(evidence, FeatureScaler(-ones, ones), head, math.inf)
@@ -311,6 +343,10 @@ def stream_of(
     return alarm.Stream(recording, times_of(slides, duration_s, **times), score, valid, hops)
 
 
+of_time = torch.linspace(1.0, 1.5, round(3.0 * RATE_HZ))
+"""A gain that rises, as one that stays is no evidence."""
+
+
 def knocked(number: int) -> np.ndarray:
     """Scores of 10 s without slip, with double knocks, one to a sum without ceiling."""
     rng = np.random.default_rng(number)
@@ -321,15 +357,14 @@ def knocked(number: int) -> np.ndarray:
     return score
 
 
-def joint_streams(num=24):
-    """Double knocks in held and taps, noise of fast evidence, and slips that it finds late."""
+def scored_streams(num=24):
+    """Double knocks of bins, noise of the classifier's scores, and slips that it finds late."""
     streams, rng = [], np.random.default_rng(5)
     for number in range(num):
         scene = ("held", "taps", "paper")[number % 3]
         onset = rng.standard_normal(2000)
         told = {"onset": onset, "number": number, "scene": scene}
         if scene == "taps":
-            told["non_slip_s"] = ((1.0, 1.1),) * 5
             onset[rng.integers(0, 2000, 5)] += 3
         if scene == "paper":
             told["slides"] = [(4.0, 5.0)]
@@ -338,13 +373,13 @@ def joint_streams(num=24):
     return streams
 
 
+@pytest.mark.parametrize("onset", [True, False])
 @pytest.mark.parametrize("rule", [Cusum(1.0, 0.2), KOfN(2, 3)], ids=lambda rule: rule.name)
-def test_joint_thresholds_are_the_lowest_that_keep_every_budget(rule):
-    streams = joint_streams()
-    made = stage(
-        budget={"held": 400.0, "taps_share": 0.3, "paper": 500.0}, rearm_s=0.05, refractory_s=0.0
-    )
-    settings = made.calibrated(rule, Platt(2.0, 0.0), streams, TIMING, onset_of())
+def test_thresholds_are_the_lowest_that_keep_every_budget(rule, onset):
+    streams = scored_streams()
+    made = stage(budget={"held": 400.0, "confounders": 500.0}, rearm_s=0.05, refractory_s=0.0)
+    classifier = onset_of() if onset else None
+    settings = made.calibrated(rule, Platt(2.0, 0.0), streams, TIMING, classifier)
     latency = LatencyParts(25 / RATE_HZ, 0.05)
 
     def alarms(settings):
@@ -352,33 +387,31 @@ def test_joint_thresholds_are_the_lowest_that_keep_every_budget(rule):
         for stream in streams:
             decider = Decider(settings, RATE_HZ, 100, 25)
             bins = decider.decide(stream.score, stream.is_valid)
-            seen = alarm.event_record(stream, decider.join(bins, stream.onset_score))
-            found = recording_events(seen, EventRules(), latency)
+            seen = decider.join(bins, stream.onset_score) if onset else bins
+            found = recording_events(alarm.event_record(stream, seen), EventRules(), latency)
             counts[stream.recording.scene] += len(found.false_alarms_s)
-        return counts
+        return {"held": counts["held"], "confounders": counts["taps"]}
 
-    def is_kept(counts, share=1.0):
-        return all(counts[scene] <= int(share * most) for scene, most in allowed.items())
-
-    # 80 s at 400 an hour: 8.9, 4 show 9.15 and 3 show 7.75; 40 knocks at 0.3: 6 show 0.28, 7 0.31
-    # 80 s less the slips' windows (3.8 to 5.11 s) at 500: 9.6, and 4 show 9.15
-    allowed = {"held": 3, "taps": 6, "paper": 4}
+    # 80 s at 400 an hour: 8.9, 4 show 9.15 and 3 show 7.75; at 500: 11.1, 5 show 10.5, 6 show 11.8
+    allowed = {"held": 3, "confounders": 5}
     assert {row["scene"]: row["allowed"] for row in settings.metadata["budget"]} == allowed
     told = {row["scene"]: row["alarms"] for row in settings.metadata["budget"]}
     assert told == alarms(settings)
-    assert is_kept(told)
-    onset = settings.onset
-    assert is_kept(alarms(replace(settings, onset=replace(onset, threshold=math.inf))), share=0.5)
+    assert all(told[scene] <= most for scene, most in allowed.items())
+    if not onset:
+        assert settings.rule.ceiling in (math.inf, pytest.approx(1.5 * settings.threshold))
+        return
     values = torch.cat([stream.onset_score for stream in streams])
-    below = float(values[values < onset.threshold].max())
-    assert not is_kept(alarms(replace(settings, onset=replace(onset, threshold=below))))
-    assert onset.lead_s == pytest.approx(0.015)
+    below = float(values[values < settings.onset.threshold].max())
+    fewer = alarms(settings.at_threshold(below))
+    assert any(fewer[scene] > most for scene, most in allowed.items())
+    assert settings.onset.lead_s == pytest.approx(0.015)
 
 
 def test_a_sum_that_is_never_positive_in_quiet_does_not_stand_for_ever():
     quiet = [stream_of(np.full(194, -5.0), number=n, onset=np.zeros(400)) for n in range(2)]
     made = stage(budget={"held": 1e5})
-    settings = made.calibrated(Cusum(1.0, 0.2), Platt(2.0, 0.0), quiet, TIMING, onset_of())
+    settings = made.calibrated(Cusum(1.0, 0.2), Platt(2.0, 0.0), quiet, TIMING)
     assert settings.threshold > 0
 
 
@@ -388,7 +421,7 @@ def test_a_threshold_that_is_never_reached_is_refused():
 
 
 def test_bins_over_the_edge_of_a_slide_have_no_label():
-    kept, is_slip = alarm.labelled([stream_of(torch.arange(60.0), [(0.2, 0.4)])], TIMING)
+    kept, is_slip = alarm._labelled([stream_of(torch.arange(60.0), [(0.2, 0.4)])], TIMING)
     starts, expected = np.arange(60) * 0.01, {}
     for number, (start, end) in enumerate(zip(starts, starts + 0.05, strict=True)):
         inside = start >= 0.2 - 1e-9 and end <= 0.4 + 1e-9
@@ -416,6 +449,30 @@ def test_debounced_settings_are_kept_in_the_file_with_no_rate(tmp_path):
         ValueError, match=r"scores of recordings left out, .* several recipe\.penalties"
     ):
         alarm.DebouncedAlarm()(detector)
+
+
+def test_enough_labelled_slips_of_ones_own_get_a_classifier_and_fewer_keep_the_rule(caplog):
+    source = Worlds()
+    detector = loudness_detector()
+    detector.info["train_recordings"] = {str(recording): "" for recording in source.ids}
+    detector.info["calibration"] = Platt(2.0, -0.5).to_dict()
+    made = alarm.DebouncedAlarm(classifier=LEARNED, fewest_slips=4)
+    made(detector)
+    report = made.fit(detector, source, num_workers=0)
+    settings = AlarmSettings.of(detector)
+    assert (report["slips"], settings.target_per_hour) == (4, None)
+    assert settings.onset.threshold == report["heads"]["quadratic"]["threshold"]
+    again, _, _ = LEARNED(source, source.ids, 0)
+    assert settings.onset.to_dict()["head"] == again.to_dict()["head"]
+    few = loudness_detector()
+    few.info |= {"calibration": detector.info["calibration"]}
+    made(few)
+    assert made.fit(few, source, num_workers=0) == {}  # two of these slips were trained on
+    assert AlarmSettings.of(few).onset is None
+    assert (
+        "2 labelled slips are too few for a classifier of slipping now, which needs 4"
+        in caplog.text
+    )
 
 
 def test_a_debounced_hop_is_half_a_bin_or_so_many_milliseconds():
@@ -447,9 +504,14 @@ def test_the_experiment_has_ten_hours_to_set_the_alarm_and_all_scenes_to_check_i
         assert cache_key(whole.streams.key(recording)) != cache_key(source.key(recording))
     quiet = [r for r in roles["calibrate"] if r.scene == "held"]
     assert sum(whole.streams.timeline(r).duration_s for r in quiet) >= 36_000
-    scenes = {role: {r.scene for r in own} for role, own in roles.items()}
-    assert scenes["learn"] == set(whole.classifier.scenes)
-    assert {"taps", "machine", "mains_bursts", "dead_channel"} <= scenes["test"]
+    of_learning = {json.dumps(dict(whole.worlds.key(r)), sort_keys=True) for r in whole.worlds.ids}
+    for recording in whole.streams.ids[:300]:
+        assert json.dumps(dict(whole.streams.key(recording)), sort_keys=True) not in of_learning
+    kinds = {recording.scene for recording in whole.worlds.ids}
+    assert len(whole.worlds.ids) >= 1400
+    assert sum(recording.scene == "slip" for recording in whole.worlds.ids) >= 800
+    for own in roles.values():
+        assert {recording.scene for recording in own} == kinds == {"slip", *CONFOUNDERS}
 
 
 def test_one_alarm_for_several_detectors_is_refused_before_the_fit(tmp_path):
@@ -462,14 +524,16 @@ def test_one_alarm_for_several_detectors_is_refused_before_the_fit(tmp_path):
 def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
     replaced = {
         "streams": "{_target_: test_alarm.Streams}",
-        "budget": "{held: 2000, taps_share: 0.6}",
-        "hours": "{held: 0.003, taps: 0.002}",
+        "worlds": "{_target_: test_alarm.Worlds}",
+        "budget": "{held: 2000, confounders: 3000}",
+        "hours": "{held: 0.003, paper: 0.002, others: 0.002}",
+        "check_hours": "{others: 0.1}",
     }
     config = composed(
         *("data._target_=test_alarm.Streams", "+data.scenes=[paper]", "data.cycles=2"),
         *("split.seen=[a,b]", "split.unseen=[new]", "split.train_fraction=0.5"),
-        *("onset=alarms", "onset.classifier.scenes=[paper,held]"),
-        *("onset.classifier.cycles=1", "~onset.check_hours", "+onset.check_hours={others: 0.1}"),
+        *("onset=alarms", "onset.classifier.epochs=2", "onset.classifier.head=quadratic"),
+        *("onset.with_slips=paper", "onset.hint_per_hour=3000"),
         *(f"~onset.{key}" for key in replaced),
         *(f"+onset.{key}={value}" for key, value in replaced.items()),
         *("recipe=paper", "recipe.num_features=10", "cache=off", "num_workers=0", "export=false"),
@@ -480,6 +544,6 @@ def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
     assert metrics["alarm"]["settings"] == settings.to_dict()
     assert settings.metadata["simulated"] is True
     assert {"test", "unseen", "test stream", "unseen stream"} <= set(metrics["events"])
-    assert metrics["events"]["test stream"][alarm.JOINT]["num_onsets"] > 0
+    assert metrics["events"]["test stream"][alarm.SLIPPING_NOW]["num_onsets"] > 0
     assert "budget of false alarms, at 95 % confidence: held 2000 " in capsys.readouterr().out
     assert {"alarm.png", "events.png"} <= {path.name for path in tmp_path.iterdir()}

@@ -1,4 +1,4 @@
-"""Baselines: simple statistics out of pool features, what each learns, and what is kept of them."""
+"""Baselines: what each learns, and what is kept of them."""
 
 import itertools
 import json
@@ -14,13 +14,7 @@ from test_learner import learn, unseen_c
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.hand import HandLayout
-from tactslip_torch.training.baselines import (
-    Baselines,
-    PooledNumber,
-    SimpleStatistics,
-    best_threshold,
-)
+from tactslip_torch.training.baselines import Baselines, PooledNumber, best_threshold
 from tactslip_torch.training.bins import BinSample, RecordingBins
 from tactslip_torch.training.evaluation import Outcomes, compared
 
@@ -49,25 +43,6 @@ def sampled(num=160):
         bins, is_slip = bins_of(num, seed)
         sample.update(RecordingBins(f"{group}/0", group, pool(bins).float(), is_slip))
     return pool, sample.bins()
-
-
-# ------------------------------------------------------------------------------- simple statistics
-@pytest.mark.parametrize(("wavelet", "num"), [("rbio2.2", 100), ("db4", 128), ("haar", 64)])
-def test_simple_statistics_are_those_of_the_bin(wavelet, num, rng):
-    """Of all sizes, on offsets, and of constant bins, slow and fast channels in any order."""
-    rows = HAND.to_rows()
-    hand = HandLayout.from_rows([rows[2], rows[0], rows[3], rows[1]])
-    size = 10 ** rng.uniform(-4, 2, (12, 4, 1))
-    bins = size * (rng.standard_normal((12, 4, num)) + rng.uniform(-2, 2, (12, 4, 1)))
-    bins[3], bins[4], bins[5, 2] = 0.0, 0.25, -3.0
-    pool = FeaturePool(hand, bin_samples=num, wavelet=wavelet)
-    found = SimpleStatistics(pool)(pool(torch.from_numpy(bins)))
-    x = bins[:, [*hand.slow, *hand.fast]]
-    wanted = [x.mean(-1), x.std(-1, ddof=1), np.sqrt((x**2).mean(-1))]
-    largest = np.abs(x).max(-1)
-    for part, expected in zip(found.split(4, 1), wanted, strict=True):
-        error = np.abs(part.numpy() - expected)
-        assert (error <= 1e-6 * np.abs(expected) + 1e-12 * largest).all()
 
 
 def test_the_pooled_number_is_the_best_of_all_means_and_deviations():

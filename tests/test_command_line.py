@@ -47,7 +47,7 @@ MISTAKES = {
     "train recipe=papr": "papr paper,",
     "train data=mine --config-dir recordings": "mine authors_raw",
     "train --config-dir nowhere": "nowhere",
-    "train --config-dir own +exp=odd": "recipe us use?",  # in its file
+    "train --config-dir own +exp=odd": "recipe view views?",  # in its file
     "train scene.friction_noise_mv=4": "+scene.friction_noise_mv=VALUE",
     "train +scene.frction_noise_mv=4": "friction_noise_mv?",
     "train +trainer.limit_train_batchs=2": "trainer limit_train_batches?",
@@ -106,7 +106,7 @@ def in_a_folder():
             (place / name).mkdir(parents=True)
         (place / "recordings" / "cup1.csv").write_text("t,SG1\n0,1\n")
         (place / "own" / "data" / "mine.yaml").write_text("_target_: mine.Recordings\n")
-        (place / "own" / "exp" / "odd.yaml").write_text("# @package _global_\nrecipe: {us: 3}\n")
+        (place / "own" / "exp" / "odd.yaml").write_text("# @package _global_\nrecipe: {view: 3}\n")
         (place / "notes.txt").write_text("no detector")
         shutil.copy(ROOT / "tactslip_torch/pretrained/paper24-sim.pt", place / "detector.pt")
         yield place
@@ -135,7 +135,7 @@ def test_a_mistake_is_answered_in_one_line(line):
 TEXTS = [
     ("train split.seen=M1", "split.seen", ["M1"]),
     ("train data=files data.root=x data.materials=cup", "data.materials", ["cup"]),
-    ("train recipe.use=pooled", "recipe.use", "pooled"),  # a text, or a list to choose from
+    ("train recipe.views=pooled", "recipe.views", ["pooled"]),
 ]
 
 

@@ -75,7 +75,7 @@ TINY_DATA = (
 TINY_SPLIT = ("split.seen=[A,B]", "split.unseen=[C]", "split.train_fraction=0.5")
 
 TINY_FIT = (
-    *("recipe.num_features=10", "recipe.penalties=[0.1,1.0]"),
+    *("recipe.num_features=10", "recipe.penalties=[0.3,3.0]"),
     *("num_workers=0", "export=false"),
 )
 TINY = (*TINY_DATA, *TINY_SPLIT, *TINY_FIT)
@@ -235,8 +235,7 @@ def test_that_no_alarm_will_be_set_is_told_before_the_fit(
 def test_every_experiment_runs_on_few_recordings(name, tmp_path, tmp_path_factory):
     cache = tmp_path_factory.getbasetemp() / "features"  # made by the first experiment of a kind
     overrides = f"+exp={name}", "num_workers=0", f"cache={cache}", "export=false", "baselines=false"
-    fit = ("recipe.use=pooled", "recipe.num_features=null", "recipe.degree=1")
-    fit += ("recipe.penalties=[0.01,0.1]", "recipe.sample_bins=20")
+    fit = ("recipe.views=[pooled]", "recipe.penalties=[1.0,10.0]", "recipe.sample_bins=20")
     told = ["data.materials=[M1,M6,iron]", "data.cycles=2", "split.train_fraction=0.5"]
     if name == "biotacsp_dos":
         told = write_biotac(tmp_path / "biotac")

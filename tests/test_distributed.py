@@ -17,7 +17,6 @@ from tactslip_torch import SlipDetector
 from tactslip_torch.__main__ import main
 
 pytestmark = pytest.mark.slow
-BINS = ("recipe.num_features=40",)  # 861 monomials: fewer bins, so bins are kept
 
 
 def together(num, *words):
@@ -53,8 +52,8 @@ def cache(tmp_path_factory):
 
 def test_processes_that_lightning_starts_learn_what_one_does(cache, tmp_path):
     alone, ddp = tmp_path / "alone", tmp_path / "ddp"
-    run_train(alone, *TINY, *BINS, cache)
-    words = *TINY, *BINS, cache, f"hydra.run.dir={ddp}", "trainer.strategy=ddp"
+    run_train(alone, *TINY, cache)
+    words = *TINY, cache, f"hydra.run.dir={ddp}", "trainer.strategy=ddp"
     command = [sys.executable, "-m", "tactslip_torch", "train", *words, "trainer.devices=2"]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "OMP_NUM_THREADS": "1"}
     options = {"cwd": tmp_path, "env": environment, "timeout": 300}

@@ -79,7 +79,7 @@ def test_pipelines_grids_and_groups_left_out(data: Any) -> None:
     with sklearn.config_context(enable_metadata_routing=True):
         routed = clone(classifier).set_fit_request(groups=True)
         assert cross_val_score(routed, X, y, params={"groups": groups}, cv=logo).mean() > 0.9
-    quick = classifier.set_params(penalties=0.1, degree=1, num_features=None)
+    quick = classifier.set_params(penalties=1.0)
     choices = {"features__frames": [{}, {"SG": 25}]}
     best = GridSearchCV(quick, choices, cv=logo).fit(X, y, groups=groups).best_estimator_
     assert best.detector_.channel_filter.context in (0, 12)
@@ -197,7 +197,7 @@ def loud_windows(num: int) -> tuple[Array, Array]:
     return X, is_slip
 
 
-QUICK: dict[str, Any] = {"num_features": None, "degree": 1, "penalties": 0.1}
+QUICK: dict[str, Any] = {"views": "pooled", "penalties": 1.0}
 SAY: list[tuple[Any, Any, int]] = [
     ("Slip", "non-slip", 0),
     ("no slip", "slipping", 1),
@@ -214,7 +214,7 @@ def test_slip_is_the_label_that_says_so_or_that_is_given(labels: tuple[Any, ...]
     X, is_second = loud_windows(40)
     y = np.array([first, second])[is_second]
     model = SlipClassifier(features=TactileFeatures(RATE_HZ))
-    model.set_params(features__use="pooled", **QUICK)
+    model.set_params(**QUICK)
     if place:
         assert model.fit(X, y).slip_label_ == labels[place[0]]
     else:
@@ -235,9 +235,7 @@ GROUPS = {
 @pytest.mark.parametrize("kind", GROUPS)
 def test_groups_are_put_together_until_both_labels_are_left_out(kind: str) -> None:
     (groups, num), (X, y) = GROUPS[kind], loud_windows(80)
-    model = SlipClassifier(
-        features=TactileFeatures(RATE_HZ, use="pooled"), num_features=None, degree=1
-    )
+    model = SlipClassifier(RATE_HZ, views="pooled")
     rows = model.fit(X, y, groups).validation_
     assert len({name for row in rows for name in row["balanced_accuracy"]}) == num
     assert model.score(X, y) > 0.8

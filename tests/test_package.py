@@ -49,7 +49,7 @@ def test_a_repr_says_what_it_is_in_a_line(general: Trained) -> None:
     shown = [
         (detector, "4 channels, bins of 100 samples at 2000 Hz"),
         (detector, "trained on real recordings, has an alarm"),
-        (detector.pool, "506 features of 4 channels"),
+        (detector.pool, "520 features of 4 channels"),
         (detector.pool.hand, "4 channels: 2 SG (slow), 2 PVDF (fast)"),
         (AlarmSettings.of(detector), "a decision every"),
         (stream, "0.200 s of 4 channels so far, look-ahead 12.5 ms"),

@@ -55,7 +55,7 @@ def test_dead_channels_are_left_out_of_their_pools(detector):
 def test_an_order_statistic_and_both_kinds_of_column_are_exported(tmp_path):
     folder = tmp_path / "both"
     run_train(
-        folder, *TINY[:-1], "recipe.use=both", "recipe.num_features=25", "recipe.degree=2",
+        folder, *TINY[:-1], "recipe.views=[channel,pooled]", "recipe.tolerance=0.9",
         "features.pooling=[mean,std,min,max,median]", "data.cycles=8", "cache=off",
     )  # fmt: skip
     made = SlipDetector.load(folder / "detector.pt")

@@ -4,19 +4,21 @@ import re
 from dataclasses import replace
 
 import numpy as np
+import oracles
 import pytest
 import torch
 from scipy.stats import ttest_ind
 from small_set import SMALL_HAND, refitted_scores
 
-from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pool import FeaturePool, is_simple_of
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
-from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.training import recipe as recipes
+from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.training.bins import BinSample, RecordingBins
-from tactslip_torch.training.choice import CandidateBins, balanced_accuracy, group_scores
-from tactslip_torch.training.recipe import FREE_CONSTANT, General, Paper
+from tactslip_torch.training.choice import balanced_accuracy
+from tactslip_torch.training.columns import VIEWS
+from tactslip_torch.training.recipe import General, Paper
+from tactslip_torch.training.views import ViewBins
 
 WHOLE_POOL = FeaturePool(SMALL_HAND)
 POOL = WHOLE_POOL.paper()
@@ -131,10 +133,32 @@ def test_features_that_the_paper_lacks_are_not_selected(recipe):
     assert not allowed[~WHOLE_POOL.is_paper].any()
 
 
+def test_each_view_may_use_its_own_features_and_training_reads_them_all():
+    """Without the simple view and baselines none but the paper's are read; ranges always are."""
+    recipe = General(feature_filter={"kind": "SG"})
+    masks = recipe.allowed_by_view(WHOLE_POOL)
+    assert list(masks) == list(VIEWS)
+    for view, mask in masks.items():
+        names = [name for name, is_in in zip(WHOLE_POOL.names, mask, strict=True) if is_in]
+        assert {name.channel for name in names} == {"SG1"}
+        assert all(name.is_simple for name in names) == (view == "simple")
+    for views, with_baselines in ((VIEWS, False), ("pooled", True)):
+        wanted = General(views=views).wanted(WHOLE_POOL, with_baselines)
+        assert wanted[is_simple_of(WHOLE_POOL)].all()
+    few = General(views="pooled", descriptors=["std"])
+    wanted = few.wanted(WHOLE_POOL, with_baselines=False)
+    names = [name for name, is_in in zip(WHOLE_POOL.names, wanted, strict=True) if is_in]
+    assert {name.descriptor for name in names} == {"std", "range"}
+    assert WHOLE_POOL.is_paper[wanted].all()
+    only_spectra = General(feature_filter={"domain": "freq"})
+    with pytest.raises(ValueError, match=r"the view 'simple' of recipe.views has no feature"):
+        only_spectra.allowed_by_view(WHOLE_POOL)
+
+
 # Both --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("recipe", [Paper(**FEW), General(**FEW, use="channel", degree=2)])
+@pytest.mark.parametrize("recipe", [Paper(**FEW), General(**FEW, views="channel")])
 def test_a_fit_is_refused_without_both_classes_and_unvalidated_with_one_group(recipe, rng, caplog):
     bins = random_bins(rng)
     with pytest.raises(ValueError, match="no non-slip bin"):
@@ -145,16 +169,15 @@ def test_a_fit_is_refused_without_both_classes_and_unvalidated_with_one_group(re
             recipe.fit(apart, POOL)
     else:
         assert recipe.fit(apart, POOL).validation == []
-        assert "needs two groups with slip and non-slip, got 0 of" in caplog.text
+        assert "needs two groups with every class, got 3 of a, b, c" in caplog.text
     fit = recipe.fit([replace(of, group="a") for of in bins], POOL)
     assert (fit.penalty, fit.validation, fit.calibration) == (3.0, [], None)
     assert re.search("unvalidated|got 1 of a", caplog.text)
 
 
-@pytest.mark.parametrize("recipe", [Paper(**FEW), General(**FEW, use="channel", degree=1)])
-def test_lost_columns_get_the_mean_of_the_two_class_means(recipe, rng):
+def test_lost_columns_get_the_mean_of_the_two_class_means(rng):
     bins = random_bins(rng, share=0.2)
-    fit = recipe.fit(bins, POOL)
+    fit = Paper(**FEW).fit(bins, POOL)
     features, is_slip = together(bins)
     z = fit.selection(features)
     expected = (z[is_slip].mean(0) + z[~is_slip].mean(0)) / 2
@@ -171,11 +194,13 @@ BAD = [
     (Paper, {"degree": 3}, "degree of the kernel must be 1 or 2, got 3"),
     (Paper, {"feature_filter": {"kinds": "SG"}}, "recipe.feature_filter: unknown 'kinds'"),
     (Paper, {"feature_filter": "SG"}, r"recipe.feature_filter must be like .*, got 'SG'"),
-    (General, {"use": "all"}, r"recipe.use must be one of .*, got 'all'"),
+    (General, {"views": ("pooled", "all")}, r"recipe.views must be one of .*, got 'all'"),
+    (General, {"views": ()}, "recipe.views must be some of simple, channel, pooled, got none"),
+    (General, {"threshold": "most"}, r"recipe.threshold must be one of .*, got 'most'"),
+    (General, {"penalties": float("inf")}, "recipe.penalties must be finite"),
     (General, {"pooling": None}, "needs statistics over channels"),
     (General, {"tolerance": 1.0}, r"recipe.tolerance must lie in \[0, 1\), got 1.0"),
     (General, {"num_features": 0}, "recipe.num_features"),
-    (General, {"degree": 0}, "degree of the kernel must be 1 or 2, got 0"),
     (General, {"scene_weights": {"taps": 0.0}}, "recipe.scene_weights"),
     (General, {"min_alive": 0}, "recipe.min_alive"),
 ]
@@ -204,6 +229,22 @@ def test_what_no_feature_has_is_refused_before_any_work(change, message):
 # The general recipe ------------------------------------------------------------------------------
 
 
+def standardised(z, weights):
+    """Columns of mean 0 and of one size, so that the kernel of degree 1 is 1 in the mean."""
+    share = weights / weights.sum()
+    away = z - share @ z
+    spread = (share @ away.square()).sqrt()
+    u = torch.where(spread > 1e-9, away / spread, 0.0)
+    return u / (share @ u.square().sum(1)).sqrt()
+
+
+def machine(u, is_slip, weights, new, penalty):
+    """Scores of new bins by NumPy's ridge machine."""
+    given = u.numpy(), is_slip.long().numpy(), weights.numpy()
+    slopes, intercept = oracles.class_ridge(*given, 1 / penalty, np.array([[-1.0], [1.0]]))
+    return torch.from_numpy(new.numpy() @ slopes + intercept)[:, 0]
+
+
 def moving_slip(rng, groups=("M1", "M2", "M3", "M4"), num=30):
     """Slip is a louder channel, another one in each group, and groups differ in gain."""
     bins = []
@@ -216,7 +257,7 @@ def moving_slip(rng, groups=("M1", "M2", "M3", "M4"), num=30):
     return bins
 
 
-ALL = General(pooling=["mean", "std"], num_features=[None, 10], penalties=[0.001, 0.1])
+ALL = General(pooling=["mean", "std"], penalties=[0.1, 10.0])
 
 
 @pytest.fixture(scope="module")
@@ -225,142 +266,79 @@ def moved():
     return bins, ALL.fit(bins, FAST_POOL)
 
 
-def test_pooled_features_win_where_another_channel_slips_in_each_group(moved):
+def test_the_pooled_view_wins_where_another_channel_slips_in_each_group(moved):
     bins, fit = moved
-    (row,) = (row for row in fit.validation if row.get("chosen"))
-    assert row["use"] == "pooled"
-    assert row["mean"] >= max(row["mean"] for row in fit.validation) - ALL.tolerance
-    of_channels = max(row["mean"] for row in fit.validation if row["use"] == "channel")
-    assert of_channels < row["mean"] - 0.05
+    views = fit.metadata["views"]
+    assert list(views) == list(VIEWS)
+    assert views["pooled"] > 0.9
+    assert fit.metadata["penalty"] == fit.metadata["penalties"]["pooled"]
+    means = {view: [r["mean"] for r in fit.validation if r["view"] == view] for view in VIEWS}
+    assert max(means["channel"]) < max(means["pooled"]) - 0.05
+    assert fit.metadata["validated"] > 0.95
     assert fit.nested["mean"] > 0.95
+    row = next(row for row in fit.validation if row.get("chosen"))
     assert set(row["balanced_accuracy"]) == {of.group for of in bins}
 
 
-def test_of_ties_the_simplest_with_the_strongest_penalty_is_taken(moved):
-    fit = replace(ALL, tolerance=0.99).fit(moved[0], FAST_POOL)
-    assert (fit.kernel.degree, fit.kernel.offset) == (1, FREE_CONSTANT)
-    assert all(name.is_pooled for name in fit.selection.pooling.names)
-    assert fit.penalty == min(row["penalty"] for row in fit.validation)
-
-
-def test_a_grid_that_ends_at_its_edge_is_extended_and_logged(moved, caplog):
-    few = replace(ALL, use="pooled", num_features=None, degree=1, tolerance=0.2)
-    with caplog.at_level("INFO"):
-        fit = few.fit(moved[0], FAST_POOL)
-    assert "extended by 0.0001" in caplog.text
-    assert min(row["penalty"] for row in fit.validation) < 0.001
-
-
-@pytest.mark.parametrize(("degree", "wanted"), [([1, 2], {1}), (2, {2})])
-def test_of_many_bins_degree_2_is_no_candidate_unless_it_is_the_only_one(
-    moved, monkeypatch, degree, wanted
-):
-    for name in ("MOST_DUAL_BINS", "MOST_SQUARE_BINS"):
-        monkeypatch.setattr(recipes, name, 10)
-    recipe = replace(ALL, degree=degree, num_features=10, penalties=0.1)
-    rows = recipe.fit(moved[0], FAST_POOL, is_nested=False).validation
-    assert {row["kernel"]["degree"] for row in rows} == wanted
-
-
-SINGLE = [
-    {"use": "channel", "num_features": None, "degree": 1},
-    {"use": "pooled", "num_features": None, "degree": 1},
-    {"use": "both", "num_features": 10, "degree": 2},
-]
-
-
-@pytest.mark.parametrize("structure", SINGLE, ids=str)
-@pytest.mark.parametrize("louder", [1.0, 1000.0])
-def test_compression_scaler_and_pooling_of_a_fold_are_learned_without_the_left_out_group(
-    structure, louder, rng
-):
-    """Its score is that of the machine that is fitted to the other groups alone."""
+@pytest.mark.parametrize("view", ["simple", "pooled"])
+def test_compression_scaler_and_pooling_do_not_move_with_labels(view, rng):
+    """All that is learned of a group that is left out has no labels in it."""
     bins = moving_slip(rng)
-    bins[1] = replace(bins[1], features=louder * bins[1].features)
-    recipe = replace(ALL, **structure, penalties=0.1, drop_channels=0.0)
-    (row,) = recipe.fit(bins, FAST_POOL, is_nested=False).validation
-    for out in bins:
-        others = [of for of in bins if of is not out]
-        expected = accuracy(recipe.fit(others, FAST_POOL, is_nested=False), [out])
-        assert row["balanced_accuracy"][out.group] == pytest.approx(expected, abs=1e-9)
+    one = replace(ALL, views=view, penalties=1.0)
+    other = [replace(of, is_slip=of.is_slip[rng.permutation(len(of.is_slip))]) for of in bins]
+    fits = [one.fit(some, FAST_POOL) for some in (bins, other)]
+    torch.testing.assert_close(*(fit.selection(bins[0].features) for fit in fits))
+    assert not torch.allclose(*(fit.head.linear for fit in fits))
 
 
 def test_of_many_groups_several_are_left_out_together_and_train_nothing(rng):
+    """A group's score is that of the machine of the others, by the sums of all of their bins."""
     bins = moving_slip(rng, [f"M{number:02}" for number in range(13)])
-    recipe = replace(
-        ALL, use="pooled", num_features=None, degree=1, penalties=0.1, drop_channels=0.0
-    )
-    (row,) = recipe.fit(bins, FAST_POOL, is_nested=False).validation
+    recipe = replace(ALL, views="pooled", penalties=0.1, drop_channels=0.0, threshold="zero")
+    fit = recipe.fit(bins, FAST_POOL)
+    (row,) = fit.validation
     sample = BinSample(recipe.sample_bins)
     for of in bins:
         sample.update(of)
     whole, joined = sample.bins(), sample.bins().joined()
     assert list(row["balanced_accuracy"]) == list(joined.group_names)
-    left_out = []
+    features, is_slip = together(bins)
+    ones, left_out = torch.ones(len(is_slip), dtype=torch.float64), []
+    u = standardised(fit.selection(features), ones)
     for place, name in enumerate(joined.group_names):
         groups = {whole.group_names[group] for group in whole.group[joined.group == place]}
         left_out += groups
-        inside, others = ([of for of in bins if (of.group in groups) == is_in] for is_in in (1, 0))
-        expected = accuracy(recipe.fit(others, FAST_POOL, is_nested=False), inside)
+        inside = torch.tensor([of.group in groups for of in bins for _ in of.is_slip])
+        score = machine(u[~inside], is_slip[~inside], ones[~inside], u[inside], penalty=0.1)
+        expected = balanced_accuracy(score >= 0, is_slip[inside])
         assert row["balanced_accuracy"][name] == pytest.approx(expected, abs=1e-9)
     assert sorted(left_out) == sorted({of.group for of in bins})
-
-
-@pytest.mark.parametrize("seed", [0, 4])  # draws by which the choices differ, and their scores
-def test_the_nested_score_of_a_group_is_of_the_choice_made_without_it(seed):
-    """Not of the overall choice, which has seen the group."""
-    bins = random_bins(np.random.default_rng(seed), "abcde", cycles=1, num=60, effect=0.5)
-    recipe = General(
-        use="channel", num_features=[1, 2, 4, 8, 16, 32], degree=1, penalties=0.1, tolerance=0.0,
-        drop_channels=0.0, pooling=None, descriptors=None,
-    )  # fmt: skip
-    fit = recipe.fit(bins, POOL)
-    (overall,) = (row["balanced_accuracy"] for row in fit.validation if row.get("chosen"))
-    for out in bins:
-        other = recipe.fit([of for of in bins if of is not out], POOL, is_nested=False)
-        found = fit.nested["balanced_accuracy"][out.group]
-        assert found == pytest.approx(accuracy(other, [out]), abs=1e-9)
-    assert fit.nested["balanced_accuracy"] != overall  # else the overall choice would do as well
 
 
 def test_one_group_of_both_classes_cannot_be_left_out(rng, caplog):
     bins = moving_slip(rng, ("M1", "M2"))
     bins[1] = replace(bins[1], is_slip=bins[1].is_slip & False)
-    assert ALL.fit(bins, FAST_POOL).validation == []
-    assert "needs two groups with slip and non-slip, got 1 of M1, M2" in caplog.text
-
-
-def test_scores_of_features_count_how_effect_and_level_move_between_groups(rng):
-    """``|mean effect| / sqrt(variance within + of the effect + of the level)``."""
-    level, effect = rng.uniform(0, 9, (3, 5)), rng.uniform(0, 3, (3, 5))
-    level[:, 0] = effect[:, 1] = 1.0
-    is_slip, groups = np.arange(60) % 2 == 0, np.arange(60) // 20
-    x = rng.standard_normal((60, 5)) + level[groups] + effect[groups] * is_slip[:, None]
-    slips = np.stack([x[is_slip & (groups == g)].mean(0) for g in range(3)])
-    quiets = np.stack([x[~is_slip & (groups == g)].mean(0) for g in range(3)])
-    within = [x[(is_slip == s) & (groups == g)].var(0) for s in (0, 1) for g in range(3)]
-    moves = (slips - quiets).var(0, ddof=1) + ((slips + quiets) / 2).var(0, ddof=1)
-    wanted = np.abs((slips - quiets).mean(0)) / np.sqrt(np.mean(within, 0) + moves)
-    found = group_scores(*map(torch.from_numpy, (x, is_slip, groups)))
-    np.testing.assert_allclose(found.numpy(), wanted, rtol=1e-9)
+    fit = ALL.fit(bins, FAST_POOL)
+    assert fit.validation == []
+    assert fit.metadata["validated"] is None
+    assert "needs two groups with every class, got 2 of M1, M2" in caplog.text
 
 
 def test_thinned_strata_keep_the_weight_of_all_their_bins(rng):
-    """One of 300 bins is fitted to 100 of three times the weight; one of 50 keeps all."""
-    sample = BinSample(1000)
-    for group, num in {"a": 600, "b": 100}.items():
-        is_slip = torch.arange(num) % 2 == 0
-        features = torch.from_numpy(rng.standard_normal((num, len(POOL.names)))).float()
-        sample.update(RecordingBins(group, group, features, is_slip))
-    drawn = sample.bins()
-    bins = CandidateBins(drawn, drawn.weight, POOL, torch.ones(len(POOL.names)) > 0)
-    thinned = bins.thinned()
-    for stratum, num_kept in zip(drawn.stratum.unique(), (100, 100, 50, 50), strict=True):
-        mine = drawn.stratum == stratum
-        kept = mine & thinned.is_kept
+    """Of 300 bins about 100 are kept of three times the weight; where there are 50, all."""
+    groups = torch.cat([torch.zeros(600), torch.ones(100)]).long()
+    labels = torch.arange(700) % 2
+    features = torch.from_numpy(rng.standard_normal((700, 2)))
+    weights = torch.from_numpy(rng.uniform(0.5, 1.5, 700))
+    bins = ViewBins(features, labels, groups, ("a", "b"), weights, 2 * groups + labels)
+    places, thinned = bins.thinned(300)
+    assert places.tolist() == sorted(set(places.tolist()))
+    for stratum, num_kept in enumerate((100, 100, 50, 50)):
+        kept = bins.stratum[places] == stratum
         assert int(kept.sum()) == num_kept
-        assert float(thinned.weights[kept].sum()) == pytest.approx(float(mine.sum()))
-    assert bool(bins.is_kept.all())  # others are as they were
+        factor = 300 / num_kept if stratum < 2 else 1.0
+        torch.testing.assert_close(thinned[kept], factor * weights[places[kept]])
+    assert bins.thinned(700)[0].tolist() == list(range(700))
 
 
 def test_scenes_have_the_weight_that_is_asked_for(rng):
@@ -389,21 +367,22 @@ def test_scenes_and_classes_weigh_in_the_solve_as_in_the_choice(rng):
     bins = moving_slip(rng, ("M1", "M2"))
     bins += [replace(of, name=f"{of.name} arm", scene="arm_motion") for of in bins]
     recipe = replace(
-        ALL, use="pooled", num_features=None, degree=1, penalties=0.1, drop_channels=0.0,
+        ALL, views="pooled", penalties=0.1, drop_channels=0.0, threshold="zero",
         scene_weights={"arm_motion": 0.25},
     )  # fmt: skip
     fit = recipe.fit(bins, FAST_POOL)
     features, is_slip = together(bins)
     is_arm = torch.tensor([of.scene == "arm_motion" for of in bins for _ in of.is_slip])
     z, weights = fit.selection(features), torch.where(is_arm, 0.25, 1.0).double()
-    expected = fit_machine(TrainingBins(z, is_slip, weights), 0.1, fit.kernel)(z)
+    u = standardised(z, weights)
+    expected = machine(u, is_slip, weights, u, penalty=0.1)
     torch.testing.assert_close(fit.head(z), expected, rtol=1e-6, atol=1e-8)
 
 
 def test_second_copies_lack_up_to_a_part_of_the_channels(rng):
     """They make another machine, and set how many channels must be alive."""
     bins = moving_slip(rng)
-    single = replace(ALL, use="pooled", num_features=None, degree=1, penalties=0.1)
+    single = replace(ALL, views="pooled", penalties=0.1)
     with_copies = single.fit(bins, FAST_POOL)
     without = replace(single, drop_channels=0.0).fit(bins, FAST_POOL)
     assert not torch.equal(with_copies.head.linear, without.head.linear)

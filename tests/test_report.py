@@ -112,6 +112,21 @@ CHOICES = [
 ]
 
 
+def of_view(view, weight, penalty, is_chosen=False, **scores):
+    """A row of a view; one with no group of both classes has no scores by group."""
+    row = choice(40, penalty, **scores or {"M1": 0.75})
+    row |= {} if scores else {"balanced_accuracy": {}}
+    return row | {"view": view, "weight": weight} | ({"chosen": True} if is_chosen else {})
+
+
+VIEW_CHOICES = [
+    of_view("simple", 0.7, 0.1, True, M1=0.9, M2=0.7),
+    of_view("simple", 0.7, 1.0, M1=0.9, M2=0.72),
+    of_view("channel", 0.0, 0.1),
+    of_view("pooled", 0.3, 1.0, True, M1=0.85, M2=0.65),
+]
+
+
 # Tables ----------------------------------------------------------------------------------------
 
 
@@ -172,9 +187,9 @@ FOREST, REGRESSION = "random_forest_simple", "logistic_regression"
     [
         (
             {FOREST: (0.012, 0.06), REGRESSION: (-0.02, 0.2)},  # better, but not surely
-            "random forest on mean, std, rms is ahead of the detector on unseen recordings: 94.1 "
-            "against 90.5 % balanced (difference 1.2 to 6.0 points, 95 % interval over 11 objects)"
-            "; try ",
+            "random forest on simple statistics is ahead of the detector on unseen recordings: "
+            "94.1 against 90.5 % balanced (difference 1.2 to 6.0 points, 95 % interval over 11 "
+            "objects); try ",
         ),
         ({FOREST: (-0.06, 0.01), REGRESSION: (-0.2, -0.1)}, "no baseline is ahead on unseen"),
         ({FOREST: (-0.06, -0.02)}, "the detector is ahead of every baseline on unseen"),
@@ -193,6 +208,32 @@ def test_of_one_recording_no_baseline_is_ahead(capsys):
     line = printed_comparison(capsys, comparison)
     assert line.startswith("no baseline is ahead")
     assert "too few for an interval" in line
+
+
+def test_choices_show_what_each_view_was_given_and_what_would_have_been_best(capsys):
+    """A dropped view has its best penalty and no star."""
+    nested = {"mean": 0.8125, "balanced_accuracy": {"M1": 0.875, "M2": 0.75}}
+    metrics = metrics_of(validation=VIEW_CHOICES, nested_validation=nested)
+    results.print_results(metrics, features())
+    lines = capsys.readouterr().out.splitlines()
+    start = next(i for i, line in enumerate(lines) if line.split()[:2] == ["chosen", "view"])
+    rows = [line.split() for line in lines[start + 1 : start + 5]]
+    assert rows[0] == ["*", "simple", "0.70", "40", "2", "0.1", "80.00", "70.00", "M2"]
+    assert rows[1] == ["simple", "0.70", "40", "2", "1", "81.00", "72.00", "M2"]
+    assert rows[2] == ["channel", "0.00", "40", "2", "0.1", "75.00", "-", "-"]
+    assert rows[3] == ["*", "pooled", "0.30", "40", "2", "1", "75.00", "65.00", "M2"]
+    (line,) = [line for line in lines if "decided without each group" in line]
+    assert line.endswith(": 81.25 % (M1 87.50, M2 75.00)")
+
+
+def test_the_figure_of_choices_has_a_line_a_view_and_a_star_for_each_that_is_kept(drawn, tmp_path):
+    results.validation_figure(metrics_of(validation=VIEW_CHOICES), tmp_path / "validation.png")
+    *of_views, stars = drawn[0].axes[0].get_lines()
+    labels = [line.get_label() for line in of_views]
+    assert [label.split(",")[0] for label in labels] == ["simple", "channel", "pooled"]
+    assert ["dropped" in label for label in labels] == [False, True, False]
+    assert of_views[0].get_xydata().tolist() == pytest.approx(np.array([[0.1, 80], [1, 81]]))
+    assert stars.get_xydata().tolist() == pytest.approx(np.array([[0.1, 80], [1, 75]]))
 
 
 def test_reliability_has_a_row_for_each_role():
@@ -284,6 +325,7 @@ FIGURES = [
     (results.confusion_figure, {}),
     (results.confusion_figure, {"splits": ABSENT}),
     (results.validation_figure, {"validation": CHOICES}),
+    (results.validation_figure, {"validation": VIEW_CHOICES}),
     (results.reliability_figure, {"alarm": {"reliability": BY_ROLE}}),
     (results.events_figure, {"events": EVENTS}),
     (features_of, {}),
@@ -463,6 +505,21 @@ def test_words_stay_in_the_figure_and_apart_for_any_hand(drawn, tmp_path, rng, n
             labels.sort(key=lambda box: box.y0)
             for low, high in itertools.pairwise(labels):
                 assert low.y1 < high.y0 + 1
+
+
+def of_view(view, weight, penalty, is_chosen=False, **scores):
+    """A row of a view; one with no group of both classes has no scores by group."""
+    row = choice(40, penalty, **scores or {"M1": 0.75})
+    row |= {} if scores else {"balanced_accuracy": {}}
+    return row | {"view": view, "weight": weight} | ({"chosen": True} if is_chosen else {})
+
+
+VIEW_CHOICES = [
+    of_view("simple", 0.7, 0.1, True, M1=0.9, M2=0.7),
+    of_view("simple", 0.7, 1.0, M1=0.9, M2=0.72),
+    of_view("channel", 0.0, 0.1),
+    of_view("pooled", 0.3, 1.0, True, M1=0.85, M2=0.65),
+]
 
 
 # Tables ----------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import beta, chi2
+from scipy.stats import chi2
 
 from tactslip_torch.onset import rules
 from tactslip_torch.onset.rules import (
@@ -166,21 +166,17 @@ def test_what_is_no_number_moves_nothing_but_the_time_since_an_alarm() -> None:
 
 
 @pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
-def test_bounds_are_those_of_garwood_and_of_clopper_and_pearson(confidence: float) -> None:
-    rate, share = Budget("held", 1.0, False, confidence), Budget("taps", 0.1, True, confidence)
+def test_bounds_are_those_of_garwood(confidence: float) -> None:
+    rate = Budget("held", 1.0, confidence)
     for alarms in (0, 1, 7, 199):
         upper = chi2.isf(1 - confidence, 2 * alarms + 2) / 2
         assert rate.bound(alarms, 2.5) == pytest.approx(upper / 2.5, rel=1e-9)
-        upper = beta.isf(1 - confidence, alarms + 1, 200 - alarms)
-        assert share.bound(alarms, 200) == pytest.approx(upper, rel=1e-9)
-    assert rate.bound(0, 0.0) == share.bound(0, 0) == math.inf
-    assert share.bound(200, 200) == share.bound(300, 200) == 1  # several alarms a knock
+    assert rate.bound(0, 0.0) == math.inf
 
 
 TOO_LITTLE = [
     (Budget("machine", 10.0), 0.29, r"0\.29 h of machine cannot show .* most 10 .* 0\.3 h"),
     (Budget("held", 1.0, confidence=0.9), 0.0, r"0 h of held .* at least 2\.303 h, or a la"),
-    (Budget("taps", 0.01, True), 298, r"298 knocks of taps cannot show a share .* 299 knocks"),
 ]
 
 
@@ -195,7 +191,6 @@ def test_too_little_to_show_a_budget_is_refused_with_what_would_do(budget, amoun
 
 NO_BUDGETS = [
     ({"limit": 0.0}, "onset.budget of held must be positive, got 0"),
-    ({"limit": 1.0, "is_share": True}, "onset.budget of held must be between 0 and 1, got 1"),
     ({"limit": 1.0, "confidence": 1.0}, "onset.confidence must lie between 0 and 1, got 1"),
 ]
 
@@ -206,11 +201,11 @@ def test_what_is_no_budget(numbers, match: str) -> None:
         Budget("held", **numbers)
 
 
-def by_latch(scores, quiet, raised, threshold, how):
+def by_latch(scores, quiet, threshold, how):
     """False alarms of all recordings, one decision after the other."""
     num = 0
-    for row, is_quiet, other in zip(scores, quiet, raised, strict=True):
-        high = [float(x >= threshold or o) for x, o in zip(row, other, strict=True)]
+    for row, is_quiet in zip(scores, quiet, strict=True):
+        high = [float(x >= threshold) for x in row]
         num += int((np.array(latch(high, 1.0, **how)[0], bool) & is_quiet).sum())
     return num
 
@@ -220,35 +215,32 @@ def by_latch(scores, quiet, raised, threshold, how):
     allowed=st.integers(0, 6),
     how=drawn_times,
     seed=st.integers(0, 2**20),
-    has_other=st.booleans(),
     most=st.sampled_from([5, 200_000]),
     least_quiet=st.sampled_from([1, 4]),
     one_by_one=st.sampled_from([500, 2]),
 )
 def test_the_lowest_threshold_is_that_of_trying_every_value(
-    recordings, allowed, how, seed, has_other, most, least_quiet, one_by_one
+    recordings, allowed, how, seed, most, least_quiet, one_by_one
 ):
     source = np.random.default_rng(seed)
     fine = source.random() < 0.5  # else many values are equal
     scores = [(np.array(row) + fine * source.random(len(row))).astype("f4") for row in recordings]
     quiet = [source.random(len(row)) < 0.8 for row in scores]
-    raised = [source.random(len(row)) < 0.1 * has_other for row in scores]
-    given_ = {**how, "is_raised": raised} if has_other else how
     ranked = np.sort(np.concatenate([row[q] for row, q in zip(scores, quiet, strict=True)]))[::-1]
     limits = {"_MOST_TRIED": most, "_LEAST_QUIET": least_quiet, "_TRIED_ONE_BY_ONE": one_by_one}
     with patch.multiple(rules, **limits):
         if not len(ranked):
             with pytest.raises(ValueError, match="no decision to count alarms in"):
-                lowest_threshold(scores, quiet, allowed, **given_)
+                lowest_threshold(scores, quiet, allowed, **how)
             return
-        found = lowest_threshold(scores, quiet, allowed, **given_)
+        found = lowest_threshold(scores, quiet, allowed, **how)
     above = float(np.nextafter(ranked[0], np.float32(np.inf)))
-    if found < above or by_latch(scores, quiet, raised, above, how) <= allowed:
-        assert by_latch(scores, quiet, raised, found, how) <= allowed
+    if found < above or by_latch(scores, quiet, above, how) <= allowed:
+        assert by_latch(scores, quiet, found, how) <= allowed
     expected = above
     tried = max(1, min(most, len(ranked) // least_quiet))
     for value in dict.fromkeys(ranked[:tried].tolist()):
-        if by_latch(scores, quiet, raised, value, how) > allowed:
+        if by_latch(scores, quiet, value, how) > allowed:
             break
         expected = value
     assert found == expected if one_by_one == 500 else found in {above, *ranked.tolist()}
@@ -267,5 +259,5 @@ def test_a_score_is_no_alarm_that_is_high_in_more_than_one_of_20_quiet_decisions
 @given(values=drawn_values, how=drawn_times, seed=st.integers(0, 2**20))
 def test_false_alarms_are_those_of_the_latch_in_quiet(values, how, seed: int) -> None:
     quiet = np.random.default_rng(seed).random(len(values)) < 0.5
-    expected = by_latch([values], [quiet], [[False] * len(values)], 1, how)
+    expected = by_latch([values], [quiet], 1, how)
     assert len(false_alarms(np.array(values) >= 1, quiet, **how)) == expected

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from tactslip_torch.features.selection import (
     ClassMoments,
+    forward_selection,
     rank_features,
     t_scores,
 )
@@ -98,7 +99,63 @@ def test_ranking_is_by_score_then_index_with_nan_last(scores, data):
     assert ranked.tolist() == expected
 
 
-# -------------------------------------------------------------------------------- rank_distinct
+# ---------------------------------------------------------------------------- forward selection
+def penalised_error(x, targets, weights, ridge):
+    """Weighted square error with a free intercept and ``ridge`` times the squared slopes, at least."""
+    root = np.sqrt(weights)[:, None]
+    rows = np.vstack([root * np.column_stack([x, np.ones(len(x))]),
+                      np.sqrt(ridge) * np.eye(x.shape[1], x.shape[1] + 1)])  # fmt: skip
+    wanted = np.vstack([root * targets, np.zeros((x.shape[1], targets.shape[1]))])
+    slopes = np.linalg.lstsq(rows, wanted, rcond=None)[0]
+    return float(np.square(wanted - rows @ slopes).sum())
+
+
+def greedy(x, targets, weights, num, ridge):
+    """The column that lowers the error most, again and again, every machine solved anew."""
+    taken = []
+    for _ in range(num):
+        rest = [i for i in range(x.shape[1]) if i not in taken]
+        errors = [penalised_error(x[:, [*taken, i]], targets, weights, ridge) for i in rest]
+        taken.append(rest[int(np.argmin(errors))])
+    return taken
+
+
+@pytest.mark.parametrize("num_targets", [1, 3])
+@pytest.mark.parametrize("ridge", [0.01, 1.0, 30.0])
+def test_forward_selection_takes_what_lowers_the_error_of_the_ridge_machine_most(
+    num_targets, ridge, rng
+):
+    """Of columns that repeat each other, on offsets, and of sizes that the ridge sees."""
+    x = rng.standard_normal((50, 9)) * rng.uniform(0.3, 2, 9)
+    x[:, 5:] = x[:, :4] + 0.3 * rng.standard_normal((50, 4))
+    targets = x[:, :num_targets] + x[:, [5]] + rng.standard_normal((50, num_targets))
+    x, weights = x + rng.uniform(-3, 3, 9), rng.uniform(0.1, 2.0, 50)
+    given = map(torch.from_numpy, (x, targets, weights))
+    expected = greedy(x, targets, weights, 6, ridge)
+    assert forward_selection(*given, 6, ridge) == expected
+    by_themselves = [penalised_error(x[:, [i]], targets, weights, ridge) for i in range(9)]
+    assert expected != np.argsort(by_themselves)[:6].tolist()  # columns that repeat wait
+
+
+def test_forward_selection_ends_where_nothing_is_left(rng):
+    x = torch.zeros(30, 5, dtype=torch.float64)
+    x[:, [1, 3]] = torch.from_numpy(rng.standard_normal((30, 2)))
+    targets, weights = x[:, [1]] + 0.1 * x[:, [3]], torch.ones(30, dtype=torch.float64)
+    assert forward_selection(x, targets, weights, 5) == [1, 3]
+    assert forward_selection(x[:, [0, 2]], targets, weights, 5) == []
+    assert sorted(forward_selection(x[:, [3, 1]], targets, weights, 9)) == [0, 1]
+
+
+def test_bins_without_weight_decide_nothing_in_forward_selection(rng):
+    """The first column explains some of the bins, the second the others."""
+    x = torch.from_numpy(rng.standard_normal((40, 2)))
+    targets = torch.cat([x[:20, [0]], 2 * x[20:, [1]]])
+    for weight, best in ((0.0, 0), (1.0, 1)):
+        weights = torch.cat([torch.ones(20), torch.full((20,), weight)]).double()
+        assert forward_selection(x, targets, weights, 1) == [best]
+
+
+# ------------------------------------------------------------------------------------- refusals
 def labelled(*labels):
     return moments_of(torch.randn(len(labels), 3), torch.tensor(labels))
 

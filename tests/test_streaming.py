@@ -70,8 +70,9 @@ def offline(detector, settings, samples, masked=None):
     evidence = settings.onset.evidence
     alone = torch.full((samples.shape[-1] // 10 + 2,), torch.nan, dtype=torch.float64)
     samples = without_stuck(samples, detector.sensing.stuck_samples)
-    known = settings.onset.score(evidence.blocks_of_recording(samples), masked)
-    alone[evidence.first_hop + 2 :] = known
+    in_use = None if masked is None else ~masked
+    known, _ = settings.onset.scores(evidence.blocks_of_recording(samples), None, in_use)
+    alone[-len(known) :] = known
     return decider.join(bins, alone.unfold(0, 3, 1).mean(-1).nan_to_num(-1e30))
 
 
@@ -83,7 +84,7 @@ def assert_same(found, expected):
         how = {"rtol": 0, "atol": close, "equal_nan": True}
         torch.testing.assert_close(*pair, **how, msg=lambda m, name=name: name + m)
     exact = ("number", "available_s", "onset_s", "is_valid", "in_range", "channels_lost")
-    for name in (*exact, "is_alarm", "is_on"):
+    for name in (*exact, "is_alarm", "is_on", "is_hint"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
@@ -170,7 +171,7 @@ def test_fast_evidence_in_any_cut_is_that_of_the_whole_recording(bad, dtype):
         samples[channel, 2000:4000:step] = value
     expected = offline(DETECTOR, WITH_ONSET, samples)
     assert 0 < int(expected.by_onset.sum()) < int(expected.by_onset.numel()) / 2
-    assert len({alarm.raised_by for alarm in expected.alarms}) == 2
+    assert {alarm.raised_by for alarm in expected.alarms} == {"onset"}
     for cuts in (range(37, 9000, 37), [5, 3000, 3001, 8000]):
         found = in_pieces(stream_of(settings=WITH_ONSET, dtype=dtype), samples, cuts)
         assert_same(found, expected)
@@ -440,12 +441,11 @@ def test_joined_decisions_by_a_plain_loop(rule, bin_hop, hop, frame):
     decider = Decider(settings, RATE, 100, 25, frame)
     found = decider.join(decider.decide(scores, scores.isfinite()), onset[: 4000 // hop])
     bins = Decider(settings, RATE, 100, 25).decide(scores, scores.isfinite())
-    high, by_onset = [], []
+    by_onset = []
     for i in range(4000 // hop):
         end = (i + 1) * hop
         known = [n for n in range(len(scores)) if n * bin_hop + 125 <= end and end >= frame]
         by_onset.append(float(onset[i]) >= settings.onset.threshold)
-        high.append(by_onset[i] or bool(known and bins.statistic[known[-1]] >= settings.threshold))
         assert float(found.available_s[i]) == end / RATE
         for name in ("score", "probability", "llr", "statistic"):
             wanted = getattr(bins, name)[known[-1]] if known else math.nan
@@ -458,10 +458,10 @@ def test_joined_decisions_by_a_plain_loop(rule, bin_hop, hop, frame):
         assert float(found.onset_s[i]) == began_s
     seconds = {"rearm": 0.02, "refractory": 0.05}
     times = {name: math.ceil(s * RATE / hop) for name, s in seconds.items()}
-    alarms, standing = by_hand(high, 1, **times)
+    alarms, standing = by_hand(list(map(float, by_onset)), 1, **times)
     assert found.number.tolist() == list(range(4000 // hop))
     assert found.by_onset.tolist() == by_onset
     assert (found.is_alarm.tolist(), found.is_on.tolist()) == (alarms, standing)
-    raised = [("onset" if by_onset[i] else "status") for i in np.flatnonzero(alarms)]
-    assert [alarm.raised_by for alarm in found.alarms] == raised
-    assert set(raised) == {"onset", "status"}
+    assert found.is_hint.tolist() == (onset[: 4000 // hop] >= classifier.hint).tolist()
+    assert {alarm.raised_by for alarm in found.alarms} == {"onset"}
+    assert (bins.statistic >= settings.threshold).any()  # bins raise none of these

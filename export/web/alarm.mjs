@@ -16,18 +16,19 @@ export function explain({ rule, sample_rate_hz: rate, hop_samples: hop, onset_ho
         : "") +
       ". An alarm comes when the sum reaches the threshold.",
   };
+  const standing = "An alarm sets the status to slip until the statistic has been low for a while.";
+  if (fast)
+    return (
+      `A classifier of slipping now looks at the stream ${every(fast)}. An alarm comes when its score ` +
+      `reaches the threshold, and sets the status to slip until the score has been low for a while. ` +
+      `The probability of slip is that of bins, ${every(hop)}; they raise no alarm.`
+    );
   return [
     `A decision is made ${every(hop)}. Its evidence says how much more likely its samples are with ` +
       "slip than without: above 0 for slip, below 0 against it (the logarithm of the ratio).",
     rules[rule?.name]?.() ?? "An alarm comes when the statistic reaches the threshold.",
-    fast
-      ? `A second classifier, of onsets, looks at fast changes ${every(fast)}: an alarm comes from ` +
-        "its score too, when that reaches its own threshold."
-      : "",
-    "An alarm sets the status to slip until the statistic has been low for a while.",
-  ]
-    .filter(Boolean)
-    .join(" ");
+    standing,
+  ].join(" ");
 }
 
 function ordinal(number) {

@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import lightning as L
 from hydra.utils import instantiate
@@ -24,8 +24,7 @@ from tactslip_torch.data.splits import ROLES
 from tactslip_torch.deploy.check import GraphKind
 from tactslip_torch.deploy.export import export_detector, read_sidecar
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
-from tactslip_torch.onset.decisions import KEY, Scorer
+from tactslip_torch.onset.decisions import KEY
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
@@ -135,7 +134,7 @@ def _experiment(config: DictConfig) -> Experiment:
         maker=maker,
         folds=folds,
         recipe=recipe,
-        alarm=alarm and partial(_set_alarm, alarm, config.num_workers),
+        alarm=alarm and partial(_set_alarm, alarm, source, config.num_workers),
         trainer=partial(make_trainer, config.trainer),
         cache=config.cache,
         metadata={
@@ -155,7 +154,7 @@ def _experiment(config: DictConfig) -> Experiment:
 def _refuse_simulated_streams(config: DictConfig, source: RecordingSource) -> None:
     """Refuse an alarm that is calibrated on another hand's simulated recordings."""
     streams = config.onset.get("streams") or {}
-    if source.is_simulated or "SimulatedRecordings" not in str(streams.get("_target_")):
+    if source.is_simulated or ".simulation." not in str(streams.get("_target_")):
         return
     raise ValueError(
         "onset=alarms is calibrated on simulated recordings, and these are not; leave onset at "
@@ -182,21 +181,21 @@ def _reading_settings(config: DictConfig) -> dict[str, Any]:
 
 
 def _set_alarm(
-    alarm: CalibratedAlarm | DebouncedAlarm, num_workers: int | None, detector: SlipDetector
+    alarm: CalibratedAlarm | DebouncedAlarm,
+    source: RecordingSource,
+    num_workers: int | None,
+    detector: SlipDetector,
 ) -> dict[str, Any]:
     """Set the alarm of a detector; what its calibration measured."""
     if isinstance(alarm, CalibratedAlarm):
-        names = get_args(BaselineName) if detector.pool.hand.fast else ()
-        baselines: dict[str, Scorer] = {
-            name.replace("_", " "): BaselineDetector(name, detector.pool, detector.channel_filter)
-            for name in names
-        }
-        return alarm(detector, baselines, num_workers)
+        return alarm(detector, num_workers=num_workers)
     if detector.calibration is None:
         what = f"{detector.info['split']}: {_NO_ALARM}"
         log.warning("%s, or these do not tell slip from non-slip", what)
     else:
         alarm(detector)
+        if alarm.classifier is not None:
+            alarm.fit(detector, source, num_workers)
     return {}
 
 

@@ -27,7 +27,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.decisions import AlarmSettings
-from tactslip_torch.onset.evidence import MEAN_HOPS, OnsetEvidence
+from tactslip_torch.onset.evidence import FLOORS_S, MEAN_HOPS, OnsetClassifier
 from tactslip_torch.onset.rules import NOTHING_YET, KOfN, Rule
 from tactslip_torch.package_files import SIDECAR as FORMAT
 from tactslip_torch.runtime import __version__
@@ -116,7 +116,7 @@ class Timing:
             return cls(raw, *times, raw.length - 1, size)
         evidence = settings.onset.evidence
         tail = max(raw.length, evidence.context + evidence.hop_samples) - 1
-        size += 1 + len(OF_LAST_BIN) + num_channels + memory_size(evidence)
+        size += 1 + len(OF_LAST_BIN) + num_channels + sum(memory_sizes(settings.onset))
         return cls(raw, *times, tail, size, evidence.hop_samples)
 
     def decisions(self, num: int) -> int:
@@ -126,17 +126,24 @@ class Timing:
         return 0 if num < max(self.first, self.frame) else (num - self.first) // self.hop + 1
 
 
-def memory_size(evidence: OnsetEvidence) -> int:
-    """Numbers that are kept: lost and known blocks, scores, half the log power and the means."""
-    return 2 + MEAN_HOPS - 1 + sum(rows * width for rows, width in memory_shapes(evidence))
+def memory_sizes(onset: OnsetClassifier) -> list[int]:
+    """Numbers kept of a stream: lost and known blocks, scores, ``memory_shapes``, floors."""
+    num_floors = len(FLOORS_S) * onset.evidence.num_filters * len(onset.evidence.hand.fast)
+    num_floors += onset.evidence.step_matrix.shape[1] * len(onset.evidence.hand.slow)
+    rows = [rows * width for rows, width in memory_shapes(onset)]
+    return [1, 1, MEAN_HOPS - 1, *rows, num_floors]
 
 
-def memory_shapes(evidence: OnsetEvidence) -> list[tuple[int, int]]:
-    """Of fast and slow channels, a row a block."""
-    num_logs = len(evidence.hand.fast) * len(evidence.fast_compression)
+def memory_shapes(onset: OnsetClassifier) -> list[tuple[int, int]]:
+    """Rows kept of log powers, products, means, sizes of steps and scaled columns."""
+    evidence = onset.evidence
+    num_slow, num_steps = len(evidence.hand.slow), evidence.step_matrix.shape[1]
     return [
-        (evidence.memory - 1, num_logs),
-        (len(evidence.step_matrix) - 1, len(evidence.hand.slow)),
+        (evidence.delay, evidence.num_filters * len(evidence.hand.fast)),
+        (evidence.delay, evidence.num_filters * evidence.pairs.shape[1]),
+        (len(evidence.step_matrix) - 1, num_slow),
+        (evidence.delay, num_steps * num_slow),
+        (max(onset.lags, default=0), evidence.num_columns),
     ]
 
 
@@ -335,8 +342,11 @@ def host_metadata(detector: SlipDetector, kind: str, precision: Precision) -> di
             "threshold_curve": settings.metadata.get("threshold_curve", []),
         }
         if settings.onset is not None:  # whose threshold the one above is
-            metadata["status_threshold"] = settings.threshold
             metadata["onset_hop_samples"] = timing.onset_hop
+            if math.isfinite(settings.threshold):  # of bins, which raise no alarm
+                metadata["status_threshold"] = settings.threshold
+            if math.isfinite(settings.onset.hint):
+                metadata["hint_threshold"] = settings.onset.hint
     return metadata
 
 

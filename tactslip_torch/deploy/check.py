@@ -40,7 +40,7 @@ _CLOSE = 1e-9  # of times, and of onset scores, which are float64 always
 _NUM_BINS, _NUM_DECISIONS = 128, 12
 _QUIET_V = 0.02  # span at rest of a channel of the recording, at most
 
-_OF_ONSETS = {"onset_score": "onset_score", "by_onset": "by_onset"}
+_OF_ONSETS = {"onset_score": "onset_score", "by_onset": "by_onset", "hint": "is_hint"}
 _OF_CHANNELS = ("valid", "in_range", "channels_lost")
 
 

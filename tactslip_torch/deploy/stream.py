@@ -26,7 +26,7 @@ from tactslip_torch.deploy.bins import (
     dtype_of,
     machine,
     memory_shapes,
-    memory_size,
+    memory_sizes,
     rule_start,
     scaled,
     score_bins,
@@ -34,9 +34,11 @@ from tactslip_torch.deploy.bins import (
 from tactslip_torch.deploy.value import BOOL, END, F64, I64, Graph, Value
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.onset.decisions import LARGEST, AlarmSettings
 from tactslip_torch.onset.evidence import (
     FEWEST_BLOCK_SAMPLES,
+    FLOORS_S,
     MEAN_HOPS,
     OnsetClassifier,
     OnsetEvidence,
@@ -65,10 +67,10 @@ def stream_graph(
     a row that are not valid, the last sample of each channel, how many were equal to it, and the
     memory of the rule.
 
-    With an onset classifier there are ``onset_score``, float64, and ``by_onset`` too, the threshold
-    is the classifier's, and behind the memory of the rule the state has decisions of the alarm in a
-    row that are not valid, the last bin's columns (``OF_LAST_BIN``, and the channels that
-    were lost) and the memory of blocks (``_onset_scores``).
+    With an onset classifier there are ``onset_score``, float64, ``by_onset`` and ``hint`` too, the
+    threshold is the classifier's, and behind the memory of the rule the state has decisions of the
+    alarm in a row that are not valid, the last bin's columns (``OF_LAST_BIN``, and the channels
+    that were lost) and the memory of blocks (``_onset_scores``).
 
     Args:
         detector: that scores the bins.
@@ -94,7 +96,7 @@ def stream_graph(
     if onset is not None:
         no_bin = [0.0, *([math.nan] * 3), 0.0, 0.0, math.inf, *([0.0] * num_channels)]
         start, given = graph.concat(start, graph.constant(no_bin, F64), axis=0), state
-        small = timing.state_size - memory_size(onset.evidence)
+        small = timing.state_size - sum(memory_sizes(onset))
         state = given.slice(0, small, 0)
     else:
         small = timing.state_size
@@ -112,7 +114,7 @@ def stream_graph(
     outputs |= dict.fromkeys(("time_s", "onset_s"), F64)
     outputs["channels_lost"] = BOOL
     if onset is not None:
-        outputs |= {"onset_score": F64, "by_onset": BOOL}
+        outputs |= {"onset_score": F64, "by_onset": BOOL, "hint": BOOL}
     rate_hz = detector.pool.sample_rate_hz
     latch_times = tuple(settings.latch_times(rate_hz).values())
     decision_samples = settings.decision_samples
@@ -210,7 +212,7 @@ def stream_graph(
         sizes = graph.axes(*sizes_before, 1, num_kept)
         parts = graph.ops("Split", state, sizes, dtypes=[F64] * 9, axis=0)
         before, made, run, of_latch, lost, _, of_rule, alarm_lost, last_bin = parts
-        memory = _onset_memory(given, small, onset.evidence)
+        memory = _onset_memory(given, small, onset)
 
         def decide_bins() -> list[Value]:
             number, scored, llr = bins(made)
@@ -259,17 +261,17 @@ def stream_graph(
                 at_hop[..., i] for i in range(len(OF_LAST_BIN))
             )
             statistic, time_s = statistic.cast(dtype), samples / rate_hz
-            is_valid = valid.cast(BOOL) | (onset_score > NOTHING_YET)
-            is_high = (by_onset | (statistic >= settings.threshold)).cast(F64)
+            is_known = onset_score > NOTHING_YET
+            is_high = by_onset.cast(F64)
             one = graph.constant([1.0], F64)
             alarm, on, of_alarm, now_lost = raised(
-                is_high, one, number, of_latch, is_valid, alarm_lost
+                is_high, one, number, of_latch, is_known, alarm_lost
             )
             return [
                 score.cast(dtype),
                 stated.cast(dtype),
                 statistic,
-                is_valid,
+                valid.cast(BOOL) | is_known,
                 in_range.cast(BOOL),
                 alarm,
                 on,
@@ -278,6 +280,7 @@ def stream_graph(
                 at_hop.slice(len(OF_LAST_BIN), END, 1).cast(BOOL),
                 onset_score,
                 by_onset,
+                onset_score >= onset.hint,
                 next_state(of_alarm, now_lost, after),
             ]
 
@@ -411,17 +414,16 @@ def _without_stuck(samples: Value, known: Value, most: int) -> tuple[Value, Valu
 # Onset scores ----------------------------------------------------------------------------------
 
 
-def _onset_memory(state: Value, start: int, evidence: OnsetEvidence) -> list[Value]:
-    """Lost and known blocks, scores of hops, half the log powers of blocks, and their means; flat.
+def _onset_memory(state: Value, start: int, onset: OnsetClassifier) -> list[Value]:
+    """What is kept of a stream's evidence (``memory_sizes``); flat, but for empty parts.
 
     Args:
         state: in which they lie last; empty: of no stream yet, NaN, on which no score rests.
         start: where they begin.
-        evidence: whose they are.
+        onset: whose they are.
     """
     graph = state.graph
-    sizes = [1, 1, MEAN_HOPS - 1]
-    sizes += [num * width for num, width in memory_shapes(evidence) if width]
+    sizes = [size for size in memory_sizes(onset) if size]
 
     def known() -> list[Value]:
         dtypes = [F64] * (1 + len(sizes))
@@ -437,11 +439,59 @@ def _onset_memory(state: Value, start: int, evidence: OnsetEvidence) -> list[Val
     return graph.if_(state.length(0) > 0, known, nothing)
 
 
+class _Measured(NamedTuple):
+    """Rows of blocks, ``[k, width]`` each; of no channels None.
+
+    Attributes:
+        logs: half the log powers, filter by filter.
+        products: mean products of pairs.
+        means: of slow channels.
+        is_known: which blocks are not lost, ``[k]``, bool.
+    """
+
+    logs: Value | None
+    products: Value | None
+    means: Value | None
+    is_known: Value
+
+
+def _measured(samples: Value, places: Value, evidence: OnsetEvidence) -> _Measured:
+    """``OnsetEvidence.blocks`` and which are not lost; arguments as of ``_onset_scores``."""
+    graph, first = samples.graph, places.unsqueeze(1)
+    fast, slow = evidence.hand.fast, evidence.hand.slow
+    hop, context, num_filters = evidence.hop_samples, evidence.context, evidence.num_filters
+    logs = products = means = None
+    if fast:
+        frames = _rows(samples.take(fast, 1), first * hop, range(context + hop)).cast(F64)
+        filters = evidence.filter_matrix.reshape(context + hop, -1).T
+        heard = graph.constant(filters, F64) @ (frames - frames.slice(0, 1, 1))
+        to_mean = graph.constant(np.kron(np.eye(num_filters), np.full(hop, 1 / hop)), F64)
+        of_fast = (to_mean @ (heard * heard) + evidence.rounding).log() * 0.5  # [k, B, F]
+        logs = of_fast.reshape(0, num_filters * len(fast))
+        if len(fast) > 1:
+            one, other = (heard.take(of.tolist(), 2) for of in evidence.pairs)
+            products = (to_mean @ (one * other)).reshape(0, -1)
+        known = of_fast.sum(1).isfinite()
+        moves = (of_fast - evidence.silence).amax(1) > 0.0
+        if hop >= FEWEST_BLOCK_SAMPLES:
+            own = frames.slice(context, END, 1)
+            moves = moves & ~(own - own.slice(0, 1, 1)).abs().amax(1).eq(0.0)
+        is_still = graph.constant(evidence.is_still or [False] * len(fast), BOOL)
+        known = known & (moves | is_still)
+    if slow:
+        block = _rows(samples.take(slow, 1), first * hop, range(context, context + hop))
+        means = block.cast(F64).mean(1)
+        if not fast:
+            known = means.isfinite()
+    is_known = known.cast(F64).sum(1) >= float(evidence.min_alive)
+    return _Measured(logs, products, means, is_known)
+
+
 def _onset_scores(
     samples: Value,
     places: Value,
     memory: Sequence[Value],
-    classifier: OnsetClassifier,
+    onset: OnsetClassifier,
     most: int,
 ) -> tuple[Value, list[Value]]:
     """Scores of hops, ``NOTHING_YET`` where there is no evidence, and what is kept.
@@ -449,113 +499,177 @@ def _onset_scores(
     Args:
         samples: from ``context`` samples before the first of these hops on; NaN before a stream.
         places: of the hops, from 0.
-        memory: of ``_onset_memory`` or the call before; as it is large, copied as seldom as can be.
-        classifier: that scores.
+        memory: of ``_onset_memory`` or the call before.
+        onset: that scores.
         most: lost blocks in a row, beyond which the memory begins anew.
 
     Shape:
         - samples: ``[m, C]``; places: ``[k]``, int64, k at least 1
         - output: ``[k]``, float64, and as memory
     """
-    evidence, graph = classifier.evidence, samples.graph
-    fast, slow = evidence.hand.fast, evidence.hand.slow
-    hop, context, num_filters = (
-        evidence.hop_samples,
-        evidence.context,
-        len(evidence.fast_compression),
-    )
-    num_windows, first = len(evidence.windows), places.unsqueeze(1)
-    frames = _rows(samples.take(fast, 1), first * hop, range(context + hop)).cast(F64)
-    filters = evidence.filter_matrix.reshape(context + hop, -1).T
-    heard = graph.constant(filters, F64) @ (frames - frames.slice(0, 1, 1))
-    to_power = np.kron(np.eye(num_filters), np.full(hop, 1 / hop))
-    square = graph.constant(to_power, F64) @ (heard * heard)  # [k, B, F]
-    power = square + np.square(evidence.fast_compression)[:, None]
-    made = [power.reshape(0, num_filters * len(fast)).log() * 0.5]
-    if slow:
-        block = _rows(samples.take(slow, 1), first * hop, range(context, context + hop))
-        made.append(block.cast(F64).mean(1))
-    shapes = memory_shapes(evidence)[: len(made)]
-    lost, filled, of_hops, *kept = memory
+    evidence, graph = onset.evidence, samples.graph
+    made = _measured(samples, places, evidence)
+    lost, filled, of_hops, *rows = memory
+    shapes = [shape for shape in memory_shapes(onset) if all(shape)]
+    *kept, floors = rows
     kept = [x.reshape(*shape) for x, shape in zip(kept, shapes, strict=True)]
-    of_fast: Any = made[0].reshape(0, num_filters, len(fast))
-    moves: Any = (of_fast - evidence.silence).amax(1) > 0.0
-    if hop >= FEWEST_BLOCK_SAMPLES:
-        own = frames.slice(context, END, 1)
-        moves = moves & ~(own - own.slice(0, 1, 1)).abs().amax(1).eq(0.0)
-    never_silent = graph.constant(evidence.silence.isinf().all(0).numpy(), BOOL)
-    alive = of_fast.sum(1).isfinite() & (moves | never_silent)
-    is_known = alive.cast(F64).sum(1) >= float(evidence.min_alive)  # [k]
-    longest, num_floor = evidence.windows[-1], evidence.memory - evidence.windows[-1]
 
-    def scores_of(made: Sequence[Value], num_rows: Value) -> list[Value]:
-        """Scores of known blocks, which have so many rows; and what is kept, but for ``lost``."""
-        first = _count_up(made[0].length(0)).unsqueeze(1)
+    def scores_of(measured: _Measured, begins: Value) -> list[Value]:
+        """Scores of known blocks, the first of whose streams stand at ``begins``, below 0 before.
 
-        def latest(of: int, num: int) -> Value:
-            """Rows up to each hop, as many: ``[k, num, *]``."""
-            rows = graph.concat(kept[of].slice(1 - num, END, 0), made[of], axis=0)
-            return _rows(rows, first, range(num))
-
-        rows = graph.concat(kept[0], made[0], axis=0)
-        floor = _rows(rows, first, range(num_floor)).mean(1)
-        to_means = np.zeros((num_windows, longest))
-        for row, length in zip(to_means, evidence.windows, strict=True):
-            row[-length:] = 1 / length
-        power = (latest(0, longest) * 2.0).exp()
-        measured: list[Any] = [
-            (graph.constant(to_means, F64) @ power).reshape(0, num_windows, num_filters, len(fast)),
-            floor.reshape(0, num_filters, len(fast)),
-            None,
-            graph.constant(np.ones(len(fast)), BOOL),
-            None,
-        ]
-        if slow:
-            means = latest(1, len(evidence.step_matrix))
-            steps = graph.constant(evidence.step_matrix.T, F64)
-            measured[2] = steps @ (means - means.slice(0, 1, 1))
-            measured[4] = graph.constant(np.ones(len(slow)), BOOL)
-        pooled: Any = evidence.pooled(*measured)
-        columns, is_usable = pooled
-        is_usable = is_usable & (num_rows >= float(evidence.memory))
-        score = machine(scaled(columns, classifier.scaler), classifier.head, F64)
-        scores = graph.concat(of_hops, graph.where(is_usable, score, math.nan), axis=0)
-        mean = _rows(scores, first, range(MEAN_HOPS)).mean(1)
+        And what is kept, but for ``lost``.
+        """
+        num = begins.length(0)
+        number = _count_up(num).cast(F64) - begins.cast(F64) + 1.0  # of each block in its stream
+        scores, after = _scores_of_known(measured, begins, number, kept, floors, onset)
+        scores = graph.concat(of_hops, scores, axis=0)
+        mean = _rows(scores, _count_up(num).unsqueeze(1), range(MEAN_HOPS)).mean(1)
         mean = graph.where(mean.isfinite(), mean, NOTHING_YET)
-        after = [_last(num_rows), scores.slice(1 - MEAN_HOPS, END, 0)]
-        for before, own, (num, _) in zip(kept, made, shapes, strict=True):
-            after.append(before.slice(own.length(0), END, 0).reshape(-1))
-            after.append(own.slice(-num, END, 0).reshape(-1))
-        return [mean, *after]
+        return [mean, _last(number), scores.slice(1 - MEAN_HOPS, END, 0), *after]
+
+    before = (filled * -1.0).cast(I64)  # where the stream of before began
 
     def all_known() -> list[Value]:
-        num_rows = places.cast(F64) + (filled + 1.0)
-        mean, *after = scores_of(made, num_rows)
+        mean, *after = scores_of(made, before + places * 0)
         return [mean, lost * 0.0, *after]
 
     def some_lost() -> list[Value]:
-        gaps = _Gaps.of(is_known, places.cast(F64), lost, most)
+        gaps = _Gaps.of(made.is_known, places.cast(F64), lost, most)
 
         def nothing_known() -> list[Value]:
-            mean = graph.where(is_known, 0.0, graph.constant([NOTHING_YET], F64))
-            parts = [filled, of_hops]
-            for own, rows in zip(kept, made, strict=True):  # in two parts, as of scores
-                parts += [own.reshape(-1), rows.slice(0, 0, 0).reshape(-1)]
-            return [mean, *parts]
+            mean = graph.where(made.is_known, 0.0, graph.constant([NOTHING_YET], F64))
+            return [mean, filled, of_hops, *rows]
 
         def those_known() -> list[Value]:
-            own = [gaps.valid_of(rows) for rows in made]
-            place = _count_up(own[0].length(0)).cast(F64)
-            begins = _latest(gaps.valid_of(gaps.begins_anew), -filled, place)
-            mean, *after = scores_of(own, place - begins + 1.0)
+            parts = (None if part is None else gaps.valid_of(part) for part in made)
+            own = _Measured(*parts)  # type: ignore[arg-type]  # flags are there
+            place = _count_up(own.is_known.length(0))
+            begins = _latest(gaps.valid_of(gaps.begins_anew), before, place)
+            mean, *after = scores_of(own, begins)
             mean = gaps.spread(mean, graph.constant([NOTHING_YET], F64))
-            return [graph.where(is_known, mean, NOTHING_YET), *after]
+            return [graph.where(made.is_known, mean, NOTHING_YET), *after]
 
         mean, *after = graph.if_(gaps.has_valid, those_known, nothing_known)
         return [mean, gaps.lost_after, *after]
 
-    score, *after = graph.if_(_is_whole(is_known, lost), all_known, some_lost)
+    score, *after = graph.if_(_is_whole(made.is_known, lost), all_known, some_lost)
     return score, after
+
+
+def _scores_of_known(
+    measured: _Measured,
+    begins: Value,
+    number: Value,
+    kept: Sequence[Value],
+    floors: Value,
+    onset: OnsetClassifier,
+) -> tuple[Value, list[Value]]:
+    """``OnsetClassifier.scores``, NaN without evidence, and the rows and floors that are kept.
+
+    Args:
+        measured: of known blocks, ``k`` of them.
+        begins: place of the first block of each one's stream; below 0: before these.
+        number: of each block in its stream, from 1.
+        kept: rows of the blocks before; of no stream yet NaN.
+        floors: of the blocks before.
+        onset: that scores.
+    """
+    evidence, graph = onset.evidence, begins.graph
+    fast, slow, num_filters = evidence.hand.fast, evidence.hand.slow, evidence.num_filters
+    num, places, delay = begins.length(0), _count_up(begins.length(0)).unsqueeze(1), evidence.delay
+    given, rows, after = list(kept), list[Value](), list[Value]()
+
+    def joined(latest: Value) -> tuple[Value, int, Value]:
+        """Rows with those that are kept, how many these are, and the first place that counts."""
+        before = given.pop(0)
+        size = [s for s in memory_shapes(onset) if all(s)][len(rows)][0]
+        rows.append(graph.concat(before, latest, axis=0))
+        lowest = (begins + size).maximum(0).unsqueeze(1)
+        end = _count_up(graph.axes(size)) + num
+        after.append(graph.op("Gather", rows[-1], end.maximum(_last(lowest).squeeze(1)), axis=0))
+        return rows[-1], size, lowest
+
+    def latest(of: tuple[Value, int, Value], back: range) -> Value:
+        """Rows so many blocks back of each block, none before its stream: ``[k, back, width]``."""
+        all_rows, size, lowest = of
+        index = (places + graph.axes(*(size - i for i in back))).maximum(lowest)
+        return graph.op("Gather", all_rows, index, axis=0)
+
+    longest = range(delay - 1, -1, -1)
+    to_means = [
+        graph.constant(np.r_[np.zeros(delay - n), np.full(n, 1 / n)][None], F64)
+        for n in evidence.windows
+    ]
+    power, products, delayed = list[Value](), list[Value](), list[Value]()
+    if measured.logs is not None:
+        logs = joined(measured.logs)
+        powers = (latest(logs, longest) * 2.0).exp()
+        power = [(each @ powers).reshape(0, num_filters, len(fast)) for each in to_means]
+        delayed = [latest(logs, range(delay, delay + 1)).squeeze(1)] * len(FLOORS_S)
+    if measured.products is not None:
+        pairs = latest(joined(measured.products), longest)
+        shape = (num_filters, evidence.pairs.shape[1])
+        products = [(each @ pairs).reshape(0, *shape) for each in to_means]
+    steps: Any = None
+    if measured.means is not None:
+        reach, num_steps = len(evidence.step_matrix), evidence.step_matrix.shape[1]
+        means = latest(joined(measured.means), range(reach - 1, -1, -1))
+        steps = graph.constant(evidence.step_matrix.T, F64) @ (means - means.slice(0, 1, 1))
+        sizes = joined(steps.abs().reshape(0, num_steps * len(slow)))
+        delayed.append(latest(sizes, range(delay, delay + 1)).squeeze(1))
+    usual, now = _followed(graph.concat(*delayed, axis=1), number, floors, evidence)
+    num_logs = num_filters * len(fast)
+    of_logs = [
+        usual.slice(i * num_logs, (i + 1) * num_logs, 1).reshape(0, num_filters, len(fast))
+        for i in range(len(FLOORS_S) if fast else 0)
+    ]
+    of_steps: Any = None
+    if slow:
+        of_steps = usual.slice(len(of_logs) * num_logs, END, 1).reshape(0, num_steps, len(slow))
+    in_use: list[Any] = [graph.constant(np.ones(len(each)), BOOL) for each in (fast, slow)]
+    pooled: Any = evidence.pooled(
+        *(power, products, of_logs),  # type: ignore[arg-type]  # values in place of tensors
+        *(steps, of_steps, *in_use),
+    )
+    columns, is_usable = pooled
+    inputs = scaled(columns, onset.scaler)
+    if lags := onset.lags:
+        of_before = joined(inputs)
+        back = [latest(of_before, range(lag, lag + 1)).squeeze(1) for lag in lags]
+        inputs = graph.concat(inputs, *back, axis=1)
+    head: Any = onset.head
+    score = machine(inputs, head, F64) if isinstance(head, QuadraticForm) else head(inputs)
+    is_usable = is_usable & (number > float(evidence.blind))
+    flat = [each.reshape(-1) for each in after]
+    return graph.where(is_usable, score, math.nan), [*flat, now]
+
+
+def _followed(
+    values: Value, number: Value, floors: Value, evidence: OnsetEvidence
+) -> tuple[Value, Value]:
+    """Recursive means of delayed values, as ``OnsetEvidence`` has its floors; the last of them.
+
+    Shape:
+        - values: ``[k, V]``; number: ``[k]``, of each block in its stream; floors: ``[V]``
+    """
+    graph, num_fast = values.graph, len(evidence.hand.fast)
+    num_logs = evidence.num_filters * num_fast
+    rates = np.repeat(evidence.floor_rates, num_logs)
+    num_sizes = evidence.step_matrix.shape[1] * len(evidence.hand.slow)
+    rates = np.r_[rates, np.full(num_sizes, evidence.floor_rates[0])]
+    since = (number - float(evidence.delay)).clamp(min=1.0).unsqueeze(1)
+    rate = (1.0 / since).maximum(rates)  # [k, V]
+    is_first = number.eq(1.0).unsqueeze(1).cast(F64) + rate * 0.0
+
+    def follow(state: list[Value], row: list[Value]) -> tuple[list[Value], list[Value]]:
+        x, share, anew = row
+        before = graph.where(anew > 0.0, math.nan, state[0])
+        known = graph.where(before.isfinite(), before, x)
+        after = graph.where(x.isfinite(), known + share * (x - known), before)
+        return [after], [after]
+
+    (after,), (made,) = graph.scan(follow, [floors], [values, rate, is_first], (len(rates),))
+    return made, after
 
 
 def _rows(rows: Value, start: Value, places: range) -> Value:

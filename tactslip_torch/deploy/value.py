@@ -153,22 +153,24 @@ class Graph:
         step: Callable[[list[Value], list[Value]], tuple[Sequence[Value], Sequence[Value]]],
         state: Sequence[Value],
         rows: Sequence[Value],
+        shape: Shape = (),
     ) -> tuple[list[Value], list[Value]]:
         """Walk along the first axis of ``rows``: a state goes on, and results are put together.
 
         Args:
-            step: of the state and an entry of each row makes the next state and results ``[]``.
+            step: of the state and an entry of each row makes the next state and results.
             state: before the first entry.
-            rows: ``[k]`` each; onnxruntime refuses k = 0, so leave an empty walk out by
+            rows: ``[k, *shape]`` each; onnxruntime refuses k = 0, so leave an empty walk out by
                 ``if_``.
+            shape: of all that is walked.
 
         Returns:
-            The state after the last entry, and results ``[k]``.
+            The state after the last entry, and results ``[k, *shape]``.
         """
         self._bodies.append(_Body())
-        given = [self.input(self._new_name(), value.dtype, ()) for value in (*state, *rows)]
+        given = [self.input(self._new_name(), value.dtype, shape) for value in (*state, *rows)]
         after, results = step(given[: len(state)], given[len(state) :])
-        self._hand_out([*after, *results], [()] * (len(after) + len(results)))
+        self._hand_out([*after, *results], [shape] * (len(after) + len(results)))
         body = self._bodies.pop().proto()
         dtypes = [value.dtype for value in (*after, *results)]
         made = self.ops("Scan", *state, *rows, dtypes=dtypes, body=body, num_scan_inputs=len(rows))

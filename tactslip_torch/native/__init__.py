@@ -118,14 +118,14 @@ class _BristleRun(ctypes.Structure):
 class _Onset(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in (
-            "num_fast", "num_slow", "num_filters", "num_windows", "num_steps", "num_columns",
-            "hop", "context", "memory", "step_length")),
+            "num_fast", "num_slow", "num_filters", "num_windows", "num_pairs", "num_steps",
+            "num_lags", "num_columns", "num_layers", "hop", "context", "delay", "step_length",
+            "blind", "min_alive", "most_lost")),
         *((name, ctypes.c_void_p) for name in (
-            "fast", "slow", "windows", "filters", "steps", "fast_compression", "slow_compression",
-            "slope", "offset", "quadratic", "linear", "silence")),
+            "fast", "slow", "windows", "first", "second", "lags", "widths", "filters", "steps",
+            "rounding", "silence", "least_step", "rates", "slope", "offset", "weights", "biases",
+            "quadratic", "linear", "is_still")),
         ("constant", ctypes.c_double),
-        ("min_alive", ctypes.c_int64),
-        ("most_lost", ctypes.c_int64),
     )  # fmt: skip
 
 
@@ -133,8 +133,9 @@ class _OnsetHops(ctypes.Structure):
     _fields_ = (
         ("samples", ctypes.c_void_p),
         *((name, ctypes.c_int64) for name in (
-            "is_float", "channel_stride", "num_hops", "num_rows", "num_lost")),
-        *((name, ctypes.c_void_p) for name in ("rows", "listened", "score", "is_lost")),
+            "is_float", "channel_stride", "num_hops", "num_lost")),
+        *((name, ctypes.c_void_p) for name in (
+            "memory", "in_use", "score", "is_lost", "columns")),
     )  # fmt: skip
 
 
@@ -523,25 +524,36 @@ def _check_floats(array: Array) -> None:
 
 
 class OnsetEngine(_Kept):
-    """Scores of hops by the native engine, as ``onset/evidence.py`` defines them; float64.
+    """Scores of a stream's hops by the native engine, as ``onset/evidence.py`` defines them.
 
     Args:
         fast: indices of the fast channels.
         slow: of the slow ones.
         windows: over how many blocks levels are taken, ascending.
-        memory: blocks that a score rests on.
+        pairs: places among the fast channels of those whose correlation is taken.
+        lags: hops back of further columns that the head takes, ascending.
         filters: a block with its context to the outputs of all filters.
+        context: samples before a block that are handed over.
         steps: means of the last blocks to steps.
-        scales: compression scales of the filters and of the steps.
-        scaling: factor and offset of each column, which is then clipped to [-1, 1].
-        head: quadratic part (or empty), linear part and constant.
+        rounding: power of the converter's rounding behind each filter.
+        least_step: of each slow channel, beside its usual steps.
         silence: half the log power of a silent channel.
-        min_alive: fast channels that must be alive.
+        rates: what a block adds to each floor.
+        scaling: factor and offset of each column, which is then clipped to [-1, 1].
+        layers: weights ``[out, in]`` and biases of a network; empty: there is a form.
+        form: quadratic part (or empty), linear part and constant; ``None``: there are layers.
+        is_still: fast channels whose usual block holds one value.
+        min_alive: channels that must be alive.
+        blind: known blocks before the first with a score.
         most_lost: lost blocks in a row, beyond which the memory begins anew.
+        with_columns: whether columns are handed out.
+
+    Attributes:
+        memory: what is kept of a stream, float64.
 
     Shape:
-        - filters: ``[context + hop, B, hop]``; steps: ``[b, D]``; silence: ``[F, B]``
-        - quadratic: ``[K, K]``; linear: ``[K]``
+        - pairs: ``[2, P]``; filters: ``[context + hop, B, hop]``; steps: ``[b, D]``
+        - rounding, silence: ``[B, F]``
 
     Raises:
         OSError: if the engine is not available.
@@ -553,58 +565,73 @@ class OnsetEngine(_Kept):
         fast: Sequence[int],
         slow: Sequence[int],
         windows: Sequence[int],
-        memory: int,
+        pairs: Array,
+        lags: Sequence[int],
         filters: Array,
+        context: int,
         steps: Array,
-        scales: tuple[Sequence[float], Sequence[float]],
-        scaling: tuple[Array, Array],
-        head: tuple[Array, Array, float],
+        rounding: Array,
+        least_step: Array,
         silence: Array,
+        rates: Sequence[float],
+        scaling: tuple[Array, Array],
+        layers: Sequence[tuple[Array, Array]],
+        form: tuple[Array, Array, float] | None,
+        is_still: Sequence[bool],
         min_alive: int,
+        blind: int,
         most_lost: int,
+        with_columns: bool,
     ) -> None:
         super().__init__()
-        length, num_filters, hop = filters.shape
-        quadratic, linear, constant = head
-        arrays = filters, steps, *scales, *scaling, quadratic, linear, silence
-        places = [self._array(each, np.float64) if len(each) else None for each in arrays]
-        self._of = _Onset(
-            len(fast), len(slow), num_filters, len(windows), steps.shape[1], len(linear),
-            hop, length - hop, memory, len(steps),
-            *(self._array(each, np.int64) for each in (fast, slow, windows)), *places, constant,
-            min_alive, most_lost,
+        _, num_filters, hop = filters.shape
+        num_columns, delay, num_steps = len(scaling[0]), windows[-1], steps.shape[1]
+        quadratic, linear, constant = form or (np.empty(0), np.empty(0), 0.0)
+        weights = np.concatenate([np.empty(0), *(each.T.ravel() for each, _ in layers)])
+        biases = np.concatenate([np.empty(0), *(bias for _, bias in layers)])
+        widths = [layers[0][0].shape[1], *(len(bias) for _, bias in layers)] if layers else []
+        whole = (fast, slow, windows, *pairs, lags, widths)
+        numbers = (
+            filters, steps, rounding, silence, least_step, rates, *scaling, weights, biases,
+            quadratic, linear,
         )  # fmt: skip
+        self._of = _Onset(
+            len(fast), len(slow), num_filters, len(windows), pairs.shape[1], num_steps, len(lags),
+            num_columns, len(layers), hop, context, delay, len(steps), blind, min_alive, most_lost,
+            *(self._array(each, np.int64) for each in whole),
+            *(self._array(each, np.float64) if np.size(each) else None for each in numbers),
+            self._array(is_still, np.uint8), constant,
+        )  # fmt: skip
+        num_logs, num_sizes = num_filters * len(fast), num_steps * len(slow)
+        kept = delay * (num_logs + num_filters * pairs.shape[1] + num_sizes)
+        kept += (len(steps) - 1) * len(slow) + len(rates) * num_logs + num_sizes
+        self.memory = np.zeros(1 + kept + (max(lags) if lags else 0) * num_columns)
+        self._num_lost, self._with_columns = 0, with_columns
 
-    def __call__(
-        self, samples: Array, rows: Array, num_rows: int, num_lost: int, listened: Array
-    ) -> tuple[Array, Array, int, int]:
-        """The scores of some hops, NaN without evidence, and which of their blocks are lost.
-
-        Rows of the others are written behind those that are there, or, where the memory begins
-        anew, from the first place on.
+    def __call__(self, samples: Array, in_use: Array) -> tuple[Array, Array, Array]:
+        """The scores of the next hops, which of their blocks are lost, and their columns.
 
         Args:
             samples: of the hops, with their context.
-            rows: memory of blocks.
-            num_rows: that are there.
-            num_lost: lost blocks behind them.
-            listened: channels that are not left out.
+            in_use: channels that are not left out.
 
         Shape:
-            - samples: ``[C, context + k * hop]``, float32 or float64
-            - rows: ``[num_rows + k, F * B + S]``, contiguous; listened: ``[C]``, bool
-            - output: ``[k]`` twice, and both numbers behind these hops
+            - samples: ``[C, context + k * hop]``, float32 or float64; in_use: ``[C]``, bool
+            - output: ``[k]``, NaN without evidence; ``[k]``; ``[k, K]``, or ``[0, K]``
         """
         address, is_float, _, stride, _ = _samples_of(samples[:, None])
         num = (samples.shape[1] - self._of.context) // self._of.hop
         score, is_lost = np.empty(num), np.zeros(num, np.bool_)
+        columns = np.empty((num * self._with_columns, self._of.num_columns))
         call = _OnsetHops(
-            address, is_float, stride, num, num_rows, num_lost,
-            rows.ctypes.data, listened.ctypes.data, score.ctypes.data, is_lost.ctypes.data,
+            address, is_float, stride, num, self._num_lost, self.memory.ctypes.data,
+            in_use.ctypes.data, score.ctypes.data, is_lost.ctypes.data,
+            columns.ctypes.data if self._with_columns else None,
         )  # fmt: skip
         if self._library.tactslip_onset(self._level, ctypes.byref(self._of), ctypes.byref(call)):
             raise MemoryError("the native engine found no memory to work in")
-        return score, is_lost, call.num_rows, call.num_lost
+        self._num_lost = call.num_lost
+        return score, is_lost, columns
 
 
 def carry_bristles(

@@ -103,25 +103,31 @@ struct BristleRun {
   double* out;                     // [3, steps / every, L]
 };
 
-// Evidence of onsets, and the machine on it: OnsetClassifier.
+// Evidence of slip, and the head on it: OnsetClassifier.
 struct Onset {
-  int64_t num_fast, num_slow, num_filters, num_windows, num_steps, num_columns;
-  int64_t hop, context, memory, step_length;  // samples, samples, blocks, blocks
-  const int64_t *fast, *slow, *windows;       // channels; blocks, ascending
+  int64_t num_fast, num_slow, num_filters, num_windows, num_pairs, num_steps, num_lags, num_columns;
+  int64_t num_layers;  // of a network; 0: the quadratic form
+  int64_t hop, context, delay, step_length;  // samples, samples, blocks, blocks
+  int64_t blind, min_alive, most_lost;       // blocks; channels; lost blocks until all begins anew
+  const int64_t *fast, *slow, *windows;      // channels; blocks, ascending
+  const int64_t *first, *second, *lags, *widths;  // [pairs] twice; hops, ascending; [layers + 1]
   const double *filters, *steps;  // [context + hop, filters, hop], [step_length, steps]
-  const double *fast_compression, *slow_compression, *slope, *offset, *quadratic, *linear;  // quadratic may be null
-  const double* silence;  // [fast, filters], half the log power of a silent channel
+  const double *rounding, *silence;  // [filters, fast]: power, half the log power
+  const double *least_step, *rates;  // [slow], [floors]
+  const double *slope, *offset;      // [columns]
+  const double *weights, *biases;    // of layers, one behind the other, [in, out] and [out]
+  const double *quadratic, *linear;  // quadratic may be null
+  const uint8_t* is_still;           // [fast]
   double constant;
-  int64_t min_alive, most_lost;  // fast channels; lost blocks in a row until all begins anew
 };
 
-// Hops to be scored, and the memory of blocks, to which theirs are written, but for lost ones.
+// Hops to be scored, and what is kept between them: Memory.
 struct OnsetHops {
   const void* samples;  // from `context` before the first hop; those of a channel lie side by side
-  int64_t is_float, channel_stride, num_hops;
-  int64_t num_rows, num_lost;  // of the memory, and lost blocks behind them; both are updated
-  double* rows;             // [rows + hops, fast * filters + slow]
-  const uint8_t* listened;  // [channels]
-  double* score;            // [hops], NaN without evidence
-  uint8_t* is_lost;         // [hops]
+  int64_t is_float, channel_stride, num_hops, num_lost;  // the last: lost blocks so far, updated
+  double* memory;
+  const uint8_t* in_use;  // [channels]
+  double* score;          // [hops], NaN without evidence
+  uint8_t* is_lost;       // [hops]
+  double* columns;        // [hops, columns], NaN of lost blocks; may be null
 };

@@ -54,7 +54,7 @@ class AlarmSettings:
         hop_samples: distance of two decisions.
         calibration: from a score to a log likelihood ratio.
         rule: from these to a statistic.
-        threshold: at which the statistic raises an alarm.
+        threshold: at which the statistic raises an alarm; of no use with an onset classifier.
         target_per_hour: false alarms an hour that the threshold was set for; ``None``: no
             rate was set.
         slip_share: how much of a stream is slip; the balance that probabilities are stated for.
@@ -64,7 +64,7 @@ class AlarmSettings:
         lead_s: from an onset to the first decision that speaks for slip, in the middle; the
             estimate of an onset goes back by it.
         metadata: on what the threshold was set, JSON-able: recordings, hours, achieved rate.
-        onset: classifier of fast evidence; with it an alarm comes from either, and decisions are
+        onset: classifier of slipping now; with it alarms come from it alone, and decisions are
             its hop apart.
 
     Raises:
@@ -121,7 +121,8 @@ class AlarmSettings:
         """The same with another ``alarm_threshold``."""
         if self.onset is None:
             return replace(self, threshold=value)
-        return replace(self, onset=replace(self.onset, threshold=value))
+        hint = min(self.onset.hint, value)  # which is never the higher one
+        return replace(self, onset=replace(self.onset, threshold=value, hint=hint))
 
     def latch_times(self, sample_rate_hz: float) -> dict[str, int]:
         """Times of a latch, in decisions, rounded up."""
@@ -137,6 +138,7 @@ class AlarmSettings:
         plain["calibration"] = self.calibration.to_dict()
         plain["rule"] = self.rule.to_dict()
         plain["metadata"] = dict(self.metadata)
+        plain["threshold"] = self.threshold if self.threshold < math.inf else None
         plain["onset"] = self.onset and self.onset.to_dict()
         return plain
 
@@ -153,6 +155,8 @@ class AlarmSettings:
             values = dict(plain)
             values["calibration"] = calibration_from_dict(values["calibration"])
             values["rule"] = rule_from_dict(values["rule"])
+            if values["threshold"] is None:
+                values["threshold"] = math.inf
             if (onset := values.get("onset")) is not None:
                 values["onset"] = OnsetClassifier.from_dict(onset, hand, sample_rate_hz)
             return cls(**values)
@@ -269,12 +273,11 @@ class Alarm:
         alarm_s: when it could be raised: the end of the deciding bin and the look-ahead.
         onset_s: when the slip is thought to have begun, no later than that.
         score: of the deciding bin.
-        probability: that the deciding bin is slip; NaN, as the two others, where the onset
-            classifier decided alone.
+        probability: that the last bin is slip; NaN, as score and statistic, where there is none.
         statistic: of the rule.
         in_range: whether the channels moved about as much as in training.
         channels_lost: names of the channels that were left out.
-        raised_by: ``"onset"``, the classifier of fast evidence, or ``"status"``, that of bins.
+        raised_by: ``"onset"``, the classifier of slipping now, or ``"status"``, that of bins.
     """
 
     alarm_s: float
@@ -291,8 +294,8 @@ class Decisions(NamedTuple):
     """One entry per decision of a stream, in order.
 
     With an onset classifier there is one every hop of its own, and the columns of bins are those of
-    the last bin known by then; before the first bin none is valid. Such a decision is valid where
-    the bin is, or where there is fast evidence.
+    the last bin known by then. Such a decision is valid where the bin is, or where the classifier
+    has a score; only the score raises alarms.
 
     Attributes:
         number: of the decision in its stream, from 0, ``[m]``, int64.
@@ -307,8 +310,9 @@ class Decisions(NamedTuple):
         channels_lost: channels in use that were left out, ``[m, C]``.
         is_alarm: whether it raises an alarm, ``[m]``.
         is_on: whether an alarm stands after it: the contact's status, ``[m]``.
-        onset_score: of fast evidence, ``NOTHING_YET`` where there is none, ``[m]``, float64.
-        by_onset: whether fast evidence reaches its threshold, ``[m]``.
+        onset_score: of the onset classifier, ``NOTHING_YET`` where there is none, ``[m]``, float64.
+        by_onset: whether that reaches its threshold, ``[m]``.
+        is_hint: whether it reaches the lower one, ``[m]``; never without an onset classifier.
         channels: names of ``C`` channels, empty where they are not known.
     """
 
@@ -326,6 +330,7 @@ class Decisions(NamedTuple):
     is_on: Tensor
     onset_score: Tensor
     by_onset: Tensor
+    is_hint: Tensor
     channels: tuple[str, ...] = ()
 
     @property
@@ -454,9 +459,8 @@ class Decider:
     """Scores in, decisions out; its memory has a fixed size.
 
     ``decide`` takes bins alone. With an onset classifier ``join`` makes of these decisions and
-    of onset scores those of the alarm: it is raised by whichever reaches its threshold first, and
-    stands until both have been low for ``rearm_s``. So bins confirm what fast evidence raised, or
-    clear it.
+    of onset scores those of the alarm: it is raised where the score reaches its threshold, and
+    stands until the score has been low for ``rearm_s``. Bins raise none then.
 
     Decisions that are not valid move nothing. After ``settings.hold_s`` of lost samples an alarm
     that stands ends, and the rule begins anew.
@@ -561,6 +565,7 @@ class Decider:
             torch.from_numpy(standing),
             torch.full(score.shape, NOTHING_YET, dtype=torch.float64),
             torch.zeros(score.shape, dtype=torch.bool),
+            torch.zeros(score.shape, dtype=torch.bool),
             self._channels,
         )
 
@@ -592,10 +597,9 @@ class Decider:
         began_s, of_bin = latest[0], latest[1:5].astype(bins.score.numpy().dtype)
         score, llr, stated, statistic = torch.from_numpy(of_bin).unbind()
         by_onset = scores >= onset.threshold
-        with np.errstate(invalid="ignore"):  # NaN is not high
-            is_high = by_onset | (of_bin[3] >= of_bin.dtype.type(settings.threshold))
-        is_valid = (latest[5] > 0) | (scores > NOTHING_YET)
-        _, alarms, standing, _ = self._alarm_rule.walk(np.where(is_valid, is_high * 1.0, np.nan), 0)
+        is_known = scores > NOTHING_YET
+        ratios = np.where(is_known, by_onset * 1.0, np.nan)
+        _, alarms, standing, _ = self._alarm_rule.walk(ratios, 0)
         available_s = self._end_s(samples)
         onset_s = np.where(by_onset, available_s - onset.lead_s, began_s)
         return Decisions(
@@ -606,13 +610,14 @@ class Decider:
             llr,
             stated,
             statistic,
-            torch.from_numpy(is_valid),
+            torch.from_numpy((latest[5] > 0) | is_known),
             torch.from_numpy(latest[6] > 0),
             torch.from_numpy(latest[7:].T > 0),
             torch.from_numpy(alarms),
             torch.from_numpy(standing),
             onset_score,
             torch.from_numpy(by_onset),
+            torch.from_numpy(scores >= onset.hint),
             self._channels,
         )
 

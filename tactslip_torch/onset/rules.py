@@ -260,8 +260,7 @@ class Budget:
 
     Args:
         scene: kind of recordings.
-        limit: alarms an hour in which nothing slips; of a share, alarms a knock.
-        is_share: whether it is a share of knocks.
+        limit: alarms an hour in which nothing slips.
         confidence: with which the limit is to hold.
         dispersion: variance of the counts of alarms by their mean, at least 1. Alarms that come in
             bunches tell as much as so many fewer that do not.
@@ -272,42 +271,36 @@ class Budget:
 
     scene: str
     limit: float
-    is_share: bool = False
     confidence: float = 0.95
     dispersion: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (0 < self.limit < math.inf and (self.limit < 1 or not self.is_share)):
-            most = "between 0 and 1" if self.is_share else "positive"
-            raise ValueError(f"onset.budget of {self.scene} must be {most}, got {self.limit}")
+        if not 0 < self.limit < math.inf:
+            raise ValueError(f"onset.budget of {self.scene} must be positive, got {self.limit}")
         check_share("onset.confidence", self.confidence)
         check_number("dispersion", self.dispersion, least=1)
 
     def bound(self, alarms: int, amount: float) -> float:
-        """The upper confidence bound of what so many alarms in so many hours, or knocks, show.
+        """The upper confidence bound of what so many alarms in so many hours show.
 
         Reference:
-            Garwood (1936), Biometrika 28, 437-442; Clopper and Pearson (1934), 26, 404-413.
+            Garwood (1936), Biometrika 28, 437-442.
             Dispersion: McCullagh and Nelder (1989), Generalized Linear Models, 6.2.3.
         """
-        from scipy.special import betaincinv, gammaincinv  # of no need for a stream
+        from scipy.special import gammaincinv  # of no need for a stream
 
         if not amount > 0:
             return math.inf
-        if not self.is_share:
-            effective = float(gammaincinv(alarms / self.dispersion + 1, self.confidence))
-            return self.dispersion * effective / amount
-        if alarms >= amount:
-            return 1.0
-        return float(betaincinv(alarms + 1, amount - alarms, self.confidence))
+        effective = float(gammaincinv(alarms / self.dispersion + 1, self.confidence))
+        return self.dispersion * effective / amount
 
     def interval(self, alarms: int, amount: float, level: float = 0.95) -> tuple[float, float]:
-        """The central interval of the rate, or share, that so many alarms show."""
+        """The central interval of the rate that so many alarms show."""
         low, high = (replace(self, confidence=(1 + side * level) / 2) for side in (-1, 1))
         return low.bound(alarms - 1, amount) if alarms else 0.0, high.bound(alarms, amount)
 
     def allowed(self, amount: float) -> int:
-        """Most alarms in so many hours, or knocks, whose bound lies within the limit.
+        """Most alarms in so many hours whose bound lies within the limit.
 
         Raises:
             ValueError: if not even none would show it.
@@ -316,16 +309,11 @@ class Budget:
         while count + 1 < max(amount, 1) * 1e3 and self.bound(count + 1, amount) <= self.limit:
             count += 1
         if count < 0:
-            what, unit = ("share", "knocks") if self.is_share else ("rate", "h")
-            least = math.log(1 - self.confidence) / (
-                math.log1p(-self.limit) if self.is_share else -self.limit
-            )
-            scale = 1 if self.is_share else 1000
-            least = math.ceil(least * scale) / scale
+            least = math.ceil(-1000 * math.log(1 - self.confidence) / self.limit) / 1000
             raise ValueError(
-                f"{amount:.3g} {unit} of {self.scene} cannot show a {what} of at most "
+                f"{amount:.3g} h of {self.scene} cannot show a rate of at most "
                 f"{self.limit:g} with a confidence of {self.confidence:g}, even without an alarm: "
-                f"give at least {least:g} {unit}, or a larger onset.budget"
+                f"give at least {least:g} h, or a larger onset.budget"
             )
         return count
 
@@ -350,7 +338,6 @@ def lowest_threshold(
     *,
     rearm: int,
     refractory: int,
-    is_raised: Sequence[NDArray[np.bool_]] | None = None,
 ) -> float:
     """The lowest threshold at which quiet stretches of recordings have at most so many alarms.
 
@@ -364,7 +351,6 @@ def lowest_threshold(
         allowed: alarms.
         rearm: decisions in a row below the threshold that re-arm.
         refractory: shortest distance of two alarms, in decisions.
-        is_raised: where another statistic reaches its own threshold, if one does.
     """
     gap = rearm + refractory + 2  # so far apart that no latch remembers
     flat = np.concatenate([np.append(own, np.full(gap, -np.inf, own.dtype)) for own in scores])
@@ -376,12 +362,9 @@ def lowest_threshold(
         raise ValueError("no decision to count alarms in; give recordings without slip")
     tried = max(1, min(_MOST_TRIED, len(ranked) // _LEAST_QUIET))
     places = np.flatnonzero(flat >= ranked[tried - 1])
-    other = np.zeros(0, np.int64)
-    if is_raised is not None:
-        other = np.flatnonzero(np.concatenate([x for own in is_raised for x in (own, none)]))
 
     def keeps(threshold: float) -> bool:
-        above = np.union1d(places[flat[places] >= threshold], other)
+        above = places[flat[places] >= threshold]
         return bool(quiet[_alarms(above, rearm, refractory)].sum() <= allowed)
 
     return _lowest(ranked[:tried], float(np.nextafter(ranked[0], np.inf)), keeps)

@@ -941,8 +941,6 @@ def _target_line(metrics: _Metrics) -> str:
     for row in metadata["budget"]:
         limit = f"{row['limit']:g} an hour"
         amount = f"{row['amount']:.1f} h"
-        if row["is_share"]:
-            limit, amount = f"{100 * row['limit']:g} % of knocks", f"{row['amount']} knocks"
         few = f"{row['alarms']} of {row['allowed']} allowed in {amount}"
         parts.append(f"{style.words(row['scene'])} {limit} ({few})")
     return (
@@ -961,12 +959,11 @@ def _budget_rows(metrics: _Metrics) -> list[_Row]:
     for row in metrics["alarm"]["budget"]:
         if row["role"] not in _STREAMS or not row["amount"]:
             continue
-        unit, factor = ("% of knocks", 100) if row["is_share"] else ("/h", 1)
-        amount = f"{row['amount']} knocks" if row["is_share"] else f"{row['amount']:.1f} h"
         head: _Row = {"scene": style.words(row["scene"])}
         head |= {"materials": {"test": "seen"}.get(row["role"], row["role"])}
-        head |= {"budget": f"{factor * row['limit']:g} {unit}", "of": amount}
-        reached = style.interval({"value": row["rate"], **row}, 2, scale=factor)
+        limit = "-" if row["limit"] is None else f"{row['limit']:g} /h"
+        head |= {"budget": limit, "of": f"{row['amount']:.1f} h"}
+        reached = style.interval({"value": row["rate"], **row}, 2)
         found.setdefault((row["scene"], row["role"]), head)[style.words(row["method"])] = reached
     return list(found.values())
 
@@ -1041,7 +1038,7 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
             _draw_rates(right, rates, aside, colour)
     left.set_title(f"Without slip: {' and '.join(hours)}")
     left.axvline(target, color=style.INK, linewidth=1, linestyle="--", zorder=1)
-    limits = {row["scene"]: row["limit"] for row in alarm["budget"] if not row["is_share"]}
+    limits = {row["scene"]: row["limit"] for row in alarm["budget"] if row["limit"]}
     for right in others:
         title = f"Confounding scenes, by {style.words(alarm['rule'])} (bars: their budgets)"
         right.set_title(title)

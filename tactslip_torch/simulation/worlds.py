@@ -106,6 +106,7 @@ class WorldRecordings(SimulatedRecordings):
 
     Args:
         seed: of the whole set.
+        purpose: sets of one seed for several purposes have nothing in common.
         slips: recordings with three slips each.
         confounders: recordings of each kind without slip; kinds that are not named have none.
         materials: ids in ``MATERIALS``, taken in turn.
@@ -128,6 +129,7 @@ class WorldRecordings(SimulatedRecordings):
         self,
         *,
         seed: int = 0,
+        purpose: str = "learn",
         slips: int = 0,
         confounders: Mapping[str, int] | None = None,
         materials: Iterable[str] = SEEN_MATERIALS,
@@ -150,6 +152,7 @@ class WorldRecordings(SimulatedRecordings):
                 f"{', '.join(CONFOUNDERS)}"
             )
         self._seed, self._tail_s, self._fixed = seed, tail_s, dict(scene or {})
+        self._purpose = purpose
         self._shares = imperfect, bristles
         materials = tuple(materials)
         for kind, num in ({SLIP: slips} | confounders).items():
@@ -162,7 +165,8 @@ class WorldRecordings(SimulatedRecordings):
 
     def _drawn(self, material: str, kind: str, number: int) -> Scene:
         """The scene of a recording; drawn again where its contact cannot take what is asked for."""
-        rng = generator(self._seed, "world", kind, number)
+        rng = generator(self._seed, "world", self._purpose, kind, number)
+        session = f"{material}/{self._purpose}/{kind}/{number}"
         for _ in range(_MOST_DRAWS):
             values = self._common(rng)
             values |= self._with_slips(rng) if kind == SLIP else self._without(rng, kind)
@@ -171,7 +175,7 @@ class WorldRecordings(SimulatedRecordings):
                 cycles=1,
                 materials=[material],
                 hand=self.hand,
-                **(values | self._fixed | {"name": kind, "session": f"{material}/{kind}/{number}"}),
+                **(values | self._fixed | {"name": kind, "session": session}),
             )
             try:
                 Handled(scene, draw_grasp(scene))

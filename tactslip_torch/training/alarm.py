@@ -1,7 +1,7 @@
 """The alarm of a fitted detector, set on recordings that it was not trained on.
 
-``CalibratedAlarm`` fits the onset classifier and sets its threshold and that of bins within a
-budget of false alarms; recordings that learn, calibrate and test are apart. ``DebouncedAlarm`` is
+``CalibratedAlarm`` fits the classifier of slipping now and sets its threshold within a budget of
+false alarms; recordings that learn, calibrate and test are apart. ``DebouncedAlarm`` is
 for sets with too little recorded without slip to count false alarms: k of the last n decisions
 speak for slip, and the rate of false alarms is not known.
 """
@@ -12,7 +12,7 @@ import logging
 import math
 import statistics
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.data.labels import whole_samples
-from tactslip_torch.data.recording import PAPER_SCENE, RecordingId, RecordingSource, Timeline
+from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.calibration import (
     Platt,
@@ -72,13 +72,14 @@ log = logging.getLogger(__name__)
 OURS = "detector"
 """The name of the detector among those that score; the others are baselines."""
 
-JOINT = "onset and status"
-"""The name of the alarm of fast evidence and bins together."""
+SLIPPING_NOW = "slipping now"
+"""The name of the alarm of the onset classifier."""
+
+CONFOUNDERS = "confounders"
+"""In a budget: all recordings that calibrate, but for those without slip and those with slips."""
 
 FIRST_TRANSITION = "first transition"
 """The name of the paper's rule."""
-
-_SHARE = "_share"  # behind a scene: a budget of its knocks
 
 LEAST, MOST = 0.1, 1000.0
 """False alarms an hour that are of interest."""
@@ -90,7 +91,7 @@ _NUM_POINTS = 25  # of a threshold curve, at most
 _NUM_TRIED = 100
 _PUSHES = 200  # timed
 _FULL_S = 2.0  # of stream, until memories are full
-_OF_BINS = 0.5  # of what a budget allows, at most, that bins alone raise
+_HELD_OF_HINTS = 0.05  # of the rate of hints, what recordings without slip may have
 _SETTLE_S = 0.05  # behind what a decision rests on, as EventRules.settle_s
 _LEVEL = 0.95  # of intervals
 _OTHERS = "others"  # scenes without hours of their own
@@ -189,7 +190,7 @@ def _scored(
     return streams
 
 
-def labelled(streams: Sequence[Stream], timing: Timing) -> tuple[Tensor, Tensor]:
+def _labelled(streams: Sequence[Stream], timing: Timing) -> tuple[Tensor, Tensor]:
     """Scores of valid bins that are wholly slip or non-slip, ``[N]``, and which they are.
 
     A bin is slip if it lies in a slide, and non-slip if it meets none.
@@ -309,7 +310,7 @@ def _reliability(
     by_material: dict[str, Any] = {}
     for name in (None, *dict.fromkeys(stream.recording.material for stream in streams)):
         own = [stream for stream in streams if name in (None, stream.recording.material)]
-        scores, is_slip = labelled(own, timing)
+        scores, is_slip = _labelled(own, timing)
         if bool(is_slip.any()) and not bool(is_slip.all()):
             stated = probability(settings.calibration.llr(scores), settings.slip_share)
             weights = weights_at_share(is_slip, settings.slip_share)
@@ -359,13 +360,14 @@ def within_budgets(
     budgets: Sequence[Budget],
     allowed: int | None = None,
     scored: Sequence[BudgetScores] | None = None,
+    slip_scene: str = "",
 ) -> AlarmSettings:
-    """Settings with the lowest thresholds that keep every budget, and what they gave as metadata.
+    """Settings with the lowest threshold that keeps every budget, and what it gave as metadata.
 
-    With an onset classifier bins alone use at most half of each. A threshold that the rule cannot
-    reach is infinite. A ``Cusum`` without ceiling gets one above its threshold. A sum that is
-    capped is sooner low again, so what was one alarm can be two; the threshold is raised until
-    budgets are kept.
+    It is that of the onset classifier, if there is one. A threshold that a rule cannot reach is
+    infinite. A ``Cusum`` without ceiling gets one above its threshold. A sum that is capped is
+    sooner low again, so what was one alarm can be two; the threshold is raised until budgets are
+    kept.
 
     Args:
         settings: calibration, rule and onset classifier; their thresholds do not count.
@@ -374,27 +376,26 @@ def within_budgets(
         budgets: the first is of recordings without slip, whose rate is stated.
         allowed: alarms, in place of those that each budget allows.
         scored: ``budget_scores`` of all this, where they are known.
+        slip_scene: of recordings with slips, which are no confounders.
 
     Raises:
         ValueError: if streams are too few to show a budget.
     """
     rule, onset = settings.rule, settings.onset
     settings = replace(settings, threshold=math.inf)
-    scored = scored or budget_scores(streams, settings, timing, budgets)
+    scored = scored or budget_scores(streams, settings, timing, budgets, slip_scene)
     most = [of.budget.allowed(of.amount) if allowed is None else allowed for of in scored]
-    part = _OF_BINS if onset else 1.0
-    value = _lowest(scored, [int(part * of) for of in most], settings, timing, "statistic")
-    value = max(value, _LEAST_THRESHOLD)
+    if onset is not None:
+        threshold = _lowest(scored, most, settings, timing, "onset_score")
+        return _with_counts(settings.at_threshold(threshold), scored, most, timing)
+    value = max(_lowest(scored, most, settings, timing, "statistic"), _LEAST_THRESHOLD)
     while True:
         value, made = value if value <= rule.ceiling else math.inf, rule
         if isinstance(rule, Cusum) and rule.ceiling == math.inf:
             made = replace(rule, ceiling=_CEILING * value)
         settings = replace(settings, rule=made, threshold=value)
         if made != rule:
-            scored = budget_scores(streams, settings, timing, budgets)
-        if onset:
-            threshold = _lowest(scored, most, settings, timing, "onset_score")
-            settings = replace(settings, onset=replace(onset, threshold=threshold))
+            scored = budget_scores(streams, settings, timing, budgets, slip_scene)
         settings = _with_counts(settings, scored, most, timing)
         if all(row["alarms"] <= row["allowed"] for row in settings.metadata["budget"]):
             return settings
@@ -410,7 +411,7 @@ class BudgetScores:
         statistic: of the rule, ``[N]`` of each recording.
         onset_score: of the onset classifier, likewise.
         is_quiet: where an alarm is false; a decision that is not valid raises none.
-        amount: hours, or knocks.
+        amount: hours.
     """
 
     budget: Budget
@@ -419,21 +420,14 @@ class BudgetScores:
     is_quiet: list[NDArray[np.bool_]] = field(default_factory=list)
     amount: float = 0
 
-    def raised(self, settings: AlarmSettings) -> list[NDArray[np.bool_]]:
-        """Where bins alone would raise an alarm."""
-        return [own >= settings.threshold for own in self.statistic]
-
     def alarms(self, settings: AlarmSettings, sample_rate_hz: float) -> list[NDArray[np.int64]]:
         """Places of the false alarms of each recording."""
-        raised, onset = self.raised(settings), settings.onset
+        scores = self.statistic if settings.onset is None else self.onset_score
         times = settings.latch_times(sample_rate_hz)
-        if onset is not None:
-            raised = [
-                of_bins | (own >= onset.threshold)
-                for of_bins, own in zip(raised, self.onset_score, strict=True)
-            ]
-        pairs = zip(raised, self.is_quiet, strict=True)
-        return [false_alarms(is_high, is_quiet, **times) for is_high, is_quiet in pairs]
+        return [
+            false_alarms(own >= settings.alarm_threshold, is_quiet, **times)
+            for own, is_quiet in zip(scores, self.is_quiet, strict=True)
+        ]
 
 
 def _decisions_h(settings: AlarmSettings, timing: Timing) -> float:
@@ -446,19 +440,28 @@ def budget_scores(
     settings: AlarmSettings,
     timing: Timing,
     budgets: Sequence[Budget],
+    slip_scene: str = "",
 ) -> list[BudgetScores]:
     """What thresholds are set on, of each budget; the shortest streams first.
 
     Alarms are false where nothing slips, outside slides and what is left of them in bins and rules.
     """
+    without = {slip_scene, *(budget.scene for budget in budgets)}
     settle_s = (timing.bin_samples + timing.look_ahead) / timing.sample_rate_hz + _SETTLE_S
     found = []
     for budget in budgets:
         scores = BudgetScores(budget)
-        own = [stream for stream in streams if stream.recording.scene == budget.scene]
+        own = [
+            stream
+            for stream in streams
+            if stream.recording.scene == budget.scene
+            or (budget.scene == CONFOUNDERS and stream.recording.scene not in without)
+        ]
         for stream, made in decide(own, settings, timing):
             time_s, times = made.available_s.numpy(), stream.times
             quiet = made.is_valid.numpy().copy()
+            if settings.onset is not None:
+                quiet &= made.onset_score.numpy() > NOTHING_YET
             firsts = first_releases(times.onsets_s, times.released_s)
             for first_s, (_, end_s) in zip(firsts, times.sliding_s, strict=True):
                 before_s = first_s - EventRules().early_s
@@ -466,8 +469,7 @@ def budget_scores(
             scores.statistic.append(made.statistic.numpy())
             scores.onset_score.append(made.onset_score.numpy())
             scores.is_quiet.append(quiet)
-            hours = int(quiet.sum()) / _decisions_h(settings, timing)
-            scores.amount += len(times.non_slip_s) if budget.is_share else hours
+            scores.amount += int(quiet.sum()) / _decisions_h(settings, timing)
         found.append(scores)
     return found
 
@@ -486,7 +488,6 @@ def _lowest(
             getattr(scores, name),
             scores.is_quiet,
             most,
-            is_raised=scores.raised(settings) if name == "onset_score" else None,
             **times,
         )
         for scores, most in zip(scored, allowed, strict=True)
@@ -507,7 +508,6 @@ def _with_counts(
         rows.append(
             {
                 "scene": budget.scene,
-                "is_share": budget.is_share,
                 "limit": budget.limit,
                 "amount": scores.amount,
                 "allowed": most,
@@ -533,31 +533,30 @@ def _with_counts(
 
 @dataclass(frozen=True)
 class CalibratedAlarm:
-    """Sets the alarm of a fitted detector, of fast evidence and of bins, within a budget.
+    """Sets the alarm of a fitted detector, of a classifier of slipping now, within a budget.
 
-    Of the recordings that the detector was not trained on, those of seen materials *learn* (the
-    onset classifier), *calibrate* (thresholds) and *test*; those of held-out materials test alone.
-
-    A classifier of bins raises an alarm where its rule reaches a threshold at which it uses at most
-    half of every budget; the onset classifier gets the lowest threshold at which both together keep
-    all of them: slips of new materials may be weaker. Recordings that calibrate are scored by an
-    onset classifier that was fitted without their material, so that budgets hold for new materials.
-    Baselines are thresholds on a score, at the onset classifier's hop and under the same budgets.
+    The classifier learns from recordings of its own. Of ``streams``, those of the materials that it
+    learned from set thresholds and test; those of other materials test alone. What sets thresholds
+    is scored by a classifier that was fitted without its material, so that budgets hold for new
+    materials. Beside it the detector of bins and baselines are thresholds on their scores, under
+    the same budgets.
 
     Args:
-        streams: recordings, those trained on included or not; of the paper's scene, without
-            slip, and of confounding scenes.
+        worlds: recordings to learn from.
+        streams: recordings with slips, without, and of confounders.
         classifier: how the onset classifier is fitted.
-        budget: false alarms an hour of each scene; of ``SCENE_share``, alarms a knock.
+        budget: false alarms an hour of each scene; ``"confounders"``: of all scenes that are not
+            named, together.
         confidence: with which budgets are to hold.
-        hours: to calibrate on, by scene; ``None``: half of the recordings.
-        check_hours: to check on, at most, by scene, ``"others"`` for those that are not named; for
-            seen and for held-out materials.
+        hint_per_hour: false hints an hour of confounders.
+        hours: to calibrate on, by scene, ``"others"`` for those that are not named.
+        check_hours: to check on, at most, likewise; for seen and for held-out materials.
         hop_ms: distance of two bins.
         slip_free: the scene without slip.
+        with_slips: the scene with slips.
         rule: what gathers evidence of bins; ``evidence: null`` is hop / bin.
         slip_share: how much of a stream is slip, for probabilities.
-        rearm_s: how long both must stay low before the next alarm.
+        rearm_s: how long the score must stay low before the next alarm.
         refractory_s: shortest time between two alarms.
 
     Raises:
@@ -565,6 +564,7 @@ class CalibratedAlarm:
             number of samples, or a number out of range.
     """
 
+    worlds: RecordingSource
     streams: RecordingSource
     classifier: OnsetTraining
     budget: Mapping[str, float]
@@ -572,24 +572,29 @@ class CalibratedAlarm:
     check_hours: Mapping[str, float]
     hop_ms: float
     slip_free: str
+    with_slips: str
     rule: Mapping[str, Any]
     confidence: float = 0.95
+    hint_per_hour: float = 60.0
     slip_share: float = 0.5
     rearm_s: float = 0.2
     refractory_s: float = 0.2
 
     def __post_init__(self) -> None:
         scenes = sorted({recording.scene for recording in self.streams.ids})
-        named = [*(budget.scene for budget in self.budgets), *self.hours, *self.check_hours]
-        for name in (self.slip_free, *self.classifier.scenes, *named):
-            if name not in (*scenes, _OTHERS):
+        named = [*self.budget, *self.hours, *self.check_hours]
+        for name in (self.slip_free, self.with_slips, *named):
+            if name not in (*scenes, _OTHERS, CONFOUNDERS):
                 raise ValueError(
                     f"onset.streams has no scene {name!r}, it has {', '.join(scenes)}; take it out "
-                    "of onset.budget, onset.hours and onset.classifier.scenes"
+                    "of onset.budget and onset.hours"
                 )
         if self.slip_free not in self.budget:
             raise ValueError(f"onset.budget must say what {self.slip_free} may have, an hour")
-        check_number("onset.hop_ms", self.hop_ms)
+        for name in ("hop_ms", "hint_per_hour"):
+            check_number(f"onset.{name}", getattr(self, name))
+        for name, limit in self.budget.items():
+            check_number(f"onset.budget.{name}", limit)
         self._settings(self.made_rule(1), Platt(1.0, 0.0), self.hop_samples)  # refuses bad numbers
 
     @property
@@ -599,11 +604,9 @@ class CalibratedAlarm:
 
     @property
     def budgets(self) -> list[Budget]:
-        """What each scene may have."""
-        return [
-            Budget(name.removesuffix(_SHARE), limit, name.endswith(_SHARE), self.confidence)
-            for name, limit in self.budget.items()
-        ]
+        """What recordings may have, those without slip first."""
+        names = sorted(self.budget, key=lambda name: name != self.slip_free)
+        return [Budget(n, self.budget[n], confidence=self.confidence) for n in names]
 
     def made_rule(self, bin_samples: int) -> Rule:
         """The rule; where it leaves it open, evidence is hop / bin."""
@@ -612,55 +615,48 @@ class CalibratedAlarm:
         return rule_from_dict({**self.rule, "evidence": evidence} if is_open else self.rule)
 
     def roles(self, detector: SlipDetector) -> dict[str, list[RecordingId]]:
-        """Which recordings learn, calibrate and test, of seen and of held-out materials.
+        """Which recordings calibrate and test, of seen and of held-out materials.
 
         Raises:
-            ValueError: if there is no recording to calibrate on.
+            ValueError: if there is no recording to calibrate on, or too few to show a budget.
         """
         trained = set(detector.info.get("train_recordings", {}).values())
-        seen = set(detector.info.get("train_materials", ()))
-        roles: dict[str, list[RecordingId]] = {
-            role: [] for role in ("learn", "calibrate", "test", "unseen")
-        }
+        seen = {recording.material for recording in self.worlds.ids}
+        roles: dict[str, list[RecordingId]] = {"calibrate": [], "test": [], "unseen": []}
         hours: defaultdict[tuple[str, str], float] = defaultdict(float)
-        places: Counter[tuple[str, str]] = Counter()
         fresh = [r for r in self.streams.ids if cache_key(self.streams.key(r)) not in trained]
         for recording in sorted(fresh, key=lambda r: (r.scene, r.cycle, r.material)):
-            scene, of = recording.scene, (recording.material, recording.scene)
-            role = "test" if recording.material in seen else "unseen"
-            if role == "test":
-                places[of] += 1
-                learns = scene in self.classifier.scenes
-                if learns and places[of] <= self.classifier.cycles:
-                    roles["learn"].append(recording)
-                    continue
-                most = self.hours.get(scene, math.inf if scene == PAPER_SCENE else 0.0)
-                is_even = scene != PAPER_SCENE or places[of] % 2 == 0
-                if hours["calibrate", scene] < most and is_even:
-                    role = "calibrate"
+            scene, role = recording.scene, "unseen"
+            if recording.material in seen:
+                most = self.hours.get(scene, self.hours.get(_OTHERS, 0.0))
+                role = "calibrate" if hours["calibrate", scene] < most else "test"
             most = self.check_hours.get(scene, self.check_hours.get(_OTHERS, 0.0))
             if role != "calibrate" and hours[role, scene] >= most:
                 continue
             hours[role, scene] += self.streams.timeline(recording).duration_s / 3600
             roles[role].append(recording)
+        given: defaultdict[str, float] = defaultdict(float)
+        for recording in roles["calibrate"]:
+            scene, h = recording.scene, hours["calibrate", recording.scene]
+            given[scene] = h
         for scene, wanted in self.hours.items():
-            if (given := hours["calibrate", scene]) < wanted:
+            if scene != _OTHERS and given[scene] < wanted:
                 log.warning(
                     "%.2f h of %s are left to calibrate on, onset.hours asks for %g: give "
                     "onset.streams more",
-                    given,
+                    given[scene],
                     scene,
                     wanted,
                 )
+        named = {self.with_slips, *self.budget}
+        given[CONFOUNDERS] = sum(h for scene, h in given.items() if scene not in named)
         for budget in self.budgets:  # refused before hours are spent
-            own = [r for r in roles["calibrate"] if r.scene == budget.scene]
-            knocks = sum(len(self.streams.timeline(r).non_slip_s) for r in own)
-            budget.allowed(knocks if budget.is_share else hours["calibrate", budget.scene])
-        for scene in (PAPER_SCENE, self.slip_free):
-            if not any(recording.scene == scene for recording in roles["calibrate"]):
+            budget.allowed(given[budget.scene])
+        for scene in (self.with_slips, self.slip_free):
+            if not given[scene]:
                 raise ValueError(
                     f"no recording of scene {scene} that was not trained on is left to calibrate "
-                    "on; give onset.streams more cycles of it"
+                    "on; give onset.streams more of them"
                 )
         return roles
 
@@ -680,18 +676,17 @@ class CalibratedAlarm:
         Returns:
             JSON-able: ``"rule"``, the method that the detector's file has, ``"settings"`` of it,
             ``"sample_rate_hz"``; ``"classifier"``, how the onset classifier was chosen;
+            ``"held_out"``, materials that it did not learn from;
             ``"streams"``, recordings, hours and slips of each role and scene; ``"methods"``;
             ``"budget"``, a row for each budget, method and role; ``"reliability"`` of each role;
-            ``"events"`` of the protocol and of the scene without slip, by role and method;
-            ``"scenes"``, the same of every other scene by role, and whether it was ``"trained"``
-            on.
+            ``"events"`` of the scenes with and without slips, by role and method; ``"scenes"``,
+            the same of every other scene by role, and whether it was ``"trained"`` on.
 
         Raises:
             ValueError: if there is nothing to calibrate on, or too little to show a budget.
         """
         roles = self.roles(detector)
-        learn = roles.pop("learn")
-        onset, left_out, chosen = self.classifier(self.streams, learn, num_workers)
+        onset, left_out, chosen = self.classifier(self.worlds, self.worlds.ids, num_workers)
         scorers: dict[str, Scorer] = {OURS: detector, **(baselines or {})}
         hop, rate = onset.evidence.hop_samples, self.streams.sample_rate_hz
         hops = dict.fromkeys(scorers, hop) | {OURS: self.hop_samples}
@@ -708,10 +703,11 @@ class CalibratedAlarm:
             for name, scorer in scorers.items()
         }
         methods = self.methods(scored["calibrate"], timings, onset)
-        amounts = self._amounts({"learn": learn, **roles})
-        _, settings = methods[JOINT]
-        usual = [budget for budget in self.budgets if budget.scene == self.slip_free]
-        (quiet,) = budget_scores(scored["calibrate"][OURS], settings, timings[OURS], usual[:1])
+        amounts = self._amounts(roles)
+        _, settings = methods[SLIPPING_NOW]
+        (quiet,) = budget_scores(
+            scored["calibrate"][OURS], settings, timings[OURS], self.budgets[:1]
+        )
         curve = threshold_curve(quiet, settings, timings[OURS])
         metadata = {
             **settings.metadata,
@@ -723,10 +719,11 @@ class CalibratedAlarm:
         detector.info[KEY] = settings.to_dict()
         del scored["calibrate"]
         return {
-            "rule": JOINT,
+            "rule": SLIPPING_NOW,
             "sample_rate_hz": rate,
             "settings": settings.to_dict(),
             "classifier": chosen,
+            "held_out": list(dict.fromkeys(recording.material for recording in roles["unseen"])),
             "streams": amounts,
             "methods": {
                 name: {
@@ -755,20 +752,20 @@ class CalibratedAlarm:
             by_scene = defaultdict[str, list[Stream]](list)  # "" the usual ones
             for stream in scored[role][scorer]:
                 scene = stream.recording.scene
-                by_scene["" if scene in (PAPER_SCENE, self.slip_free) else scene].append(stream)
+                by_scene["" if scene in (self.with_slips, self.slip_free) else scene].append(stream)
             for scene, own in by_scene.items():
                 measured_s = compute_s if scorer == OURS else None
                 events[scene][role][name] = _events(own, made, timings[scorer], measured_s)
-            if name == JOINT and (found := _reliability(by_scene[""], made, timings[OURS])):
+            if name == SLIPPING_NOW and (found := _reliability(by_scene[""], made, timings[OURS])):
                 calibrations[f"{role} stream"] = found
-        budget_rows = self._budget_rows(events, methods, scored)
+        budget_rows = self._budget_rows(methods, scored, timings)
         usual = events.pop("", {})
         return {
             "budget": budget_rows,
             "reliability": calibrations,
             "events": {f"{role} stream": found for role, found in usual.items()},
             "scenes": {
-                scene: {"trained": scene in self.classifier.scenes} | by_role
+                scene: {"trained": scene in {r.scene for r in self.worlds.ids}} | by_role
                 for scene, by_role in events.items()
             },
         }
@@ -781,8 +778,8 @@ class CalibratedAlarm:
     ) -> dict[str, tuple[str, AlarmSettings]]:
         """By name whose scores, and what makes alarms of them.
 
-        ``JOINT``; the rule on bins alone, as published, within the budget of ``slip_free``;
-        the paper's own rule, ``FIRST_TRANSITION``; and a threshold on the score of each baseline.
+        ``SLIPPING_NOW``; the rule on bins, under the same budgets; the paper's own rule,
+        ``FIRST_TRANSITION``; and a threshold on the score of each baseline.
 
         The paper's rule makes every change of the score to slip an alarm, one decision a bin: there
         is no threshold but the score's own, and no memory beyond the bin before. It is left out
@@ -797,9 +794,9 @@ class CalibratedAlarm:
             ValueError: if our scores cannot be calibrated, or a budget not be shown.
         """
         ours, timing = streams[OURS], timings[OURS]
-        calibration = fit_platt(*labelled(ours, timing))
+        calibration = fit_platt(*_labelled(ours, timing))
         rule = self.made_rule(timing.bin_samples)
-        methods = {JOINT: (OURS, self.calibrated(rule, calibration, ours, timing, onset))}
+        methods = {SLIPPING_NOW: (OURS, self.calibrated(rule, calibration, ours, timing, onset))}
         alone = self.calibrated(rule, calibration, ours, timing)
         methods[rule.name] = OURS, alone
         if timing.bin_samples % timing.hop_samples == 0:
@@ -810,7 +807,7 @@ class CalibratedAlarm:
             if name != OURS:
                 settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timings[name].hop_samples)
                 of = timings[name]
-                scored = budget_scores(streams[name], settings, of, self.budgets)
+                scored = budget_scores(streams[name], settings, of, self.budgets, self.with_slips)
                 most = [each.budget.allowed(each.amount) for each in scored]
                 threshold = _lowest(scored, most, settings, of, "statistic")
                 settings = replace(settings, threshold=threshold)
@@ -825,21 +822,23 @@ class CalibratedAlarm:
         timing: Timing,
         onset: OnsetClassifier | None = None,
     ) -> AlarmSettings:
-        """Settings with their thresholds.
-
-        With an onset classifier both thresholds, which together keep every budget; of bins alone,
-        as published, the one that keeps that of ``slip_free``.
-        """
-        usual, *others = sorted(self.budgets, key=lambda x: x.scene != self.slip_free)
-        budgets = [usual, *(others if onset else ())]
+        """Settings with the threshold that keeps every budget, and that of hints."""
         settings = replace(self._settings(rule, calibration, timing.hop_samples), onset=onset)
-        settings = within_budgets(settings, streams, timing, budgets)
-        lead_s = _lead_s(streams, replace(settings, onset=None), timing, by_onset=False)
-        settings = replace(settings, lead_s=lead_s)
-        if settings.onset is None:
-            return settings
-        lead_s = _lead_s(streams, settings, timing, by_onset=True)
-        return replace(settings, onset=replace(settings.onset, lead_s=lead_s))
+        made = within_budgets(settings, streams, timing, self.budgets, slip_scene=self.with_slips)
+        lead_s = _lead_s(streams, made, timing, by_onset=onset is not None)
+        if made.onset is None:
+            return replace(made, lead_s=lead_s)
+        rates = {CONFOUNDERS: 1.0, self.slip_free: _HELD_OF_HINTS}
+        hints = [
+            Budget(scene, share * self.hint_per_hour)
+            for scene, share in rates.items()
+            if scene in self.budget
+        ]
+        scored = budget_scores(streams, settings, timing, hints, self.with_slips)
+        most = [int(of.budget.limit * of.amount) for of in scored]
+        hint = _lowest(scored, most, settings, timing, "onset_score")
+        hint = min(hint, made.onset.threshold)
+        return replace(made, onset=replace(made.onset, lead_s=lead_s, hint=hint))
 
     def _settings(self, rule: Rule, calibration: Platt, hop_samples: int) -> AlarmSettings:
         """Without a threshold yet."""
@@ -856,41 +855,43 @@ class CalibratedAlarm:
 
     def _budget_rows(
         self,
-        events: Mapping[str, Mapping[str, Mapping[str, Any]]],
-        methods: Mapping[str, object],
+        methods: Mapping[str, tuple[str, AlarmSettings]],
         scored: Mapping[str, Mapping[str, Sequence[Stream]]],
+        timings: Mapping[str, Timing],
     ) -> list[dict[str, Any]]:
-        """What each method had of each budget, on recordings of each role."""
+        """What each method had of each budget, and of each scene, on recordings of each role."""
         rows = []
-        for role, budget, name in product(scored, self.budgets, methods):
-            is_usual = budget.scene == self.slip_free
-            scene = "" if is_usual else budget.scene
-            numbers = events.get(scene, {}).get(role, {}).get(name, {})
-            if is_usual:
-                numbers = numbers.get("per_scene", {}).get(budget.scene)
-            if not numbers:
-                continue
-            alarms, amount = numbers["num_false_alarms"], numbers["quiet_hours"]
-            if budget.is_share:
-                own = (x for x in scored[role][OURS] if x.recording.scene == budget.scene)
-                amount = sum(len(stream.times.non_slip_s) for stream in own)
-            if not amount:
-                continue
-            low, high = budget.interval(alarms, amount, _LEVEL)
-            rows.append(
-                {
-                    "role": role,
-                    "scene": budget.scene,
-                    "is_share": budget.is_share,
-                    "limit": budget.limit,
-                    "method": name,
-                    "alarms": alarms,
-                    "amount": amount,
-                    "rate": alarms / amount,
-                    "low": low,
-                    "high": high,
-                }
-            )
+        scenes = {stream.recording.scene for own in scored.values() for stream in own[OURS]}
+        limits = {budget.scene: budget.limit for budget in self.budgets}
+        others = sorted(scenes - {self.with_slips, *limits})
+        for role, (name, (scorer, made)) in product(scored, methods.items()):
+            wanted = [*self.budgets, *(Budget(s, limits.get(CONFOUNDERS, 1.0)) for s in others)]
+            for budget in wanted:
+                kinds = self.budgets if budget.scene == CONFOUNDERS else [budget]
+                (of,) = (
+                    one
+                    for one in budget_scores(
+                        scored[role][scorer], made, timings[scorer], kinds, self.with_slips
+                    )
+                    if one.budget.scene == budget.scene
+                )
+                if not of.amount:
+                    continue
+                num = sum(map(len, of.alarms(made, timings[scorer].sample_rate_hz)))
+                low, high = budget.interval(num, of.amount, _LEVEL)
+                rows.append(
+                    {
+                        "role": role,
+                        "scene": budget.scene,
+                        "limit": budget.limit if budget in self.budgets else None,
+                        "method": name,
+                        "alarms": num,
+                        "amount": of.amount,
+                        "rate": num / of.amount,
+                        "low": low,
+                        "high": high,
+                    }
+                )
         return rows
 
     def _amounts(
@@ -913,6 +914,9 @@ class CalibratedAlarm:
 class DebouncedAlarm:
     """Sets the alarm of a fitted detector at no given rate: k of the last n decisions say slip.
 
+    With a classifier of slipping now, fitted on the detector's own training recordings, alarms come
+    from that, at a threshold of about ten false alarms an hour of those that were left out.
+
     Args:
         hop_ms: distance of two decisions; ``None`` for half a bin.
         k: so many decisions must say slip,
@@ -921,6 +925,8 @@ class DebouncedAlarm:
         slip_share: how much of a stream is slip, for probabilities.
         rearm_s: how long the statistic must stay low before the next alarm.
         refractory_s: shortest time between two alarms.
+        classifier: how a classifier of slipping now is fitted; ``None``: there is none.
+        fewest_slips: labelled slips that it is fitted on, at least; with fewer the rule stays.
 
     Raises:
         ValueError: for a number that cannot be.
@@ -933,11 +939,13 @@ class DebouncedAlarm:
     slip_share: float = 0.5
     rearm_s: float = 0.1
     refractory_s: float = 0.2
+    classifier: OnsetTraining | None = None
+    fewest_slips: int = 30
 
     def __post_init__(self) -> None:
         if self.hop_ms is not None:
             check_number("onset.hop_ms", self.hop_ms)
-        for name in ("k", "n"):
+        for name in ("k", "n", "fewest_slips"):
             check_number(f"onset.{name}", getattr(self, name), whole=True)
         check_share("onset.probability", self.probability)
         self._settings(Platt(1.0, 0.0), 1)  # refuses bad numbers
@@ -966,6 +974,37 @@ class DebouncedAlarm:
             )
         hop = self.hop_samples(detector.pool.sample_rate_hz, detector.pool.bin_samples)
         detector.info[KEY] = self._settings(known[0], hop).to_dict()
+
+    def fit(
+        self, detector: SlipDetector, source: RecordingSource, num_workers: int | None = None
+    ) -> dict[str, Any]:
+        """Give a detector that has its alarm a classifier of slipping now.
+
+        Args:
+            detector: fitted on recordings of the source.
+            source: whose labelled slips begin at known times.
+            num_workers: processes.
+
+        Returns:
+            JSON-able: what the classifier was fitted on; empty where there are too few slips.
+        """
+        assert self.classifier is not None
+        trained = set(detector.info.get("train_recordings", {}))
+        own = [recording for recording in source.ids if str(recording) in trained]
+        num_slips = sum(len(source.timeline(recording).onsets_s) for recording in own)
+        if num_slips < self.fewest_slips:
+            log.warning(
+                "%d labelled slips are too few for a classifier of slipping now, which needs %d; "
+                "the alarm stays at %d of %d decisions on bins",
+                *(num_slips, self.fewest_slips, self.k, self.n),
+            )
+            return {}
+        onset, _, report = self.classifier(source, own, num_workers)
+        chosen = report["heads"].get(report["head"], {})
+        onset = replace(onset, threshold=chosen.get("threshold", 0.0))
+        settings = replace(AlarmSettings.of(detector), onset=onset)
+        detector.info[KEY] = settings.to_dict()
+        return report
 
     def _settings(self, calibration: Platt, hop_samples: int) -> AlarmSettings:
         settings = AlarmSettings(

@@ -299,16 +299,12 @@ class Calibrator:
         settings, onset = self.settings, self.settings.onset
         times = settings.latch_times(self.timing.sample_rate_hz)
         rearm, refractory = times["rearm"], times["refractory"]
-        num = num if onset is None else num // 2  # of each classifier
-        quiet = scores.is_quiet
+        statistic = scores.statistic if onset is None else scores.onset_score
         threshold = lowest_threshold(
-            scores.statistic, quiet, num, rearm=rearm, refractory=refractory
+            statistic, scores.is_quiet, num, rearm=rearm, refractory=refractory
         )
         if onset is not None:
-            value = lowest_threshold(
-                scores.onset_score, quiet, num, rearm=rearm, refractory=refractory
-            )
-            settings = replace(settings, onset=replace(onset, threshold=value))
+            return settings.at_threshold(threshold)
         rule = settings.rule
         if isinstance(rule, Cusum):
             settings = replace(settings, rule=replace(rule, ceiling=math.inf))

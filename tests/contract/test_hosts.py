@@ -157,7 +157,7 @@ def test_an_onset_classifier_raises_alarms_and_is_named(
     """The threshold is that of the classifier."""
     expected = truth(hosts.slipping_stream(), threshold, with_onset=True)
     raised_by = [row["raised_by"] for row in expected if row["alarm"]]
-    assert set(raised_by) == ({"onset", "status"} if threshold is None else {"status"})
+    assert set(raised_by) == ({"onset"} if threshold is None else set())
     ran = run_host(host, fast_stream, fast_recording, EVERY, *options)
     hosts.assert_same(ran, expected)
     assert ran.stderr == ""  # nothing is known before the first bin, and nothing is dead
