@@ -34,7 +34,7 @@ class Timing(NamedTuple):
     p99_us: float
 
 
-def time_detector(detector: SlipDetector, calls: int) -> Timing:
+def _time_detector(detector: SlipDetector, calls: int) -> Timing:
     """Time ``predict_raw`` of one ordinary bin in float32, one call after the other.
 
     Args:
@@ -58,7 +58,7 @@ def time_detector(detector: SlipDetector, calls: int) -> Timing:
 
 
 def time_in_fresh_process(path: str | os.PathLike[str], calls: int) -> Timing:
-    """``time_detector`` of a saved detector in a process that has done nothing else.
+    """``_time_detector`` of a saved detector in a process that has done nothing else.
 
     Raises:
         ValueError: if that process ends without a result.
@@ -74,7 +74,7 @@ def time_in_fresh_process(path: str | os.PathLike[str], calls: int) -> Timing:
 
 
 def _time_saved(path: str | os.PathLike[str], calls: int) -> Timing:
-    return time_detector(SlipDetector.load(path), calls)
+    return _time_detector(SlipDetector.load(path), calls)
 
 
 @dataclass(frozen=True)

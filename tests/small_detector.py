@@ -44,7 +44,8 @@ def small_detector(
     rng = np.random.default_rng(seed)
     pool = FeaturePool(HAND, arithmetic=arithmetic)  # type: ignore[arg-type]
     channel_filter = ChannelFilter([51, 51, 11, 11])
-    steady = [i for i, n in enumerate(pool.names) if n.descriptor not in ("mode", "cv", "entropy")]
+    jumpy, is_paper = ("mode", "cv", "entropy"), pool.is_paper.tolist()
+    steady = [i for i, n in enumerate(pool.names) if is_paper[i] and n.descriptor not in jumpy]
     of_gauges = rng.choice([i for i in steady if i < 26], 4, replace=False)
     of_films = rng.choice([i for i in steady if i >= 26], NUM_FEATURES - 4, replace=False)
     selected = [int(i) for i in (*of_gauges, *of_films)]

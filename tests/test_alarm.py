@@ -25,7 +25,7 @@ from tactslip_torch.onset.decisions import KEY, AlarmSettings, Decider, score_st
 from tactslip_torch.onset.events import EventRules, LatencyParts, recording_events
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN
-from tactslip_torch.report.results import _confounder_rows, alarm_figure, alarm_table
+from tactslip_torch.report.results import _alarm_figure, _alarm_table, _confounder_rows
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation import CONFOUNDERS
 from tactslip_torch.training import alarm
@@ -308,10 +308,10 @@ def test_slips_are_found_in_time_and_all_is_told_in_plain_json(calibrated, tmp_p
     with pytest.raises(ValueError, match=r"no alarm threshold; train .*onset=debounced"):
         AlarmSettings.of(loudness_detector())
     metrics = {"simulated": True, "events": found["events"], "alarm": found}
-    assert alarm_table(metrics).startswith("SIMULATED")
+    assert _alarm_table(metrics).startswith("SIMULATED")
     row = next(row for row in _confounder_rows(metrics) if row["scene"] == "taps")
     assert (row["materials"], row["trained on"]) == ("seen", True)
-    alarm_figure(metrics, tmp_path / "alarm.png")
+    _alarm_figure(metrics, tmp_path / "alarm.png")
     assert_png(tmp_path / "alarm.png")
 
 

@@ -14,7 +14,7 @@ from test_learner import learn, unseen_c
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.training.baselines import Baselines, PooledNumber, best_threshold
+from tactslip_torch.training.baselines import Baselines, _PooledNumber, best_threshold
 from tactslip_torch.training.bins import BinSample, RecordingBins
 from tactslip_torch.training.evaluation import Outcomes, compared
 
@@ -47,14 +47,14 @@ def sampled(num=160):
 
 def test_the_pooled_number_is_the_best_of_all_means_and_deviations():
     pool, sample = sampled()
-    number = PooledNumber(pool, sample)
+    number = _PooledNumber(pool, sample)
     assert number.name.statistic in ("mean", "std")
     rng = np.random.default_rng(0)
     features = torch.from_numpy(rng.standard_normal(sample.features.shape)).float().abs()
     place = {str(name): index for index, name in enumerate(pool.names)}
     for channel in ("PVDF1", "PVDF2"):
         features[:, place[f"{channel} A3 time iqr"]] += 5.0 * ~sample.is_slip
-    found = PooledNumber(pool, replace(sample, features=features))
+    found = _PooledNumber(pool, replace(sample, features=features))
     assert str(found.name) == "PVDF A3 time iqr [mean]"
     assert found.metadata["sign"] == -1
     assert torch.equal(found(features), sample.is_slip)

@@ -6,6 +6,7 @@ import torch
 from small_detector import HAND, raw_bins
 
 from tactslip_torch.features.pool import FeaturePool, is_simple_of
+from tactslip_torch.features.sensing import SpanFeatures
 from tactslip_torch.training.columns import VIEWS, joined, view_columns
 
 POOL = FeaturePool(HAND, level=2)
@@ -27,7 +28,8 @@ def drawn(num=60, seed=0, is_dead=None):
 
 def columns_of(view, features, weights):
     allowed = SIMPLE if view == "simple" else DESCRIBED
-    return view_columns(view, POOL, allowed, features, weights, STATISTICS)
+    spans = SpanFeatures(POOL.hand, POOL.names, POOL.bin_samples)
+    return view_columns(view, POOL.hand, POOL.names, spans, allowed, features, weights, STATISTICS)
 
 
 def source(selection):

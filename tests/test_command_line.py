@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 
 from tactslip_torch import __version__
 from tactslip_torch.__main__ import COMMANDS, OF_THEIR_OWN, main
-from tactslip_torch.commands.configuration import checked, conf_dir, help_text, keys_of, with_lists
+from tactslip_torch.commands.configuration import _keys_of, checked, conf_dir, help_text, with_lists
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "troubleshooting.md"
@@ -181,7 +181,7 @@ def test_what_can_be_set_and_every_example_of_the_help_pass(line):
 @pytest.mark.parametrize("command", CONFIGURED)
 def test_every_key_is_described(command):
     line = checked(command, [])
-    keys = keys_of(command, line.config)
+    keys = _keys_of(command, line.config)
     assert [key.name for key in keys if not key.description] == []
     text = help_text(COMMANDS[command], line)
     assert [key.name for key in keys if f"  {key.name}=" not in text] == []

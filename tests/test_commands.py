@@ -11,7 +11,7 @@ from hydra.errors import InstantiationException
 from small_set import NoiseRecordings
 
 from tactslip_torch import HandLayout, SlipDetector
-from tactslip_torch.commands.configuration import compose_config, options_of
+from tactslip_torch.commands.configuration import _options_of, compose_config
 from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.commands.train import train
@@ -231,7 +231,7 @@ def test_that_no_alarm_will_be_set_is_told_before_the_fit(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", options_of("exp"))
+@pytest.mark.parametrize("name", _options_of("exp"))
 def test_every_experiment_runs_on_few_recordings(name, tmp_path, tmp_path_factory):
     cache = tmp_path_factory.getbasetemp() / "features"  # made by the first experiment of a kind
     overrides = f"+exp={name}", "num_workers=0", f"cache={cache}", "export=false", "baselines=false"

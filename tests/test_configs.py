@@ -7,7 +7,7 @@ from biotac_layout import write_biotac
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
-from tactslip_torch.commands.configuration import checked, compose_config, keys_of, options_of
+from tactslip_torch.commands.configuration import _keys_of, _options_of, checked, compose_config
 from tactslip_torch.commands.configuration import presets as presets_of
 from tactslip_torch.data.splits import ROLES
 from tactslip_torch.simulation.simulate import SimulatedRecordings
@@ -24,7 +24,7 @@ def folds_of(config):
     return source, instantiate(config.split, _convert_="all")(source.ids)
 
 
-@pytest.mark.parametrize("name", options_of("exp"))
+@pytest.mark.parametrize("name", _options_of("exp"))
 def test_an_experiment_composes_and_everything_it_names_exists(name, tmp_path):
     where = write_biotac(tmp_path / name) if name in RECORDED else []
     config = checked("train", [f"+exp={name}", "seed=7", *where]).config
@@ -43,16 +43,16 @@ def test_an_experiment_composes_and_everything_it_names_exists(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("group", "option"), [(group, option) for group in GROUPS for option in options_of(group)]
+    ("group", "option"), [(group, option) for group in GROUPS for option in _options_of(group)]
 )
 def test_every_option_composes_and_its_keys_are_described(group, option):
     config = checked("train", [f"{group}={option}"]).config
-    assert [key.name for key in keys_of("train", config) if not key.description] == []
+    assert [key.name for key in _keys_of("train", config) if not key.description] == []
     if config[group] and group != "features":  # plain values, for ``feature_maker``
         assert callable(get_object(config[group]._target_))
 
 
-@pytest.mark.parametrize("name", options_of("scene"))
+@pytest.mark.parametrize("name", _options_of("scene"))
 def test_every_scene_makes_recordings(name):
     config = compose_config("train", [f"scene={name}", "data.cycles=1", "data.materials=[M3,wood]"])
     source = instantiate(config.data, _convert_="all")

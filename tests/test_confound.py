@@ -11,7 +11,7 @@ from test_commands import composed
 from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import RecordingId, Timeline
-from tactslip_torch.report.results import confound_table
+from tactslip_torch.report.results import _confound_table
 
 pytestmark = pytest.mark.slow
 
@@ -68,7 +68,7 @@ def test_a_run_on_several_scenes_leaves_table_figure_and_scores_by_fold(ran):
     metrics = json.loads((folder / "metrics.json").read_text())
     folds = metrics["folds"]
     assert list(folds) == ["protocol", "with_scenes"]
-    assert confound_table(metrics) in printed
+    assert _confound_table(metrics) in printed
     for name in ("confound.png", "confusion.png", *(f"{fold}/detector.pt" for fold in folds)):
         assert (folder / name).is_file(), name
     for role in ("test", "unseen"):  # the same bins of every scene

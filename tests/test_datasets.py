@@ -12,7 +12,7 @@ import torch
 from hydra.utils import instantiate
 from test_commands import composed
 
-from tactslip_torch.data.file_recordings import FileRecordings, file_digest
+from tactslip_torch.data.file_recordings import FileRecordings, _file_digest
 from tactslip_torch.data.formats import named_format
 from tactslip_torch.data.public_sets import STEMS, authors_raw, named_recordings, nominal
 from tactslip_torch.data.recording import Recording, RecordingId
@@ -227,10 +227,10 @@ def test_a_folder_is_hashed_by_all_its_files(tmp_path):
         (tmp_path / place / "inner").mkdir(parents=True)
         (tmp_path / place / "a").write_text("a")
         (tmp_path / place / "inner" / "b").write_text(content)
-    one, two, three = (file_digest(tmp_path / p) for p in ("one", "two", "three"))
+    one, two, three = (_file_digest(tmp_path / p) for p in ("one", "two", "three"))
     assert one == two != three
     (tmp_path / "two" / "a").rename(tmp_path / "two" / "c")
-    assert file_digest(tmp_path / "two") != one
+    assert _file_digest(tmp_path / "two") != one
 
 
 # Gaps, tares and rates -------------------------------------------------------------------------

@@ -63,7 +63,9 @@ def repeated(scaler, again):
     scale = torch.cat([scaler.compression, 0.1 * scaler.compression[list(again)]])
     own, ends = scaler.compression, (scaler.minimum, scaler.maximum)
     ends = [own * torch.expm1(end.abs() / own) * end.sign() for end in ends]
-    return FeatureScaler(*(signed_log(end[columns], scale) for end in ends), scale, columns)
+    ends = [signed_log(end[columns], scale) for end in ends]
+    of_each = columns if scaler.columns is None else scaler.columns[columns]
+    return FeatureScaler(*ends, scale, of_each)
 
 
 VARIANTS = {

@@ -55,7 +55,9 @@ def test_processes_that_lightning_starts_learn_what_one_does(cache, tmp_path):
     run_train(alone, *TINY, cache)
     words = *TINY, cache, f"hydra.run.dir={ddp}", "trainer.strategy=ddp"
     command = [sys.executable, "-m", "tactslip_torch", "train", *words, "trainer.devices=2"]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "OMP_NUM_THREADS": "1"}
+    tests = Path(__file__).parent
+    path = os.pathsep.join(map(str, (tests, tests.parent)))  # this package, whichever is installed
+    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     options = {"cwd": tmp_path, "env": environment, "timeout": 300}
     done = subprocess.run(command, capture_output=True, text=True, **options)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -10,7 +10,7 @@ from contract.recordings import of_set, split_of_set
 from tactslip_torch import SlipDetector
 from tactslip_torch.commands.configuration import compose_config
 from tactslip_torch.commands.pareto import pareto
-from tactslip_torch.pareto import Candidate, Timing, choose, nondominated, time_detector
+from tactslip_torch.pareto import Candidate, Timing, _time_detector, choose, nondominated
 
 
 def candidate(accuracy, p99_us, hop_ms=10.0):
@@ -38,7 +38,7 @@ def test_what_another_beats_is_not_on_the_front():
 def test_a_detector_is_timed_by_its_calls(paper, monkeypatch):
     detector = paper.detector
     monkeypatch.setattr(detector, "predict_raw", lambda samples: time.sleep(0.002))
-    timing = time_detector(detector, 10)
+    timing = _time_detector(detector, 10)
     assert 2000 <= timing.p50_us <= timing.p99_us < 50_000
 
 

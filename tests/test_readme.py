@@ -20,7 +20,7 @@ from test_detector import random_detector
 import tactslip_torch
 from tactslip_torch import AlarmSettings
 from tactslip_torch.__main__ import main
-from tactslip_torch.commands.configuration import options_of
+from tactslip_torch.commands.configuration import _options_of
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.rules import KOfN
 
@@ -116,7 +116,7 @@ def test_every_choice_it_names_exists(kind):
     pages = ALL.replace(PAGES["CHANGELOG.md"], "").replace(PAGES["docs/migrating.md"], "")
     pages = re.sub(r"<!-- (\w+) -->.*?<!-- /\1 -->", "", pages, flags=re.S)  # results, of their day
     for name in re.findall(rf"[\s`]\+?{kind}=(\w+)", pages):
-        assert name in (*options_of(kind), "NAME")
+        assert name in (*_options_of(kind), "NAME")
 
 
 def test_every_part_of_the_package_is_in_the_table():

@@ -146,13 +146,13 @@ def test_the_papers_numbers_stand_beside_its_own_scenes_alone(drawn, tmp_path, s
     metrics = {"simulated": True, "splits": {"test": scores_of(scenes=scenes)}}
     elsewhere = metrics | {"is_papers_hand": False}
     for each in (metrics, elsewhere):
-        results.confusion_figure(each, tmp_path / "confusion.png")
+        results._confusion_figure(each, tmp_path / "confusion.png")
     own, other = (figure.axes[0].get_xlabel() for figure in drawn)
     assert ("paper: non-slip 93.8" in own) == is_papers
     assert other == "prediction\n\n"
     assert any(row[0] == "paper" for row in rows_of(results.splits_table(metrics))) == is_papers
     assert results.PAPER_LINE not in results.splits_table(elsewhere)
-    lines = results.materials_table(metrics).splitlines()
+    lines = results._materials_table(metrics).splitlines()
     expected = ["acrylic", "ABS", "20 mm/s", "40 mm/s", "60 mm/s"]
     if len(scenes) > 1:
         assert lines.pop(1) == (
@@ -227,7 +227,7 @@ def test_choices_show_what_each_view_was_given_and_what_would_have_been_best(cap
 
 
 def test_the_figure_of_choices_has_a_line_a_view_and_a_star_for_each_that_is_kept(drawn, tmp_path):
-    results.validation_figure(metrics_of(validation=VIEW_CHOICES), tmp_path / "validation.png")
+    results._validation_figure(metrics_of(validation=VIEW_CHOICES), tmp_path / "validation.png")
     *of_views, stars = drawn[0].axes[0].get_lines()
     labels = [line.get_label() for line in of_views]
     assert [label.split(",")[0] for label in labels] == ["simple", "channel", "pooled"]
@@ -237,7 +237,7 @@ def test_the_figure_of_choices_has_a_line_a_view_and_a_star_for_each_that_is_kep
 
 
 def test_reliability_has_a_row_for_each_role():
-    lines = results.reliability_table(metrics_of(alarm={"reliability": BY_ROLE})).splitlines()
+    lines = results._reliability_table(metrics_of(alarm={"reliability": BY_ROLE})).splitlines()
     rows = [line.split() for line in lines[2:]]
     assert rows[0] == ["test", "all", "4000", "1.25", "2.50", "0.0625", "0.2500"]
     assert rows[1] == ["M1", "800", "2.00", "4.00", "0.0625", "0.2500"]
@@ -246,13 +246,13 @@ def test_reliability_has_a_row_for_each_role():
 
 def test_events_say_what_their_delay_is_made_of_and_why_there_are_none():
     timed = {"test": {"rule": events_of(), "cusum at 1/h": events_of(compute_s=0.0021)}}
-    *_, untimed, parts = rows_of(results.events_table(metrics_of(events=timed)))
+    *_, untimed, parts = rows_of(results._events_table(metrics_of(events=timed)))
     assert untimed[-1] == "-"
     look_ahead, *rest, whole, compute = map(float, parts[1:])
     assert (look_ahead, compute) == (12.5, 2.1)
     assert look_ahead + sum(rest) == pytest.approx(whole, abs=0.2)
     nothing = {role: {"a": no_events(), "b": no_events()} for role in ("train", "test")}
-    text = results.events_table(metrics_of(events=nothing))
+    text = results._events_table(metrics_of(events=nothing))
     assert text.splitlines()[1:] == [f"no events: {REASON}"]
 
 
@@ -269,7 +269,7 @@ def test_slips_and_hours_too_few_for_a_rate_are_told():
         "1 h are wanted"
     )
     quiet = without_onsets(720.0)
-    text = results.events_table(metrics_of(simulated=False, events={"test": {"a": quiet}}))
+    text = results._events_table(metrics_of(simulated=False, events={"test": {"a": quiet}}))
     head, *_, note, last = text.splitlines()
     assert not {"mm", "delay", "found", "missed"} & set(head.split())
     assert note == "no slip has a known onset: false alarms alone can be counted"
@@ -298,7 +298,7 @@ def test_a_scene_without_a_name_is_not_called_after_the_paper():
     metrics = {"simulated": False, "is_papers_hand": False}
     for scenes, shown in ((("paper", "taps"), "unnamed"), (("lift", "taps"), "lift")):
         own = metrics | {"splits": {"test": scores_of(scenes=scenes)}}
-        text = results.materials_table(own) + results.confound_table(own)
+        text = results._materials_table(own) + results._confound_table(own)
         assert f"scene {shown}" in text
         assert "paper" not in text
         assert "acrylic" in text  # objects of the unnamed scene or, without it, of all
@@ -318,16 +318,16 @@ ABSENT = {str(i): split_metrics([[0, 0], [i, 5]]) for i in range(5)}  # many, wi
 
 
 def features_of(metrics, path):
-    results.selected_features_figure(features(), path, simulated=metrics["simulated"])
+    results._selected_features_figure(features(), path, simulated=metrics["simulated"])
 
 
 FIGURES = [
-    (results.confusion_figure, {}),
-    (results.confusion_figure, {"splits": ABSENT}),
-    (results.validation_figure, {"validation": CHOICES}),
-    (results.validation_figure, {"validation": VIEW_CHOICES}),
-    (results.reliability_figure, {"alarm": {"reliability": BY_ROLE}}),
-    (results.events_figure, {"events": EVENTS}),
+    (results._confusion_figure, {}),
+    (results._confusion_figure, {"splits": ABSENT}),
+    (results._validation_figure, {"validation": CHOICES}),
+    (results._validation_figure, {"validation": VIEW_CHOICES}),
+    (results._reliability_figure, {"alarm": {"reliability": BY_ROLE}}),
+    (results._events_figure, {"events": EVENTS}),
     (features_of, {}),
 ]
 
@@ -491,7 +491,7 @@ def test_words_stay_in_the_figure_and_apart_for_any_hand(drawn, tmp_path, rng, n
     path = tmp_path / "a.png"
     entry = {"alarms": ALARMS, "truth": TRUTH}
     onset_figure(traces, entry, path, title="Recording cup_1.csv of cup, 2 alarms")
-    results.selected_features_figure(chosen, path, simulated=False)
+    results._selected_features_figure(chosen, path, simulated=False)
     for figure in drawn:
         renderer, space = FigureCanvasAgg(figure).get_renderer(), figure.bbox
         parts = [*figure.axes, *figure.legends, figure._suptitle]

@@ -101,7 +101,7 @@ def test_ranking_is_by_score_then_index_with_nan_last(scores, data):
 
 # ---------------------------------------------------------------------------- forward selection
 def penalised_error(x, targets, weights, ridge):
-    """Weighted square error with a free intercept and ``ridge`` times the squared slopes, at least."""
+    """Least weighted square error, with a free intercept and ``ridge`` times squared slopes."""
     root = np.sqrt(weights)[:, None]
     rows = np.vstack([root * np.column_stack([x, np.ones(len(x))]),
                       np.sqrt(ridge) * np.eye(x.shape[1], x.shape[1] + 1)])  # fmt: skip

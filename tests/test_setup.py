@@ -11,7 +11,7 @@ import yaml
 
 from tactslip_torch.commands import setup
 from tactslip_torch.data.file_names import name_pattern
-from tactslip_torch.data.proposal import Answers, bin_samples, filter_frame, look, propose
+from tactslip_torch.data.proposal import Answers, _filter_frame, bin_samples, look, propose
 
 # Names ---------------------------------------------------------------------------------------
 
@@ -84,7 +84,7 @@ def test_bins_and_frames_fit_the_rate(rate_hz):
     assert num % 2 == 0  # so that half of it is a hop
     assert num == pytest.approx(np.clip(0.05 * rate_hz, 32, 1024), rel=0.25)
     for adapting, seconds in (("slow", 0.0255), ("fast", 0.0055)):
-        frame = filter_frame(adapting, rate_hz)
+        frame = _filter_frame(adapting, rate_hz)
         if frame is None:
             assert seconds * rate_hz < 5
         else:

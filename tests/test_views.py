@@ -9,7 +9,7 @@ import torch
 from small_detector import HAND, raw_bins
 
 from tactslip_torch.deploy.bins import RawBin, bin_graph
-from tactslip_torch.deploy.check import runner, session_of
+from tactslip_torch.deploy.check import _session_of, runner
 from tactslip_torch.features.pool import FeaturePool, is_simple_of
 from tactslip_torch.features.selection import forward_selection
 from tactslip_torch.hand import HandLayout
@@ -23,9 +23,9 @@ from tactslip_torch.training.recipe import General
 from tactslip_torch.training.views import (
     ViewBins,
     ViewSettings,
+    _kernel_of,
     base_views,
     choose_views,
-    kernel_of,
     merged,
     parts_of,
 )
@@ -81,7 +81,7 @@ def accuracy(score, labels):
 
 def refitted(view, bins, penalty):
     """Scores of bins, and of second copies, by NumPy's machine of those of other groups."""
-    kernel, units = kernel_of(view.name), view.units(bins.features)
+    kernel, units = _kernel_of(view.name), view.units(bins.features)
     rows, place = units, np.arange(len(units))
     weights = bins.weights.numpy()
     if bins.is_lost is not None and view.name == "pooled":
@@ -143,7 +143,7 @@ def test_the_kernel_of_each_view_is_one_for_bins_of_training():
     for view in chosen(bins).views:
         size = view.units(bins.features).square().sum(1)
         mean = float(bins.weights @ size / bins.weights.sum())
-        assert (mean + kernel_of(view.name).offset) ** view.degree == pytest.approx(1.0, rel=1e-9)
+        assert (mean + _kernel_of(view.name).offset) ** view.degree == pytest.approx(1.0, rel=1e-9)
         middle = bins.weights @ view.units(bins.features) / bins.weights.sum()
         assert middle.abs().max() < 1e-12
 
@@ -188,7 +188,7 @@ def test_so_many_columns_of_each_view_are_read_and_selected_anew_without_each_gr
             own = own / (size * (2 if view.degree == 2 else 1)).sqrt()
             given = bins.labels[is_in].numpy(), bins.weights[is_in].numpy(), 1.0
             expected = machine_scores(
-                kernel_of(view.name), own[is_in], own[~is_in], *given, class_targets(2).numpy()
+                _kernel_of(view.name), own[is_in], own[~is_in], *given, class_targets(2).numpy()
             )
             np.testing.assert_allclose(view.held_out[0, 1, ~is_in], expected, rtol=1e-6, atol=1e-7)
             choices.add(tuple(taken))
@@ -364,7 +364,7 @@ def test_factors_leave_out_little_of_the_machine_of_degree_2():
     (part,) = parts_of(view, bins, 1.0)
     u, targets = view.units(bins.features), class_targets(2).numpy()
     given = bins.labels.numpy(), bins.weights.numpy(), 1.0, targets
-    expected = machine_scores(kernel_of("channel"), u, u, *given)[:, 0]
+    expected = machine_scores(_kernel_of("channel"), u, u, *given)[:, 0]
     error = np.asarray(part_scores(part, u)) - expected
     assert len(part.signs) <= views.MOST_FACTORS
     assert 0 < np.sqrt(np.mean(error**2)) < 0.02 * expected.std()
@@ -401,7 +401,7 @@ def test_a_detector_of_several_views_scores_alike_by_torch_native_and_onnx():
     raw = RawBin.of(detector)
     start = detector.context_before - raw.before
     cut = bins[..., start : start + raw.length].contiguous().numpy()
-    got = runner(session_of(bin_graph(detector, "float64").model()))({"samples": cut})
+    got = runner(_session_of(bin_graph(detector, "float64").model()))({"samples": cut})
     np.testing.assert_allclose(got["score"], expected.score, rtol=0, atol=1e-9 * spread)
 
 

@@ -107,7 +107,7 @@ def compose_config(
     return config
 
 
-def options_of(group: str) -> list[str]:
+def _options_of(group: str) -> list[str]:
     """The options of a group."""
     group = group.partition("@")[0]
     files = (conf_dir() / group).glob("*.yaml") if group else ()
@@ -154,7 +154,7 @@ def _described(group: str, option: str) -> dict[str, str]:
     return own
 
 
-def keys_of(command: str, config: DictConfig, hydra: Any = None) -> list[Key]:
+def _keys_of(command: str, config: DictConfig, hydra: Any = None) -> list[Key]:
     """The keys that may be set, in the order of the configuration.
 
     A mapping that is described as a whole is one key.
@@ -192,7 +192,7 @@ def help_text(summary: str, line: CommandLine) -> str:
     command, config = line.command, line.config
     path = conf_dir() / f"{command}.yaml"
     head = [row[2:] for row in path.read_text().partition("defaults:")[0].splitlines()]
-    keys, about = keys_of(command, config), _described("", command)
+    keys, about = _keys_of(command, config), _described("", command)
     groups = {
         name: at
         for name, at in reversed(_groups(config.hydra).items())
@@ -208,11 +208,11 @@ def help_text(summary: str, line: CommandLine) -> str:
     if groups:
         lines += ["", "groups of settings (GROUP=OPTION; the default is marked *):"]
         for group, chosen in groups.items():
-            options = " ".join(f"*{o}" if o == chosen else o for o in options_of(group))
+            options = " ".join(f"*{o}" if o == chosen else o for o in _options_of(group))
             lines += _row(group, f"{about[f'defaults.{group}']}: {options}")
         lines += _row("", "GROUP=OPTION beside --help lists the keys of that option")
         lines += _row("+exp=NAME", "an experiment: other defaults for several keys")
-        for option in options_of("exp"):
+        for option in _options_of("exp"):
             text = (conf_dir() / f"exp/{option}.yaml").read_text(encoding="utf-8")
             if set(re.findall(r"override /(\w+):", text)) <= set(groups):
                 comments = re.findall(r"(?m)^# (.*)$", text.partition("\ndefaults:")[0])
@@ -276,12 +276,12 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
     for override in options.overrides:
         rest.remove(override)
     overrides, config = _composed(command, options)
-    known = {key.name.partition(".")[0] for key in keys_of(command, config) if key.description}
+    known = {key.name.partition(".")[0] for key in _keys_of(command, config) if key.description}
     for name in config:
         if str(name) not in known.union(_groups(config.hydra), presets(), ("hydra",)):
             raise ValueError(_no_key(command, str(name), config))
     if has_hand:
-        for own in keys_of(command, config):
+        for own in _keys_of(command, config):
             if not own.description and own.name.partition(".")[0] in OF_HAND:
                 raise ValueError(f"{HAND_FILE}: {_no_key(command, own.name, config)}")
     return CommandLine(command, [*overrides, *rest], typed, options, config)
@@ -304,7 +304,7 @@ def _composed(command: str, options: Namespace) -> tuple[list[str], DictConfig]:
                 key, _, values = word.partition("=")
                 first, *others = re.sub(r"\w+\(|\)", "", values).split(",")
                 tried[tried.index(word)] = f"{key}={first}"
-                known = options_of(key.lstrip("+"))
+                known = _options_of(key.lstrip("+"))
                 for option in others if known and not options.config_dir else ():
                     if option not in known:
                         raise ValueError(_unknown(key.lstrip("+"), option, known)) from error
@@ -326,7 +326,7 @@ def _translated(command: str, overrides: Sequence[str], error: Exception) -> str
     text, listed = str(error), f"tactslip {command} --help lists the keys"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, option = error.missing_cfg_file.rpartition("/")
-        return _unknown(group, option, sorted({*options_of(group), *(error.options or ())}))
+        return _unknown(group, option, sorted({*_options_of(group), *(error.options or ())}))
     if found := re.search(r"(?:argument|parameters) '(.+)'", text):
         key, _, value = found[1].partition("=")
         hint = "" if "(" in value else f", or write '{key}=[{value}]' for a list"
@@ -357,7 +357,7 @@ def _unknown(group: str, option: str, known: Sequence[str]) -> str:
 
 def _tried(command: str, overrides: Sequence[str]) -> list[DictConfig]:
     """The configuration with the options of groups alone."""
-    groups = [word for word in overrides if options_of(word.partition("=")[0].lstrip("+"))]
+    groups = [word for word in overrides if _options_of(word.partition("=")[0].lstrip("+"))]
     try:
         return [compose_config(command, groups, with_hydra=True)]
     except (HydraException, OmegaConfBaseException):
@@ -373,7 +373,7 @@ def _no_key(command: str, key: str, config: DictConfig | None = None) -> str:
     chosen = _groups(config.hydra).get(group)
     having = [
         f"{group}={option}"
-        for option in options_of(group)
+        for option in _options_of(group)
         if any(f"{rest}.".startswith(f"{own}.") for own in _described(group, option))
     ]
     if chosen and rest and having and f"{group}={chosen}" not in having:
@@ -388,7 +388,7 @@ def _no_key(command: str, key: str, config: DictConfig | None = None) -> str:
 def _nearest(command: str, key: str, config: DictConfig | None = None) -> str | None:
     """The name that was meant: one without dots before others."""
     config = config or compose_config(command, with_hydra=True)
-    keys = [each.name for each in keys_of(command, config) if each.description]
+    keys = [each.name for each in _keys_of(command, config) if each.description]
     names = ["hydra.run.dir", *_groups(config.hydra), *keys]
     names = sorted(names, key=lambda name: name.count("."))
     by_last = {name.rpartition(".")[2]: name for name in reversed(names)}
@@ -401,7 +401,7 @@ def _nearest(command: str, key: str, config: DictConfig | None = None) -> str | 
 
 def with_lists(command: str, config: DictConfig, hydra: Any) -> None:
     """Put a text or number where the description of a key says "list" into a list, in place."""
-    for key in keys_of(command, config, hydra):
+    for key in _keys_of(command, config, hydra):
         is_simple = isinstance(key.value, str | int | float) and not isinstance(key.value, bool)
         is_set = key.value != "???" and not str(key.value).startswith("${")
         if is_simple and is_set and key.description.startswith("list"):

@@ -66,7 +66,7 @@ _REACH = 11
 _FEW = 16  # files that are looked at by one process
 
 
-def file_digest(path: Path) -> str:
+def _file_digest(path: Path) -> str:
     """SHA-256 of a file's content, or of all files of a folder with their names.
 
     Of an episode: of the table that it is in, and its name. A file is read once by a process, as
@@ -77,10 +77,10 @@ def file_digest(path: Path) -> str:
     """
     if path.is_dir():
         inner = sorted(inner for inner in path.rglob("*") if inner.is_file())
-        lines = [f"{one.relative_to(path).as_posix()}\0{file_digest(one)}\n" for one in inner]
+        lines = [f"{one.relative_to(path).as_posix()}\0{_file_digest(one)}\n" for one in inner]
         return hashlib.sha256("".join(lines).encode()).hexdigest()
     if (table := file_of(path)) != path:
-        return hashlib.sha256(f"{path.name}\0{file_digest(table)}".encode()).hexdigest()
+        return hashlib.sha256(f"{path.name}\0{_file_digest(table)}".encode()).hexdigest()
     found = path.stat()
     return _digest(str(path.absolute()), found.st_mtime_ns, found.st_size)
 
@@ -796,7 +796,7 @@ class FileRecordings:
         """What determines the samples: what the file holds, not its name, and how it is read."""
         entry, head, _ = self._files[recording]
         return {
-            "sha256": file_digest(self.root / entry.file),
+            "sha256": _file_digest(self.root / entry.file),
             "channels": self.hand.to_rows(),
             "reading": self._given.reading.key(),
             "rows": head.rows,

@@ -709,13 +709,13 @@ def bin_samples(rate_hz: float) -> int:
     return next((n for n in lengths if (1e6 * n / rate_hz).is_integer()), least)
 
 
-def filter_frame(adapting: str, rate_hz: float) -> int | None:
+def _filter_frame(adapting: str, rate_hz: float) -> int | None:
     """The filter's frame in samples: 25.5 ms of slow channels, 5.5 ms of fast ones, odd.
 
     ``None``, no filter, where that is fewer than 5 samples.
 
     Example:
-        >>> [filter_frame(a, rate) for rate in (2000.0, 1000.0, 100.0) for a in ("slow", "fast")]
+        >>> [_filter_frame(a, rate) for rate in (2000.0, 1000.0, 100.0) for a in ("slow", "fast")]
         [51, 11, 25, 5, None, None]
     """
     num = 2 * round((_FRAMES_S[adapting] * rate_hz - 1) / 2) + 1
@@ -731,7 +731,7 @@ def _propose_bins(kinds: Mapping[str, str], rate_hz: float, draft: Proposal) -> 
     draft.set("labels.hop_ms", hop_ms, "half a bin: a decision every so many ms")
     draft.set("labels.assign", "majority", "a bin is slip if most of its samples are")
     draft.tell("bins", f"{bin_ms:.4g} ms, a hop of {hop_ms:.4g} ms", reason)
-    frames = {kind: filter_frame(adapting, rate_hz) for kind, adapting in kinds.items()}
+    frames = {kind: _filter_frame(adapting, rate_hz) for kind, adapting in kinds.items()}
     if frames:
         rule = "filter of each kind in samples: 25.5 ms if slow, 5.5 ms if fast; null: not filtered"
         draft.set("features.frames", frames, rule)

@@ -56,7 +56,7 @@ def check_model(
     Raises:
         ValueError: for the first output that differs, in one line.
     """
-    return compare(runner(session_of(model)), detector, kind, precision)
+    return compare(runner(_session_of(model)), detector, kind, precision)
 
 
 def compare(
@@ -230,7 +230,7 @@ def _with_losses(samples: Tensor, detector: SlipDetector) -> Tensor:
     return broken
 
 
-def session_of(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
+def _session_of(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
     """A session on one thread, optimised as onnxruntime does by default.
 
     Raises:

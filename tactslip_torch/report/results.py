@@ -68,20 +68,20 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
     Args:
         folder: made if it is not there.
         metrics: JSON-able, with ``simulated`` and ``splits``.
-        selected: one mapping per selected feature, as ``selected_features_figure`` takes them.
+        selected: one mapping per selected feature, as ``_selected_features_figure`` takes them.
     """
     write_json(folder / "metrics.json", metrics)
-    confusion_figure(metrics, folder / "confusion.png")
+    _confusion_figure(metrics, folder / "confusion.png")
     if selected:
         path, simulated = folder / "selected_features.png", metrics["simulated"]
-        selected_features_figure(selected, path, simulated=simulated)
+        _selected_features_figure(selected, path, simulated=simulated)
     alarm = metrics.get("alarm") or {}
     for is_there, draw, name in (
         (_scene_rows(metrics), _confound_figure, "confound"),
-        (_drawn_events(metrics), events_figure, "events"),
-        (alarm, alarm_figure, "alarm"),
-        (alarm.get("reliability"), reliability_figure, "reliability"),
-        (metrics.get("validation"), validation_figure, "validation"),
+        (_drawn_events(metrics), _events_figure, "events"),
+        (alarm, _alarm_figure, "alarm"),
+        (alarm.get("reliability"), _reliability_figure, "reliability"),
+        (metrics.get("validation"), _validation_figure, "validation"),
     ):
         if is_there:
             draw(metrics, folder / f"{name}.png")
@@ -90,14 +90,14 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
 def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> None:
     """Print the tables of a run."""
     texts = [splits_table(metrics), *_comparison_lines(metrics), *_trained_on_lines(metrics)]
-    texts.append(materials_table(metrics))
+    texts.append(_materials_table(metrics))
     for key, tables in (
-        ("events", (events_table,)),
-        ("alarm", (alarm_table, _scenes_table, reliability_table)),
+        ("events", (_events_table,)),
+        ("alarm", (_alarm_table, _scenes_table, _reliability_table)),
     ):
         texts += [one(metrics) for one in tables if metrics.get(key)]
     if _scene_rows(metrics):
-        texts.append(confound_table(metrics))
+        texts.append(_confound_table(metrics))
     if selected:
         texts.append(_selected_table(selected))
     if metrics.get("validation"):
@@ -196,7 +196,7 @@ def _scene_name(metrics: _Metrics, scene: str) -> str:
     return style.UNNAMED_SCENE if is_default else scene
 
 
-def materials_table(metrics: _Metrics) -> str:
+def _materials_table(metrics: _Metrics) -> str:
     """The same scores within each split for each material, speed and, of several, scene.
 
     Speeds are shown where some are known. Of another hand than the paper's, recordings that were
@@ -286,7 +286,7 @@ def _solve_line(solve: Mapping[str, Any]) -> str:
 
 
 @style.styled
-def confusion_figure(metrics: _Metrics, path: str | Path) -> None:
+def _confusion_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write one confusion matrix per split: bins counted, and percent of each true class.
 
     The paper's recalls are the caption of a panel where it states them, of scenes of its own.
@@ -393,7 +393,7 @@ _DOMAIN_WORDS = {"time": "time domain", "freq": "frequency domain"}
 
 
 @style.styled
-def selected_features_figure(
+def _selected_features_figure(
     selected: Sequence[Mapping[str, str]], path: str | Path, *, simulated: bool
 ) -> None:
     """Write where the selected features come from: how many of each kind, component and so on.
@@ -503,7 +503,7 @@ def _validation_table(metrics: _Metrics) -> str:
 
 
 @style.styled
-def validation_figure(metrics: _Metrics, path: str | Path) -> None:
+def _validation_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the balanced accuracy on left-out groups over C, one line for each view.
 
     Args:
@@ -566,7 +566,7 @@ def _scene_rows(metrics: _Metrics) -> list[dict[str, Any]]:
     return rows if len(scenes) > 1 and not all(row["is_trained"] for row in rows) else []
 
 
-def confound_table(metrics: _Metrics) -> str:
+def _confound_table(metrics: _Metrics) -> str:
     """Bins, recalls and balanced accuracy of each detector on each kind of scene, held out.
 
     ``trained on it`` says whether other cycles of that scene were trained on, ``-`` where the
@@ -662,7 +662,7 @@ def _reliabilities(metrics: _Metrics) -> list[tuple[str, str, Mapping[str, Any]]
     return rows
 
 
-def reliability_table(metrics: _Metrics) -> str:
+def _reliability_table(metrics: _Metrics) -> str:
     """Calibration error, Brier score and log loss of each role, and of each material in it.
 
     Args:
@@ -679,7 +679,7 @@ def reliability_table(metrics: _Metrics) -> str:
 
 
 @style.styled
-def reliability_figure(metrics: _Metrics, path: str | Path) -> None:
+def _reliability_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the reliability curve of each role with its counts, and the error of each material.
 
     Args:
@@ -755,7 +755,7 @@ def _false_alarms(numbers: Mapping[str, Any]) -> str:
     return style.interval(numbers[f"false_alarms_{key}"], 1, f" /{unit}")
 
 
-def events_table(metrics: _Metrics) -> str:
+def _events_table(metrics: _Metrics) -> str:
     """One row for each role and rule; brackets hold intervals.
 
     ``delay`` is the median from the exact onset to the alarm, look-ahead within, ``mm slid`` the
@@ -827,7 +827,7 @@ def _drawn_events(metrics: _Metrics) -> dict[str, dict[str, Mapping[str, Any]]]:
 
 
 @style.styled
-def events_figure(metrics: _Metrics, path: str | Path) -> None:
+def _events_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write slips found by time since the onset, and what became of all, as a PNG.
 
     A row for each role that has slips: to the left the fraction of slips that were found so many ms
@@ -968,7 +968,7 @@ def _budget_rows(metrics: _Metrics) -> list[_Row]:
     return list(found.values())
 
 
-def alarm_table(metrics: _Metrics) -> str:
+def _alarm_table(metrics: _Metrics) -> str:
     """``_target_line``, ``_rate_rows`` and ``_budget_rows`` for the terminal."""
     rows = style.table(_rate_rows(metrics), num_left=2, merged=1)
     budget = style.table(_budget_rows(metrics), num_left=3)
@@ -1010,7 +1010,7 @@ def _scenes_table(metrics: _Metrics) -> str:
 
 
 @style.styled
-def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
+def _alarm_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the false-alarm rates that were reached, and those of every scene, as a PNG.
 
     Args:

@@ -95,7 +95,7 @@ def _says_forest(made: Any, columns: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(made.classes_[np.mean(votes, 0).argmax(1)])
 
 
-class PooledNumber:
+class _PooledNumber:
     """The mean or deviation over channels of one descriptor with the best balanced accuracy.
 
     Args:
@@ -151,7 +151,7 @@ class Baselines:
     def __init__(self, pool: FeaturePool, scaled: Tensor, sample: SampledBins) -> None:
         from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # sklearn's own
 
-        self._pooled = PooledNumber(pool, sample)  # refuses one class
+        self._pooled = _PooledNumber(pool, sample)  # refuses one class
         self._simple = is_simple_of(pool)
         x = sample.features[:, self._simple].double()
         with warnings.catch_warnings(), threadpool_limits(1):  # small: threads would wait

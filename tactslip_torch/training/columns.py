@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import Sensing, SpanFeatures
+from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.scaling import FeatureScaler
 
 VIEWS = ("simple", "channel", "pooled")
@@ -105,7 +105,9 @@ class FeatureSelection:
 
 def view_columns(
     view: str,
-    pool: FeaturePool,
+    hand: HandLayout,
+    known: Sequence[FeatureName],
+    spans: SpanFeatures,
     allowed: Tensor,
     features: Tensor,
     weights: Tensor,
@@ -115,7 +117,9 @@ def view_columns(
 
     Args:
         view: one of ``VIEWS``.
-        pool: of the features of the bins.
+        hand: the channels.
+        known: names of the features of the bins.
+        spans: of these features.
         allowed: which of them the view may use, ``[F]``, bool.
         features: of the bins.
         weights: of the bins, for the means that stand for lost channels.
@@ -127,16 +131,15 @@ def view_columns(
     Raises:
         ValueError: as ``ChannelPooling.fit``.
     """
-    spans = SpanFeatures(pool.hand, pool.names, pool.bin_samples)
     span = spans(features)
     silence = spans, Sensing.fit(span, 1, 1)
     is_lost = spans.is_silent(span, silence[1])
     places = allowed.nonzero()[:, 0].tolist()
-    names = [pool.names[place] for place in places]
+    names = [known[place] for place in places]
     layer, x, inputs = None, features[:, places], tuple(names)
     if view == "pooled":
         assert pooling is not None  # General
-        layer = ChannelPooling.fit(pool.hand, names, x, pooling, is_lost)
+        layer = ChannelPooling.fit(hand, names, x, pooling, is_lost)
         of_name = dict(zip(names, places, strict=True))
         inputs, places = layer.inputs, [of_name[name] for name in layer.inputs]
         x, names = layer(features[:, places].double(), is_lost), list(layer.names)
@@ -155,7 +158,7 @@ def view_columns(
         torch.cat([each.compression for each in scalers if each.compression is not None]),
         columns,
     )
-    place = {name: index for index, name in enumerate(pool.hand.names)}
+    place = {name: index for index, name in enumerate(hand.names)}
     channel = torch.tensor([place.get(name.channel, len(place)) for name in names])[columns]
     selection = FeatureSelection(tuple(places), scaler, layer, silence, channel, names=inputs)
     fill = (weights @ selection.in_parts(features)) / weights.sum()

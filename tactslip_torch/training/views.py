@@ -24,6 +24,7 @@ from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import forward_selection
+from tactslip_torch.features.sensing import SpanFeatures
 from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, QuadraticForm, factors_of
 from tactslip_torch.model.ridge import ClassSums, balanced_weights, class_targets, solve_dual
 from tactslip_torch.runtime import one_thread, steps, trim_memory
@@ -198,10 +199,10 @@ def base_views(
         allowed: which features each view may use, ``[F]``, bool.
         settings: which views.
     """
-    made = list[View]()
+    made, spans = list[View](), SpanFeatures(pool.hand, pool.names, pool.bin_samples)
     for name in settings.views:
-        args = pool, allowed[name], bins.features, bins.weights, settings.pooling
-        selection = view_columns(name, *args)
+        args = allowed[name], bins.features, bins.weights, settings.pooling
+        selection = view_columns(name, pool.hand, pool.names, spans, *args)
         center, gain = _standard(name, selection.in_parts(bins.features), bins.weights)
         made.append(View(name, selection, center, gain, gain.new_zeros(0)))
     return made
@@ -302,7 +303,7 @@ def _validated(
 
 
 def _standard(name: str, z: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Center and gain of scaled columns ``[N, S]``: a kernel whose mean diagonal is 1."""
+    """Center and gain of scaled columns ``[N, S]``: a kernel whose diagonal is 1 in the mean."""
     share = weights / weights.sum()
     center = share @ z
     spread = (share @ (z - center).square()).sqrt()
@@ -349,7 +350,7 @@ class _Rows:
     @property
     def kernel(self) -> Polynomial:
         """Of the standardised columns; the intercept is free, so degree 1 has no offset."""
-        return kernel_of(self.name)
+        return _kernel_of(self.name)
 
     def best(self, is_in: Tensor, num: int) -> list[int]:
         """Columns by forward selection from some of the rows."""
@@ -372,7 +373,7 @@ class _Rows:
         return sums
 
 
-def kernel_of(view: str) -> Polynomial:
+def _kernel_of(view: str) -> Polynomial:
     """The kernel of a view's standardised columns."""
     return PAPER_KERNEL if DEGREE[view] == 2 else Polynomial(1, 0.0)
 
@@ -546,7 +547,7 @@ def _row(
     row = {
         "view": view.name,
         "num_features": view.selection.size,
-        "kernel": kernel_of(view.name).to_dict(),
+        "kernel": _kernel_of(view.name).to_dict(),
         "penalty": penalty,
         "mean": _accuracy(held[known], labels[known]),
         "balanced_accuracy": by_group,
