@@ -136,7 +136,7 @@ class Alarms(Benchmark):
     title = "The alarm in many worlds"
     about = "alarms of +exp=onset within the default budget, on recordings that set nothing"
     page, markers, has_headings = "docs/onset.md", "onset", False
-    quick = f'seeds=[0] overrides=["{QUICK}"] worlds=["pulled","bristles, pulled"] sessions=1'
+    quick = f'seeds=[0] overrides=["{QUICK}"] worlds=["pulled","pinch"] sessions=1'
     charts: ClassVar = {
         "": [
             ("Slips found", ("found", "bins")),

@@ -71,7 +71,7 @@ def alarming_detector(with_onset: bool = False) -> SlipDetector:
         rearm_s=0.03,
         refractory_s=0.1,
         lead_s=0.02,
-        onset=onset_of(samples, detector.pool.hand, quantile=0.8) if with_onset else None,
+        onset=onset_of(samples, detector.pool.hand, 3, 0.8) if with_onset else None,
     )
     detector.info[KEY] = settings.to_dict()
     return detector

@@ -147,20 +147,23 @@ def oracle(evidence, x, masked=()):
         row = []
         if fast:
             level = [np.log(before(power, n, 0, t)).T / 2 for n in windows]  # [B, F]
-            for each in level:
-                row += pools(each - floors[0][t], ("mean", "max", "min", "std"))
-            for each in level[:2]:
-                for floor in floors[1:]:
-                    row += pools(each - floor[t], ("mean", "max"))
+            rises = np.concatenate([each - floors[0][t] for each in level])
+            row += pools(rises, ("mean", "max", "min", "std"))
+            rises = [each - floor[t] for each in level[:2] for floor in floors[1:]]
+            row += pools(np.concatenate(rises), ("mean", "max"))
             if len(hand.fast) > 1:
-                for n in windows:
-                    squares = [
-                        before((y[i] * y[j]).mean(-1), n, 0, t) ** 2
-                        / (before(power[i], n, 0, t) * before(power[j], n, 0, t))
-                        for i, j in combinations(range(len(fast)), 2)
-                    ]
-                    squares = squares or [np.zeros(len(level[0]))]
-                    row += [np.mean(squares, 0), np.max(squares, 0)]
+                squares = [
+                    np.concatenate(
+                        [
+                            before((y[i] * y[j]).mean(-1), n, 0, t) ** 2
+                            / (before(power[i], n, 0, t) * before(power[j], n, 0, t))
+                            for n in windows
+                        ]
+                    )
+                    for i, j in combinations(range(len(fast)), 2)
+                ]
+                squares = squares or [np.zeros(len(windows) * len(level[0]))]
+                row += [np.mean(squares, 0), np.max(squares, 0)]
         if slow:
             size = np.log1p(np.abs(z[t]))
             row += pools(size, ("mean", "max", "min"))

@@ -205,16 +205,19 @@ struct Hop {
       in_use[f] = run.in_use[own.fast[f]] && rise > 0.0 && isfinite(sum);
       num_alive += in_use[f];
     }
-    for (int64_t w = 0; w < own.num_windows && num_fast; ++w) {
-      for (int64_t i = 0; i < num_logs; ++i) values[i] = level[w * num_logs + i] - kept.floor[i];
-      to = pool(values, num_filters, num_fast, in_use, 4, to);
-    }
-    for (int64_t w = 0; w < 2 && num_fast; ++w)
-      for (int64_t n = 1; n < NUM_FLOORS; ++n) {
+    if (num_fast) {
+      for (int64_t w = 0; w < own.num_windows; ++w)
         for (int64_t i = 0; i < num_logs; ++i)
-          values[i] = level[w * num_logs + i] - kept.floor[n * num_logs + i];
-        to = pool(values, num_filters, num_fast, in_use, 2, to);
-      }
+          values[w * num_logs + i] = level[w * num_logs + i] - kept.floor[i];
+      to = pool(values, own.num_windows * num_filters, num_fast, in_use, 4, to);
+      double* next = values;
+      for (int64_t w = 0; w < 2; ++w)
+        for (int64_t n = 1; n < NUM_FLOORS; ++n)
+          for (int64_t i = 0; i < num_logs; ++i)
+            *next++ = level[w * num_logs + i] - kept.floor[n * num_logs + i];
+      to = pool(values, 2 * (NUM_FLOORS - 1) * num_filters, num_fast, in_use, 2, to);
+    }
+    int64_t num_squares = own.num_windows * num_filters;
     for (int64_t w = 0; w < own.num_windows && num_fast > 1; ++w) {
       last_means(kept.products, products, num_products, own.windows[w], false, values);
       for (int64_t b = 0; b < num_filters; ++b) {
@@ -228,11 +231,11 @@ struct Hop {
           most = square > most ? square : most;
           sum += square, num += 1.0;
         }
-        to[b] = num ? sum / num : 0.0;
-        to[num_filters + b] = most;
+        to[w * num_filters + b] = num ? sum / num : 0.0;
+        to[num_squares + w * num_filters + b] = most;
       }
-      to += 2 * num_filters;
     }
+    if (num_fast > 1) to += 2 * num_squares;
     // pools over slow channels
     if (int64_t num_slow = own.num_slow) {
       int64_t num_known = 0;
@@ -317,7 +320,8 @@ extern "C" int ONSET_ENTRY(const Onset* own, OnsetHops* run) {
   int64_t longest = own->num_lags ? own->lags[own->num_lags - 1] : 0, widest = 0;
   for (int64_t n = 0; n <= own->num_layers && own->num_layers; ++n)
     widest = own->widths[n] > widest ? own->widths[n] : widest;
-  int64_t of_values[] = {num_logs, num_products, 3 * num_sizes, own->num_columns, widest};
+  int64_t num_rises = own->num_windows > 4 ? own->num_windows : 4;  // of both kinds of floors
+  int64_t of_values[] = {num_rises * num_logs, num_products, 3 * num_sizes, own->num_columns, widest};
   int64_t most = 0;
   for (int64_t size : of_values) most = size > most ? size : most;
   int64_t others = own->num_slow > widest ? own->num_slow : widest;

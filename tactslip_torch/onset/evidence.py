@@ -508,16 +508,18 @@ class OnsetEvidence:
         alive = None
         if num_fast:
             levels = [each.log() * 0.5 for each in power]
-            known = (sum(levels[1:], levels[0]) + floors[0]).sum(1).isfinite()
+            every = torch.cat(levels, 1)  # [k, W * B, F]
+            known = (every.sum(1) + floors[0].sum(1)).isfinite()
             loud = (floors[-1] - self.silence).amax(1) > 0.0
             alive = known & loud & fast  # [k, F]
-            for level in levels:
-                columns += _over_channels(level - floors[0], alive, num_fast, with_spread=True)
-            for level in levels[:2]:
-                for floor in floors[1:]:
-                    columns += _over_channels(level - floor, alive, num_fast)[:2]
+            rises = every - torch.cat([floors[0]] * len(levels), 1)
+            columns += _over_channels(rises, alive, num_fast, with_spread=True)
+            quick = [level - floor for level in levels[:2] for floor in floors[1:]]
+            columns += _over_channels(torch.cat(quick, 1), alive, num_fast)[:2]
             if num_fast > 1:
-                columns += self._correlations(power, products, alive)
+                columns += self._correlations(
+                    torch.cat([*power], 1), torch.cat([*products], 1), alive
+                )
         if num_slow:
             known = (steps + step_floor).sum(1).isfinite() & slow
             alive = known if alive is None else alive
@@ -532,25 +534,19 @@ class OnsetEvidence:
         num_alive = alive.type_as(steps if num_slow else power[0]).sum(-1)
         return torch.cat(columns, -1), num_alive >= float(self.min_alive)
 
-    def _correlations(
-        self, power: Sequence[Tensor], products: Sequence[Tensor], alive: Tensor
-    ) -> list[Tensor]:
-        """Mean and largest squared correlation over pairs in use, 0 of none: ``[k, B]`` each."""
+    def _correlations(self, power: Tensor, products: Tensor, alive: Tensor) -> list[Tensor]:
+        """Mean and largest squared correlation over pairs in use, 0 of none: ``[k, W * B]``."""
         num_fast, num_pairs = len(self.hand.fast), self.pairs.shape[1]
         first, second = torch.zeros(2, num_fast, num_pairs, dtype=torch.float64)
         first[self.pairs[0], torch.arange(num_pairs)] = 1.0
         second[self.pairs[1], torch.arange(num_pairs)] = 1.0
-        rows = alive.unsqueeze(1)
-        found = alive.type_as(power[0])
+        found = alive.type_as(power)
         both = (found @ first) * (found @ second)  # [k, P]
         num = both.sum(-1)[..., None].clamp(min=1.0)
-        made = []
-        for own, product in zip(power, products, strict=True):
-            known = torch.where(rows, own, 1.0)
-            square = product * product / ((known @ first) * (known @ second))
-            square = torch.where(both.unsqueeze(1) > 0.0, square, 0.0)
-            made += [square.sum(-1) / num, square.amax(-1)]
-        return made
+        known = torch.where(alive.unsqueeze(1), power, 1.0)
+        square = products * products / ((known @ first) * (known @ second))
+        square = torch.where(both.unsqueeze(1) > 0.0, square, 0.0)
+        return [square.sum(-1) / num, square.amax(-1)]
 
     def to_dict(self) -> dict[str, Any]:
         """All but the hand and the sample rate, which are the detector's."""
