@@ -153,3 +153,39 @@ def test_a_sample_of_fewer_than_none_or_of_nothing_is_refused():
         BinSample(-1)
     with pytest.raises(ValueError, match="got none"):
         BinSample(3).bins()
+
+
+def test_a_sample_of_a_sample_stands_for_the_same_bins():
+    recordings = make_recordings([200, 300, 150, 250], seed=1)
+    first = BinSample(20)
+    for of in recordings:
+        first.update(of)
+    sample = first.bins()
+    for most, of in ((20, sample), (7, sample), (20, sample.thinned(60))):
+        again = BinSample(most)
+        for bins in of.by_recording():
+            again.update(bins)
+        found = again.bins()
+        for one in sample.stratum.unique():
+            wanted = sample.weight[sample.stratum == one].sum()
+            torch.testing.assert_close(found.weight[found.stratum == one].sum(), wanted)
+    assert torch.equal(again.bins().features, sample.thinned(60).features)
+
+
+def test_bins_are_thinned_evenly_over_groups_and_classes():
+    recordings = make_recordings([400, 10, 300], seed=2)
+    every = BinSample(1000)
+    for of in recordings:
+        every.update(of)
+    whole = every.bins()
+    fewer = whole.thinned(100)
+    assert 80 < len(fewer.is_slip) <= 100
+    sizes = whole.stratum.bincount()
+    kept = fewer.stratum.bincount(minlength=len(sizes))
+    largest = kept.max()
+    for size, num in zip(sizes[sizes > 0].tolist(), kept[sizes > 0].tolist(), strict=True):
+        assert num in (size, largest)
+    names = [fewer.recording_names[i] for i in fewer.recording]
+    of_name = {of.name: of.features for of in recordings}
+    for name, row in zip(names, fewer.features, strict=True):
+        assert (of_name[name] == row).all(1).any()

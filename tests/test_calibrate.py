@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from dataclasses import replace
 
 import hosts
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import torch
 from contract import names
 from contract.recordings import CHANNELS, RATE_HZ, SLIDE_S, of_set, samples_of, write_recording
+from contract.running import train
 from drawing import assert_png
 
 from tactslip_torch.data.labels import LabelRule
@@ -19,8 +21,10 @@ from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, score_stream
 from tactslip_torch.onset.rules import Budget, Cusum, KOfN
+from tactslip_torch.training import refit
 from tactslip_torch.training.alarm import Stream, Timing
 from tactslip_torch.training.calibrate import Calibrator, Change, decision_threshold, in_stretches
+from tactslip_torch.training.refit import BINS, KeptBins
 
 TIMING = Timing(1000.0, 500, 1000, 0)
 """A decision every half second, on the second before."""
@@ -325,3 +329,247 @@ def test_another_hand_is_refused(command, general, tmp_path):
     ran = command(tmp_path, "calibrate", *fewer, "per_hour=2000", "hydra.run.dir=run")
     assert ran.status == 2
     assert "channels" in ran.err
+
+
+# The refit ---------------------------------------------------------------------------------------
+
+
+def odd_samples(trial, *, slips=True):
+    """Of an object whose slip is no louder than its rest, but lower in frequency."""
+    rng = np.random.default_rng([ord("G"), trial])
+    samples = 0.16 * rng.standard_normal((3 * RATE_HZ, len(CHANNELS)))
+    low = np.apply_along_axis(np.convolve, 0, samples, np.ones(8) / np.sqrt(8), "same")
+    slide = slice(*(round(end * RATE_HZ) for end in SLIDE_S))
+    if slips:
+        samples[slide] = low[slide]
+    return (samples + 1).astype(np.float32)
+
+
+def loud_samples(trial):
+    """Of an object whose slip is so loud that nothing misses it."""
+    rng = np.random.default_rng([ord("H"), trial])
+    samples = 0.1 * rng.standard_normal((3 * RATE_HZ, len(CHANNELS)))
+    samples[slice(*(round(end * RATE_HZ) for end in SLIDE_S))] *= 4
+    return (samples + 1).astype(np.float32)
+
+
+def write_new(folder, trials, samples_of_trial=odd_samples, num_quiet=0):
+    """Recordings of a new object, all of which slip but for the last ones, which are quiet."""
+    folder.mkdir()
+    rows = [["file", "material", "trial", "label", "sliding_s"]]
+    slide = f"{SLIDE_S[0]}-{SLIDE_S[1]}"
+    for trial in trials:
+        path = write_recording(folder / f"G_{trial}.csv", samples_of_trial(trial))
+        rows.append([path.name, "G", trial, "", slide])
+    for trial in range(1000, 1000 + num_quiet):
+        path = write_recording(folder / f"G_{trial}.csv", odd_samples(trial, slips=False))
+        rows.append([path.name, "G", trial, "non-slip", ""])
+    with (folder / names.MANIFEST).open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    return folder
+
+
+def accuracy_on_odd(detector, trials):
+    """Balanced, of decisions that are wholly slip or not, on recordings nothing was fitted to."""
+    right = {True: [], False: []}
+    bin_samples, hop = detector.pool.bin_samples, 50
+    for trial in trials:
+        samples = torch.from_numpy(odd_samples(trial).T.copy())
+        score = score_stream(detector, samples, hop).score
+        start = torch.arange(len(score)) * hop / RATE_HZ
+        end = start + bin_samples / RATE_HZ
+        slips = (start >= SLIDE_S[0]) & (end <= SLIDE_S[1])
+        rests = (end <= SLIDE_S[0]) | (start >= SLIDE_S[1])
+        known = score.isfinite()
+        right[True].append(score[slips & known] >= 0)
+        right[False].append(score[rests & known] < 0)
+    return sum(float(torch.cat(each).float().mean()) for each in right.values()) / 2
+
+
+@pytest.fixture(scope="module")
+def refitted(command, general, tmp_path_factory):
+    """With recordings of a new object: what was printed, the folder and the report."""
+    place = tmp_path_factory.mktemp("refitted")
+    root = write_new(place / "odd", range(6))
+    printed = command.well(place, "calibrate", *told(general.file, root, "refit=true"))
+    return printed, place / "run", json.loads((place / "run" / "calibration.json").read_text())
+
+
+def test_a_refit_with_recordings_of_a_new_object_finds_its_slip(refitted, general):
+    printed, run, report = refitted
+    tried = report["refit"]
+    assert tried["after"] > tried["before"] + 0.1
+    assert "the detector is refitted" in printed
+    detector, others = SlipDetector.load(run / names.DETECTOR), range(90, 94)
+    assert accuracy_on_odd(detector, others) > accuracy_on_odd(general.detector, others) + 0.15
+    before, after = (
+        sum(row[when]["slip_right"] + row[when]["other_right"] for row in report["left_out"])
+        for when in ("before", "after")
+    )
+    assert after > before
+    assert AlarmSettings.of(detector).calibration == detector.calibration[0]
+    assert_png(run / "calibration.png")
+
+
+def test_a_refitted_detector_says_what_it_was_trained_on(command, refitted, tmp_path):
+    """So its own recordings do not calibrate it, and its bins are those of a further refit."""
+    _, run, _ = refitted
+    detector = SlipDetector.load(run / names.DETECTOR)
+    assert detector.info["train_materials"] == ["A", "B", "C", "G"]
+    kept = KeptBins.load(run / BINS, detector)
+    assert set(kept.sample.group_names) == {"A", "B", "C", "G"}
+    root = run.parent / "odd"
+    ran = command(tmp_path, "calibrate", *told(run / names.DETECTOR, root, "refit=true"))
+    assert (ran.status, "no recording is left" in ran.err) == (2, True)
+
+
+def test_a_refit_that_is_not_better_is_not_written(command, general, tmp_path):
+    """Slips so loud that a threshold is right everywhere: that is moved, the machine stays."""
+    root = write_new(tmp_path / "loud", range(3), loud_samples)
+    printed = command.well(tmp_path, "calibrate", *told(general.file, root, "refit=true"))
+    report = json.loads((tmp_path / "run" / "calibration.json").read_text())
+    assert report["refit"]["before"] == 1.0
+    assert "not refitted, as that is not better" in printed
+    assert report["bins"]["is_set"]
+    detector = SlipDetector.load(tmp_path / "run" / names.DETECTOR)
+    assert torch.equal(detector.head.linear, general.detector.head.linear)
+    assert detector.info["train_materials"] == ["A", "B", "C"]
+    kept = KeptBins.load(tmp_path / "run" / BINS, detector)  # those of before
+    assert set(kept.sample.group_names) == {"A", "B", "C"}
+
+
+def test_an_alarm_of_a_refit_is_set_for_a_rate_and_must_be_again(command, general, tmp_path):
+    root = write_new(tmp_path / "new", range(4), num_quiet=3)
+    given = told(general.file, root, "refit=true", "per_hour=2000")
+    command.well(tmp_path, "calibrate", *given)
+    model = tmp_path / "run" / names.DETECTOR
+    detector = SlipDetector.load(model)
+    assert detector.info["refitted"]["is_set"]
+    alarm = detector.info["calibrated"]["alarm"]
+    assert alarm["bound"] <= 2000 == AlarmSettings.of(detector).target_per_hour
+    ran = command(tmp_path, "calibrate", *told(model, root, "refit=true"))
+    assert (ran.status, "per_hour=RATE" in ran.err) == (2, True)
+
+
+def of_general(general, folder):
+    """A copy of the detector and its bins."""
+    folder.mkdir()
+    for name in (names.DETECTOR, BINS):
+        (folder / name).write_bytes((general.folder / name).read_bytes())
+    return folder
+
+
+def broken_bins(content, case):
+    """Bytes of a file of bins that were damaged."""
+    if case == "cut":
+        return content[: len(content) // 2]
+    if case == "a byte":
+        place = len(content) // 2
+        return content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
+    return b"no archive"
+
+
+@pytest.mark.parametrize("case", ["cut", "a byte", "no archive", "gone", "of another detector"])
+def test_bins_that_are_damaged_or_not_there_are_refused_in_a_line(
+    command, general, refitted, tmp_path, case
+):
+    model, expected = of_general(general, tmp_path / "model"), "is damaged"
+    if case == "gone":
+        (model / BINS).unlink()
+        expected = "keep_bins=false"
+    elif case == "of another detector":
+        (model / BINS).write_bytes((refitted[1] / BINS).read_bytes())
+        expected = "another detector"
+    else:
+        (model / BINS).write_bytes(broken_bins((model / BINS).read_bytes(), case))
+    before = {path.name: path.read_bytes() for path in model.iterdir()}
+    odd = refitted[1].parent / "odd"
+    ran = command(tmp_path, "calibrate", *told(model / names.DETECTOR, odd, "refit=true"))
+    assert (ran.status, ran.err.count("\n")) == (2, 1)
+    assert expected in ran.err
+    assert BINS in ran.err
+    assert {path.name: path.read_bytes() for path in model.iterdir()} == before
+    assert not (tmp_path / "run" / names.DETECTOR).exists()
+
+
+@pytest.mark.parametrize(
+    ("trials", "more", "expected"),
+    [
+        ([0], [], "two or more"),
+        ([0, 1], ["use_trained=true"], "use_trained"),
+        ([0, 1], ["labels.bin_ms=100"], "bin_ms"),
+    ],
+)
+def test_a_refit_refuses_what_cannot_be_tried(command, general, tmp_path, trials, more, expected):
+    root = write_new(tmp_path / "odd", trials)
+    ran = command(tmp_path, "calibrate", *told(general.file, root, "refit=true", *more))
+    assert (ran.status, ran.err.count("\n")) == (2, 1)
+    assert expected in ran.err
+    assert not (tmp_path / "run" / names.DETECTOR).exists()
+
+
+def test_kept_bins_fitted_again_give_the_same_machine(general):
+    """All training bins of this small set are in the sample."""
+    kept = KeptBins.load(general.folder / BINS, general.detector)
+    again, _ = kept.refitted(general.detector, [])
+    assert again.selected == general.detector.selected
+    torch.testing.assert_close(again.head.linear, general.detector.head.linear)
+    torch.testing.assert_close(again.scaler.minimum, general.detector.scaler.minimum)
+    assert again.calibration[0].slope == pytest.approx(general.detector.calibration[0].slope)
+
+
+def test_kept_bins_hold_no_pickle_and_are_read_as_they_were_written(general, tmp_path):
+    with np.load(general.folder / BINS, allow_pickle=False) as content:
+        kinds = {name: content[name].dtype.kind for name in content.files}
+    assert "O" not in kinds.values()
+    assert kinds["features"] == "f"
+    kept = KeptBins.load(general.folder / BINS, general.detector)
+    kept.save(tmp_path / BINS)
+    again = KeptBins.load(tmp_path / BINS, general.detector)
+    assert again.recipe == kept.recipe
+    assert again.selected == kept.selected
+    for name in ("features", "is_slip", "weight", "recording"):
+        assert torch.equal(getattr(again.sample, name), getattr(kept.sample, name))
+
+
+def test_a_file_of_bins_is_never_larger_than_its_cap(general, tmp_path, monkeypatch):
+    """What is left stands for all bins, of each group and class."""
+    kept = KeptBins.load(general.folder / BINS, general.detector)
+    most = (general.folder / BINS).stat().st_size // 3
+    monkeypatch.setattr(refit, "MOST_BYTES", most)
+    kept.save(tmp_path / BINS)
+    assert most / 2 < (tmp_path / BINS).stat().st_size <= most
+    fewer = KeptBins.load(tmp_path / BINS, general.detector).sample
+    assert len(fewer.is_slip) < len(kept.sample.is_slip) / 2
+    for one in kept.sample.stratum.unique():
+        stands_for = fewer.weight[fewer.stratum == one].sum()
+        torch.testing.assert_close(stands_for, kept.sample.weight[kept.sample.stratum == one].sum())
+
+
+def test_a_kept_bin_counts_as_many_as_it_stands_for(general):
+    """The machine of bins of weight 4 is that of each of them four times, in recordings apart."""
+    kept = KeptBins.load(general.folder / BINS, general.detector)
+    pool, bins = kept.pool(general.detector), kept.sample.by_recording()
+    recipe = replace(kept.recipe, views=("simple",), penalties=(1.0,), drop_channels=0.0)
+
+    def scores(some):
+        fit = recipe.fit(some, pool)
+        return fit.head(fit.selection(kept.sample.features))
+
+    four = [replace(of, weight=4 * of.weight) if of.group == "A" else of for of in bins]
+    apart = [
+        replace(of, name=f"{of.name} {part}")
+        for of in bins
+        for part in range(4 if of.group == "A" else 1)
+    ]
+    alike, wanted, plain = scores(four), scores(apart), scores(bins)
+    assert (alike - wanted).norm() < 0.2 * (plain - wanted).norm()
+
+
+def test_no_bins_are_kept_of_the_papers_recipe_or_where_that_is_not_wanted(
+    command, general, paper, tmp_path
+):
+    assert not (paper.folder / BINS).exists()
+    words = {"keep_bins": False, "recipe.views": ["simple"], "recipe.penalties": [1.0]}
+    made = train(command, tmp_path, general.overrides, **words)
+    assert not (made.folder / BINS).exists()

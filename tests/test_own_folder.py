@@ -196,6 +196,8 @@ def test_recordings_of_one_label_are_joined_until_two_groups_have_both():
         torch.zeros(12),
         ("",),
         torch.ones(12, dtype=torch.float64),
+        group,
+        tuple("abcdef"),
     )
     joined = sample.joined()
     assert len(joined.group_names) == 3

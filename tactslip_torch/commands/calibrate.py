@@ -1,24 +1,28 @@
 """Set alarm and threshold on recordings of use: ``tactslip calibrate model=detector.pt ...``.
 
 Recordings without slip set the alarm for a rate of false alarms, labelled ones with slip the
-decision threshold. Leaves ``detector.pt``, ``calibration.json`` and ``calibration.png``; a detector
-that would be worse on recordings left out is not written.
+decision threshold. With ``refit=true`` the detector is fitted again before, to its training bins
+and the labelled recordings. Leaves ``detector.pt``, ``calibration.json`` and ``calibration.png``; a
+detector that would be worse on recordings left out is not written.
 """
 
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from tactslip_torch.commands.entry import entry_point, save_config
+from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.detector import SlipDetector
@@ -29,14 +33,18 @@ from tactslip_torch.report.calibration import (
     calibration_table,
     pooled_outcome,
 )
-from tactslip_torch.runtime import check_number, check_share, plain, write_json
+from tactslip_torch.runtime import bar, check_number, check_share, plain, whole_file, write_json
 from tactslip_torch.training.alarm import OURS, Stream, Timing, score_streams
+from tactslip_torch.training.bins import RecordingBins
 from tactslip_torch.training.calibrate import (
     Calibrator,
     Change,
     ScoredRecording,
+    held_out_accuracy,
     in_stretches,
+    left_out_folds,
 )
+from tactslip_torch.training.refit import BINS, KeptBins
 
 _FEW_SLIPS, _FEW_RECORDINGS, _NUM_STRETCHES = 30, 3, 10
 _NUM_CELLS = 60  # of a histogram
@@ -71,49 +79,218 @@ def calibrate(config: DictConfig, folder: Path) -> dict[str, Any]:
     calibrator = Calibrator(
         settings, timing, instantiate(config.labels), config.per_hour, config.confidence
     )
+    kept = _kept_bins(config, detector) if config.refit else None
     times = _labelled(config, detector, source)
     _check_hours(calibrator, times)
     save_config(config, folder)
-    scored = score_streams(
-        source,
-        list(times),
-        {OURS: detector},
-        {OURS: settings.hop_samples},
-        settings.onset,
-        config.num_workers,
-    )
-    streams = [one._replace(times=times[one.recording]) for one in scored[OURS]]
-    recordings = [calibrator.scored(one) for one in _cut(streams, timing)]
-    report, change = _calibrated(calibrator, recordings)
+    scoring = _Scoring(source, times, config.num_workers)
+    new = _new_bins(kept, detector, calibrator.rule, scoring) if kept else {}
+    use = _Use(detector, calibrator, scoring.recordings(calibrator, list(times), detector))
     origin: dict[str, Any] = {
         "simulated": source.is_simulated,
         "date": datetime.now(UTC).date().isoformat(),
         "model": str(config.model),
-        "hours": sum(one.hours for one in recordings),
+        "hours": sum(one.hours for one in use.recordings),
         "recordings": {str(one): cache_key(source.key(one)) for one in times},
         "trained_on": bool(config.use_trained),
     }
-    report = {**origin, **report}
+    before, refit = use, None
+    if kept is not None:
+        use, kept, refit = _refitted(use, kept, new, scoring)
+    detector, calibrator, recordings = use
+    report, change = _calibrated(calibrator, recordings)
+    if refit is not None and refit["is_set"]:
+        report["left_out"] = _rows_of_refit(before, report["left_out"], change is not None)
+        change = change or Change(0.0, None, calibrator.settings)
+        detector.info |= _trained_on(detector, origin["recordings"], times)
+        detector.info["refitted"] = plain(origin | refit)
+    report = {**origin, **({"refit": refit} if refit else {}), **report}
     print("\n" + calibration_table(report["left_out"], simulated=report["simulated"]))
     _tell(report)
     write_json(folder / "calibration.json", plain(report))
     calibration_figure(report, folder / "calibration.png")
     if change is None:
         print(f"the detector stays as it is, {config.model}; no detector is written")
-    else:
-        alarm = report.get("alarm", {})
-        curve = [point[:2] for point in alarm.get("curve", ())] if alarm.get("is_set") else ()
-        more = {"threshold_curve": curve} if curve else {}
-        calibrator.apply(change, detector, more | {"simulated": report["simulated"]})
-        kept = ("per_hour", "confidence", "hours", "dispersion", "alarms", "bound")
-        detector.info["calibrated"] = plain(
-            origin
-            | {"alarm": {name: alarm[name] for name in kept} if alarm.get("is_set") else None}
-            | {"decision_threshold_moved_by": change.shift}
-        )
-        detector.save(folder / "detector.pt")
-        print(f"calibrated detector: {folder / 'detector.pt'}")
+        return report
+    alarm = report.get("alarm", {})
+    curve = [point[:2] for point in alarm.get("curve", ())] if alarm.get("is_set") else ()
+    more = {"threshold_curve": curve} if curve else {}
+    calibrator.apply(change, detector, more | {"simulated": report["simulated"]})
+    stated = ("per_hour", "confidence", "hours", "dispersion", "alarms", "bound")
+    detector.info["calibrated"] = plain(
+        origin
+        | {"alarm": {name: alarm[name] for name in stated} if alarm.get("is_set") else None}
+        | {"decision_threshold_moved_by": change.shift}
+    )
+    _keep_bins(kept, detector, Path(config.model).with_name(BINS), folder / BINS)
+    detector.save(folder / "detector.pt")
+    print(f"calibrated detector: {folder / 'detector.pt'}")
     return report
+
+
+class _Use(NamedTuple):
+    """A detector, what calibrates it, and recordings as one that had not seen them scored them."""
+
+    detector: SlipDetector
+    calibrator: Calibrator
+    recordings: list[ScoredRecording]
+
+
+class _Scoring(NamedTuple):
+    """Recordings to be scored, with what is known of them."""
+
+    source: RecordingSource
+    times: Mapping[RecordingId, Timeline]
+    num_workers: int | None
+
+    def streams(
+        self, calibrator: Calibrator, some: Sequence[RecordingId], detector: SlipDetector
+    ) -> list[Stream]:
+        """Some of the recordings as a detector scores them."""
+        settings = calibrator.settings
+        hops, onset = {OURS: settings.hop_samples}, settings.onset
+        scored = score_streams(self.source, some, {OURS: detector}, hops, onset, self.num_workers)
+        return [one._replace(times=self.times[one.recording]) for one in scored[OURS]]
+
+    def recordings(
+        self, calibrator: Calibrator, some: Sequence[RecordingId], detector: SlipDetector
+    ) -> list[ScoredRecording]:
+        """The same, to be calibrated on."""
+        streams = self.streams(calibrator, some, detector)
+        return [calibrator.scored(one) for one in _cut(streams, calibrator.timing)]
+
+
+# The refit ---------------------------------------------------------------------------------------
+
+
+def _kept_bins(config: DictConfig, detector: SlipDetector) -> KeptBins:
+    """The training bins beside a detector that can be fitted again.
+
+    Raises:
+        ValueError: if there are none, or more must be said.
+    """
+    if config.use_trained:
+        raise ValueError("refit=true adds recordings; leave use_trained at false")
+    rate = AlarmSettings.of(detector).target_per_hour
+    if config.per_hour is None and rate is not None:
+        raise ValueError(
+            f"the alarm is set for {rate:g} false alarms an hour, which holds no more after a "
+            "refit; give per_hour=RATE, and recordings without slip to set it by"
+        )
+    return KeptBins.load(Path(config.model).with_name(BINS), detector)
+
+
+def _new_bins(
+    kept: KeptBins, detector: SlipDetector, rule: LabelRule, scoring: _Scoring
+) -> dict[RecordingId, RecordingBins]:
+    """Labelled bins of the recordings that a refit adds.
+
+    Raises:
+        ValueError: if recordings are too few to leave some out.
+    """
+    source, times, num_workers = scoring
+    new = kept.recordings(detector, source, rule, times, num_workers)
+    is_slip = torch.cat([bins.is_slip for bins in new.values()])
+    num_slip = int(is_slip.sum())
+    if len(new) < 2 or not 0 < num_slip < len(is_slip):
+        raise ValueError(
+            "a refit is tried on new recordings left out: that needs two or more with labels, slip "
+            f"and no slip among them; got {len(new)} with {num_slip} bins of slip and "
+            f"{len(is_slip) - num_slip} of none"
+        )
+    return new
+
+
+def _refitted(
+    use: _Use, kept: KeptBins, new: Mapping[RecordingId, RecordingBins], scoring: _Scoring
+) -> tuple[_Use, KeptBins | None, dict[str, Any]]:
+    """The detector refitted, if that is better on what is left out, with its bins; what came of it.
+
+    Each recording is scored by a refit without it, so that thresholds can be set by these scores.
+    """
+    detector, calibrator, _ = use
+    times = scoring.times
+    made, kept_then = kept.refitted(detector, new.values())
+    then = replace(calibrator, settings=AlarmSettings.of(made))
+    masks, _ = left_out_folds([one.material for one in times])
+    scored = dict[RecordingId, Stream]()
+    for mask in bar(masks, "refit, recordings left out", "fold"):
+        out = [one for one, is_out in zip(times, mask, strict=True) if is_out]
+        without, _ = kept.refitted(detector, [bins for one, bins in new.items() if one not in out])
+        scored |= zip(out, scoring.streams(then, out, without), strict=True)
+    streams = _cut([scored[one] for one in times], then.timing)
+    after = _Use(made, then, [then.scored(one) for one in streams])
+    old, better = (held_out_accuracy(of.recordings) for of in (use, after))
+    report = {
+        "is_set": better > old,
+        "before": old,
+        "after": better,
+        "new_objects_before": detector.info.get("validated"),
+        "new_objects_after": made.info["validated"],
+        "num_groups": [len(of.sample.group_names) for of in (kept, kept_then)],
+        "added_bins": sum(len(bins.is_slip) for bins in new.values()),
+        "kept_bins": len(kept.sample.is_slip),
+        "groups": _by_group(use, after),
+    }
+    return (after, kept_then, report) if better > old else (use, None, report)
+
+
+def _by_group(before: _Use, after: _Use) -> list[dict[str, Any]]:
+    """Balanced accuracy on each group before and after, both thresholds at 0."""
+    pairs = (_rows(use.calibrator, use.recordings, _unchanged(use)) for use in (before, after))
+    found = []
+    for old, new in zip(*pairs, strict=True):
+        found.append(old | {"after": new["after"]})
+    rows = []
+    for group in dict.fromkeys(row["group"] for row in found):
+        own = [row for row in found if row["group"] == group]
+        ends = (pooled_outcome(row[when] for row in own) for when in ("before", "after"))
+        old, new = (end["balanced_accuracy"] for end in ends)
+        rows.append({"group": group, "before": old, "after": new})
+    return rows
+
+
+def _rows_of_refit(
+    before: _Use, rows: Sequence[Mapping[str, Any]], is_moved: bool
+) -> list[dict[str, Any]]:
+    """Rows of a refitted detector that say what the old one made of the recordings."""
+    old = _rows(before.calibrator, before.recordings, _unchanged(before))
+    when = "after" if is_moved else "before"  # no threshold of the refitted one is moved
+    return [mine | {"after": row[when]} for mine, row in zip(old, rows, strict=True)]
+
+
+def _unchanged(use: _Use) -> list[Change]:
+    return [Change(0.0, None, use.calibrator.settings)] * len(use.recordings)
+
+
+def _trained_on(
+    detector: SlipDetector, recordings: Mapping[str, str], times: Mapping[RecordingId, Timeline]
+) -> dict[str, Any]:
+    """What ``info`` says of the training recordings, with those that were added."""
+    info, known = detector.info, dict(detector.info.get("train_recordings", {}))
+    for name, key in recordings.items():
+        while name in known:
+            name += " (refit)"
+        known[name] = key
+    materials = {*info.get("train_materials", ()), *(one.material for one in times)}
+    sessions = {*info.get("train_sessions", ()), *(one.session or "1" for one in times)}
+    return {
+        "train_recordings": known,
+        "train_materials": sorted(materials),
+        "train_sessions": sorted(sessions),
+    }
+
+
+def _keep_bins(kept: KeptBins | None, detector: SlipDetector, old: Path, new: Path) -> None:
+    """Leave bins beside a written detector: those of the refit, else those of the old one."""
+    if kept is not None:
+        kept.written_with(detector).save(new)
+    elif old.is_file() and not (new.exists() and new.samefile(old)):
+        with whole_file(new) as temporary:
+            shutil.copyfile(old, temporary)
+
+
+# What is given -----------------------------------------------------------------------------------
 
 
 def _check_hand(detector: SlipDetector, source: RecordingSource) -> None:
@@ -341,6 +518,21 @@ def _histogram(recordings: Sequence[ScoredRecording]) -> dict[str, Any]:
 
 def _tell(report: Mapping[str, Any]) -> None:
     """What was set, and what was not and why."""
+    if refit := report.get("refit"):
+        accuracies = f"{100 * refit['before']:.1f} % before, {100 * refit['after']:.1f} % after"
+        what = "refitted" if refit["is_set"] else "not refitted, as that is not better"
+        print(
+            f"the detector is {what}: balanced accuracy {accuracies}, with {refit['added_bins']} "
+            f"new bins beside {refit['kept_bins']} kept ones; on what was left out, each at the "
+            "better of its threshold and one moved"
+        )
+        if None not in (ends := [refit["new_objects_before"], refit["new_objects_after"]]):
+            told = " %, after ".join(f"{100 * end:.1f}" for end in ends)
+            old, new = refit["num_groups"]
+            print(
+                "to be expected on objects of neither, by leaving out each group of training bins: "
+                f"before {told} % ({old} groups, {new} after; a hard one lowers it)"
+            )
     print(f"left out: {report['left_out_words']}")
     if bins := report.get("bins"):
         accuracies = f"{100 * bins['before']:.1f} % before, {100 * bins['after']:.1f} % after"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from tactslip_torch.onset.decisions import KEY
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
+from tactslip_torch.training.bins import SampledBins
 from tactslip_torch.training.experiment import (
     Experiment,
     common_metadata,
@@ -35,7 +37,8 @@ from tactslip_torch.training.experiment import (
     run_experiment,
     write_tensorboard,
 )
-from tactslip_torch.training.recipe import Paper, Recipe
+from tactslip_torch.training.recipe import General, Paper, Recipe
+from tactslip_torch.training.refit import BINS, KeptBins
 
 log = logging.getLogger(__name__)
 
@@ -108,8 +111,9 @@ def _experiment(config: DictConfig) -> Experiment:
     alarm: CalibratedAlarm | DebouncedAlarm | None
     _refuse_simulated_streams(config, source)
     alarm = instantiate(config.onset, _convert_="all") or None
-    if type(config.train_on_all) is not bool:
-        raise ValueError(f"train_on_all must be true or false, got {config.train_on_all!r}")
+    for key in ("train_on_all", "keep_bins"):
+        if type(config[key]) is not bool:
+            raise ValueError(f"{key} must be true or false, got {config[key]!r}")
     if isinstance(alarm, CalibratedAlarm) and len(folds) > 1:
         raise ValueError(
             f"onset=alarms sets the alarm of one detector, this split makes {len(folds)}; take "
@@ -123,6 +127,9 @@ def _experiment(config: DictConfig) -> Experiment:
         trained = trained if config.train_on_all else [set(f.having("train")) for f in folds]
         if why := _why_unvalidated(recipe, min(map(len, trained))):
             log.warning("%s: %s", _NO_ALARM, why)
+    keep_bins = None
+    if config.keep_bins and isinstance(recipe, General):
+        keep_bins = partial(_keep_bins, recipe, maker.pool.selected)
     return Experiment(
         maker=maker,
         folds=folds,
@@ -140,6 +147,7 @@ def _experiment(config: DictConfig) -> Experiment:
         with_baselines=config.baselines,
         export=_export_fold if config.export else None,
         train_on_all=config.train_on_all,
+        keep_bins=keep_bins,
     )
 
 
@@ -189,6 +197,17 @@ def _set_alarm(
         if alarm.classifier is not None:
             alarm.fit(detector, source, num_workers)
     return {}
+
+
+def _keep_bins(
+    recipe: General,
+    selected: Sequence[int],
+    detector: SlipDetector,
+    sample: SampledBins,
+    folder: Path,
+) -> None:
+    """Write the training bins that a refit adds to."""
+    KeptBins.of(detector, sample, selected, recipe).save(folder / BINS)
 
 
 def _export_fold(detector: SlipDetector, folder: Path) -> dict[str, dict[str, float] | str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from tactslip_torch.report import style
 
@@ -87,15 +88,19 @@ def calibration_figure(report: Mapping[str, Any], path: str | Path) -> None:
 
     Args:
         report: the content of ``calibration.json``, with ``bins`` where the decision threshold
-            was looked for, and ``alarm`` where the alarm was.
+            was looked for, ``alarm`` where the alarm was, and ``refit`` where that was tried.
         path: the PNG to write, replaced as a whole if it exists.
     """
-    panels = {name: report[name] for name in ("bins", "alarm") if report.get(name)}
+    panels = {name: report[name] for name in ("refit", "bins", "alarm") if report.get(name)}
     title = "Calibration: before (dashed) and after (solid)"
     figure = style.new_figure(5.6 * len(panels), 3.9, title, simulated=report["simulated"])
     grid = np.ravel(figure.subplots(1, len(panels)))
     for axes, (name, found) in zip(grid, panels.items(), strict=True):
-        if name == "bins":
+        ends: tuple[float, ...] = ()
+        if name == "refit":
+            title = "Refit, tried on what was left out"
+            _draw_refit(axes, found["groups"])
+        elif name == "bins":
             title, ends = "Decision threshold", (0.0, found["threshold"])
             edges, colours = found["histogram"]["edges"], (style.PALETTE[1], style.PALETTE[0])
             for kind, label, colour in zip(
@@ -116,8 +121,22 @@ def calibration_figure(report: Mapping[str, Any], path: str | Path) -> None:
             axes.fill_between(places, rates, bounds, label=label, **look)
             axes.axhline(found["per_hour"], color=style.GREY, linewidth=1, label="wanted, at most")
             axes.set(yscale="log", xlabel="threshold of the alarm", ylabel="false alarms an hour")
-        for end, dash in zip(ends, ("--", "-"), strict=True):
+        for end, dash in zip(ends, ("--", "-"), strict=False):
             axes.axvline(end, color=style.INK, linestyle=dash, linewidth=1.2)
         axes.set_title(title + ("" if found["is_set"] else " (not changed)"))
         axes.legend(loc="best")
     style.save(figure, path)
+
+
+def _draw_refit(axes: Axes, groups: Rows) -> None:
+    """Balanced accuracy on each group before and after a refit."""
+    known = [row for row in groups if None not in (row["before"], row["after"])]
+    for place, row in enumerate(known):
+        ends = [100 * row["before"], 100 * row["after"]]
+        axes.plot(ends, [place, place], color=style.GREY, linewidth=1)
+    places, colour = range(len(known)), style.PALETTE[0]
+    for when, fill in (("before", "none"), ("after", colour)):
+        values = [100 * row[when] for row in known]
+        axes.scatter(values, places, edgecolors=colour, facecolors=fill, label=when, zorder=2)
+    axes.set_yticks(places, [row["group"] for row in known])
+    axes.set(xlabel="balanced accuracy, %", ylim=(len(known) - 0.5, -0.5))

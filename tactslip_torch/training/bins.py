@@ -31,9 +31,11 @@ class RecordingBins:
         is_slip: which they are.
         scene: of the recording.
         longest_run: most equal samples in a row of a channel that moves; ``None``: not known.
+        weight: for how many bins each stands, alike for those of a group, scene and class;
+            ``None``: for itself.
 
     Shape:
-        - features: ``[N, F]``; is_slip: ``[N]``, bool
+        - features: ``[N, F]``; is_slip: ``[N]``, bool; weight: ``[N]``, float64
     """
 
     name: str
@@ -42,6 +44,7 @@ class RecordingBins:
     is_slip: Tensor
     scene: str = PAPER_SCENE
     longest_run: int | None = None
+    weight: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class SampledBins:
         scene: ``[n]``, index into ``scene_names``.
         scene_names: ascending.
         weight: ``[n]``, float64, for how many bins of its stratum each stands.
+        recording: ``[n]``, index into ``recording_names``.
+        recording_names: ascending.
         longest_run: most equal samples in a row, of all recordings; ``None``: not known.
     """
 
@@ -66,6 +71,8 @@ class SampledBins:
     scene: Tensor
     scene_names: tuple[str, ...]
     weight: Tensor
+    recording: Tensor
+    recording_names: tuple[str, ...]
     longest_run: int | None = None
 
     @property
@@ -126,11 +133,55 @@ def join_groups(
     more = [f" and {len(own) - 1} more" if len(own) > 1 else "" for own in members]
     return to[group], tuple(name + behind for name, behind in zip(firsts, more, strict=True))
 
+    def thinned(self, most: int) -> SampledBins:
+        """At most about so many of the bins, even over strata, which stand for all of them."""
+        places, weight = even_places(self.stratum, self.weight, most)
+        names = ("features", "is_slip", "group", "scene", "recording")
+        return replace(self, weight=weight, **{name: getattr(self, name)[places] for name in names})
+
+    def by_recording(self) -> list[RecordingBins]:
+        """The same bins, those of each recording together, to be fitted to again."""
+        found = []
+        for index, name in enumerate(self.recording_names):
+            rows = (self.recording == index).nonzero()[:, 0]
+            if len(rows):
+                group = self.group_names[int(self.group[rows[0]])]
+                scene = self.scene_names[int(self.scene[rows[0]])]
+                features, is_slip = self.features[rows], self.is_slip[rows]
+                bins = RecordingBins(name, group, features, is_slip, scene, self.longest_run)
+                found.append(replace(bins, weight=self.weight[rows]))
+        return found
+
+
+def even_places(stratum: Tensor, weights: Tensor, most: int) -> tuple[Tensor, Tensor]:
+    """Places of at most about so many bins, even over strata, and weights for those left out.
+
+    Each stratum keeps two bins at least, if it has them.
+
+    Shape:
+        - stratum, weights: ``[N]``
+        - output: ``[n]``, ascending, and ``[n]``
+    """
+    if len(stratum) <= most:
+        return torch.arange(len(stratum)), weights
+    strata = [(stratum == one).nonzero()[:, 0] for one in stratum.unique().tolist()]
+    share = most // len(strata)
+    for _ in range(len(strata)):  # strata that have fewer leave their part to the others
+        short = [len(rows) for rows in strata if len(rows) < share]
+        share = max((most - sum(short)) // max(len(strata) - len(short), 1), share)
+    weights, kept = weights.clone(), list[Tensor]()
+    for rows in strata:
+        some = torch.linspace(0, len(rows) - 1, min(len(rows), max(share, 2))).round().long()
+        weights[rows] *= len(rows) / len(some)
+        kept.append(rows[some])
+    places = torch.cat(kept).sort().values
+    return places, weights[places]
+
 
 class _Stratum(NamedTuple):
     """Bins of one stratum: how many there were, and those of smallest key, ascending."""
 
-    num_seen: int
+    num_seen: float
     places: list[tuple[float, str, int]]  # key, recording, bin
     features: Tensor  # [len(places), F]
 
@@ -170,7 +221,8 @@ class BinSample:
             places = [(float(keys[row]), bins.name, row) for row in kept.tolist()]
             if len(rows):
                 stratum = bins.group, bins.scene, label
-                self._add(stratum, _Stratum(len(rows), places, bins.features[kept]))
+                num = len(rows) if bins.weight is None else float(bins.weight[rows].sum())
+                self._add(stratum, _Stratum(num, places, bins.features[kept]))
 
     def merge(self, other: BinSample) -> None:
         """Add the bins of another sample of that size; of other recordings (not checked)."""
@@ -194,8 +246,11 @@ class BinSample:
             for _, recording, index in part.places
         ]
         order = sorted(range(len(rows)), key=rows.__getitem__)
-        _, _, of_group, of_scene, is_slip, weight = zip(*(rows[i] for i in order), strict=True)
+        columns = zip(*(rows[i] for i in order), strict=True)
+        of_recording, _, of_group, of_scene, is_slip, weight = columns
         groups, scenes = sorted(set(of_group)), sorted(set(of_scene))
+        recordings = sorted(set(of_recording))
+        number = {name: index for index, name in enumerate(recordings)}
         return SampledBins(
             features=torch.cat([part.features for _, part in strata])[order],
             is_slip=torch.tensor(is_slip),
@@ -204,6 +259,8 @@ class BinSample:
             scene=torch.tensor([scenes.index(name) for name in of_scene]),
             scene_names=tuple(scenes),
             weight=torch.tensor(weight, dtype=torch.float64),
+            recording=torch.tensor([number[name] for name in of_recording]),
+            recording_names=tuple(recordings),
             longest_run=self._longest_run,
         )
 

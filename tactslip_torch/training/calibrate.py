@@ -240,14 +240,9 @@ class Calibrator:
         moves_bins = change.calibration is not None
         rows = change.alarm.metadata.get("budget", ())
         rate = rows[0]["allowed"] / rows[0]["amount"] if budget is not None else 0.0
-        names = list(dict.fromkeys(one.stream.recording.material for one in recordings))
-        places: list[int] = [names.index(one.stream.recording.material) for one in recordings]
-        words = f"{len(names)} groups ({', '.join(names[:4])}{', ..' * (len(names) > 4)})"
-        if len(names) < _FEWEST_GROUPS:
-            places, words = list(range(len(recordings))), f"{len(recordings)} recordings"
+        masks, words = left_out_folds([one.stream.recording.material for one in recordings])
         found = [change] * len(recordings)
-        for fold in range(min(_NUM_FOLDS, max(places) + 1)):
-            out = [place % _NUM_FOLDS == fold for place in places]
+        for out in masks:
             rest = [one for one, is_out in zip(recordings, out, strict=True) if not is_out]
             hours = sum(one.hours for one in rest)
             is_slip = torch.cat([one.is_slip for one in rest] or [torch.zeros(0).bool()])
@@ -314,6 +309,50 @@ class Calibrator:
         if isinstance(rule, Cusum):
             settings = replace(settings, rule=replace(rule, ceiling=math.inf))
         return replace(settings, threshold=threshold)
+
+
+def left_out_folds(groups: Sequence[str]) -> tuple[list[list[bool]], str]:
+    """What is left out together, and in words.
+
+    Groups are where there are three or more, else recordings; in up to ten folds.
+
+    Args:
+        groups: of each recording.
+
+    Returns:
+        For each fold which recordings are left out, and what all of them are.
+    """
+    names = list(dict.fromkeys(groups))
+    places = [names.index(group) for group in groups]
+    words = f"{len(names)} groups ({', '.join(names[:4])}{', ..' * (len(names) > 4)})"
+    if len(names) < _FEWEST_GROUPS:
+        places, words = list(range(len(groups))), f"{len(groups)} recordings"
+    folds = range(min(_NUM_FOLDS, max(places) + 1))
+    return [[place % _NUM_FOLDS == fold for place in places] for fold in folds], words
+
+
+def held_out_accuracy(recordings: Sequence[ScoredRecording]) -> float:
+    """Balanced accuracy of bins at a threshold of 0 or, if that is better, as the others set it.
+
+    0 where there are no valid bins of both classes.
+    """
+    masks, _ = left_out_folds([one.stream.recording.material for one in recordings])
+    bins, is_slip = (torch.cat([getattr(r, n) for r in recordings]) for n in ("bins", "is_slip"))
+    if not bool(is_slip.any()) or bool(is_slip.all()):
+        return 0.0
+    moved = bins.clone()
+    for mask in masks:
+        is_out = torch.cat(
+            [torch.full((len(r.bins),), out) for r, out in zip(recordings, mask, strict=True)]
+        )
+        rest = is_slip[~is_out]
+        if bool(rest.any()) and not bool(rest.all()):
+            moved[is_out] -= decision_threshold(bins[~is_out], rest)
+    recalls = [
+        ((scores[is_slip] >= 0).double().mean(), (scores[~is_slip] < 0).double().mean())
+        for scores in (bins, moved)
+    ]
+    return max(float(slip + other) / 2 for slip, other in recalls)
 
 
 def decision_threshold(scores: Tensor, is_slip: Tensor) -> float:

@@ -155,15 +155,19 @@ class FeatureMaker:
             self._kept_bytes += size
         return has_room
 
-    def __call__(self, recording: RecordingId) -> RecordingFeatures:
+    def __call__(self, recording: RecordingId, times: Timeline | None = None) -> RecordingFeatures:
         """Features and labels of one recording.
+
+        Args:
+            recording: which.
+            times: what is true of it, where that is more than the source says.
 
         Raises:
             ValueError: if bins leave the recording or a sample they need is not finite.
         """
         if (kept := self._kept.get(recording)) is not None:
             return kept
-        times = self.source.timeline(recording)
+        times = self.source.timeline(recording) if times is None else times
         bins = self.lay_bins(times)
         features, longest_run = self._features(recording, times, bins)
         is_slip = bins.is_slip

@@ -41,6 +41,7 @@ from tactslip_torch.native import BackendName, backend_of
 from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import Align, ChannelFilter, frame_lengths
 from tactslip_torch.signals.wavelet import SpectrumMethod, highest_level
+from tactslip_torch.training.bins import SampledBins
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule, training_origin
 from tactslip_torch.training.evaluation import merged_results
 from tactslip_torch.training.learner import SlipLearner
@@ -66,6 +67,8 @@ class Experiment:
         export: writes the ONNX files of a detector into a folder; ``None``: nothing does.
         train_on_all: whether a last detector, the one to use, is trained on all recordings of the
             folds; those of folds then show what to expect of it, in place of a nested validation.
+        keep_bins: writes the sample of the training bins of a detector into a folder; of several
+            folds only of the last detector, where there is one. ``None``: nothing does.
     """
 
     maker: FeatureMaker
@@ -79,6 +82,7 @@ class Experiment:
     with_baselines: bool = True
     export: Callable[[SlipDetector, Path], dict[str, Any]] | None = None
     train_on_all: bool = False
+    keep_bins: Callable[[SlipDetector, SampledBins, Path], None] | None = None
 
 
 def run_experiment(experiment: Experiment, folder: Path) -> dict[str, Any]:
@@ -95,8 +99,10 @@ def run_experiment(experiment: Experiment, folder: Path) -> dict[str, Any]:
     results: dict[str, dict[str, Any]] = {}
     with feature_cache(experiment.cache) as experiment.maker.cache:
         data = SlipDataModule(experiment.maker, folds, experiment.num_workers)
-        of_folds = replace(experiment, export=None) if experiment.train_on_all else experiment
         is_one = len(folds) == 1 and not experiment.train_on_all
+        of_folds = experiment if is_one else replace(experiment, keep_bins=None)
+        if experiment.train_on_all:
+            of_folds = replace(of_folds, export=None)
         for data.fold in folds:
             place = folder if is_one else folder / data.fold.name
             results[data.fold.name] = _run_fold(of_folds, data, place)
@@ -149,6 +155,8 @@ def _run_fold(experiment: Experiment, data: SlipDataModule, folder: Path) -> dic
     onnx: dict[str, Any] = {}
     if trainer.is_global_zero:
         detector.save(folder / "detector.pt")  # stays, whatever comes
+        if experiment.keep_bins and learner.sample is not None:
+            experiment.keep_bins(detector, learner.sample, folder)
         alarm = experiment.alarm(detector) if experiment.alarm else {}
         detector.save(folder / "detector.pt")
     alarmed = time.perf_counter()

@@ -16,6 +16,7 @@ from tactslip_torch.onset.events import LatencyParts, RecordingEvents
 from tactslip_torch.runtime import from_first_process, gathered, one_thread
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.baselines import Baselines
+from tactslip_torch.training.bins import SampledBins
 from tactslip_torch.training.datamodule import RecordingFeatures, TrainingBins
 from tactslip_torch.training.evaluation import (
     EvaluatedBins,
@@ -41,6 +42,7 @@ class SlipLearner(L.LightningModule):
 
     Attributes:
         detector: the result, after the training step.
+        sample: of the training bins, after the training step.
         metadata: how it was made, such as the penalty.
         metrics: ``{"splits": ..., "baselines": ..., "comparison": ..., "events": ...}`` after a
             test.
@@ -71,6 +73,7 @@ class SlipLearner(L.LightningModule):
             self.recipe.allowed(pool)  # refused before any work
         self.detector = detector
         self.with_baselines = with_baselines
+        self.sample: SampledBins | None = None
         self.baselines: Baselines | None = None
         self.metadata: dict[str, Any] = {}
         self.metrics: dict[str, Any] = {}
@@ -93,6 +96,7 @@ class SlipLearner(L.LightningModule):
         fitted = time.perf_counter()
         self.seconds["fit"] = fitted - started
         self.log("penalty", fit.penalty, batch_size=1)
+        self.sample = fit.sample
         self.metadata = {"recipe": self.recipe.name} | fit.metadata
         info = self.metadata | {"calibration": fit.calibration}
         if self.with_baselines:

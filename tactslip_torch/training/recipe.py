@@ -533,6 +533,8 @@ class General(_Recipe):
         if not len(labels):
             return
         weight = torch.tensor(weights[bins.scene]).double()[labels]
+        if bins.weight is not None:
+            weight = weight * bins.weight
         u, is_lost = view.units(bins.features), self.second_copies(bins.name, len(labels), pool)
         if is_lost is not None and view.name == "pooled":
             u = torch.cat([u, view.units(bins.features, is_lost)])

@@ -34,6 +34,7 @@ from tactslip_torch.model.kernels import (
 )
 from tactslip_torch.model.ridge import ClassSums, balanced_weights, class_targets, solve_dual
 from tactslip_torch.runtime import one_thread, steps, trim_memory
+from tactslip_torch.training.bins import even_places
 from tactslip_torch.training.choice import platt_or_none
 from tactslip_torch.training.columns import FeatureSelection, joined, view_columns
 
@@ -89,25 +90,8 @@ class ViewBins:
         return max(int(self.labels.max()) + 1, 2)
 
     def thinned(self, most: int) -> tuple[Tensor, Tensor]:
-        """Places of at most about so many bins, even over strata, and weights for those left out.
-
-        Shape:
-            - output: ``[n]``, ascending, and ``[n]``
-        """
-        if len(self.labels) <= most:
-            return torch.arange(len(self.labels)), self.weights
-        strata = [(self.stratum == one).nonzero()[:, 0] for one in self.stratum.unique().tolist()]
-        share = most // len(strata)
-        for _ in range(len(strata)):  # strata that have fewer leave their part to the others
-            short = [len(rows) for rows in strata if len(rows) < share]
-            share = max((most - sum(short)) // max(len(strata) - len(short), 1), share)
-        weights, kept = self.weights.clone(), list[Tensor]()
-        for rows in strata:
-            some = torch.linspace(0, len(rows) - 1, min(len(rows), max(share, 2))).round().long()
-            weights[rows] *= len(rows) / len(some)
-            kept.append(rows[some])
-        places = torch.cat(kept).sort().values
-        return places, weights[places]
+        """Places of some of the bins and weights, as ``even_places`` has them."""
+        return even_places(self.stratum, self.weights, most)
 
 
 @dataclass(frozen=True)
