@@ -86,6 +86,25 @@ class SampledBins:
         group, named = join_groups(self.group, label, self.weight, names, most)
         return self if named is names else replace(self, group=group, group_names=named)
 
+    def thinned(self, most: int) -> SampledBins:
+        """At most about so many of the bins, even over strata, which stand for all of them."""
+        places, weight = even_places(self.stratum, self.weight, most)
+        names = ("features", "is_slip", "group", "scene", "recording")
+        return replace(self, weight=weight, **{name: getattr(self, name)[places] for name in names})
+
+    def by_recording(self) -> list[RecordingBins]:
+        """The same bins, those of each recording together, to be fitted to again."""
+        found = []
+        for index, name in enumerate(self.recording_names):
+            rows = (self.recording == index).nonzero()[:, 0]
+            if len(rows):
+                group = self.group_names[int(self.group[rows[0]])]
+                scene = self.scene_names[int(self.scene[rows[0]])]
+                features, is_slip = self.features[rows], self.is_slip[rows]
+                bins = RecordingBins(name, group, features, is_slip, scene, self.longest_run)
+                found.append(replace(bins, weight=self.weight[rows]))
+        return found
+
 
 def join_groups(
     group: Tensor, label: Tensor, weight: Tensor, names: tuple[str, ...], most: int = MOST_GROUPS
@@ -132,25 +151,6 @@ def join_groups(
     firsts = [names[own[0]] for own in members]
     more = [f" and {len(own) - 1} more" if len(own) > 1 else "" for own in members]
     return to[group], tuple(name + behind for name, behind in zip(firsts, more, strict=True))
-
-    def thinned(self, most: int) -> SampledBins:
-        """At most about so many of the bins, even over strata, which stand for all of them."""
-        places, weight = even_places(self.stratum, self.weight, most)
-        names = ("features", "is_slip", "group", "scene", "recording")
-        return replace(self, weight=weight, **{name: getattr(self, name)[places] for name in names})
-
-    def by_recording(self) -> list[RecordingBins]:
-        """The same bins, those of each recording together, to be fitted to again."""
-        found = []
-        for index, name in enumerate(self.recording_names):
-            rows = (self.recording == index).nonzero()[:, 0]
-            if len(rows):
-                group = self.group_names[int(self.group[rows[0]])]
-                scene = self.scene_names[int(self.scene[rows[0]])]
-                features, is_slip = self.features[rows], self.is_slip[rows]
-                bins = RecordingBins(name, group, features, is_slip, scene, self.longest_run)
-                found.append(replace(bins, weight=self.weight[rows]))
-        return found
 
 
 def even_places(stratum: Tensor, weights: Tensor, most: int) -> tuple[Tensor, Tensor]:
