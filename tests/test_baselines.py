@@ -14,7 +14,7 @@ from test_learner import learn, unseen_c
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.training.baselines import Baselines, _PooledNumber, best_threshold
+from tactslip_torch.training.baselines import Baselines, _best_threshold, _PooledNumber
 from tactslip_torch.training.bins import BinSample, RecordingBins
 from tactslip_torch.training.evaluation import Outcomes, compared
 
@@ -90,7 +90,7 @@ def test_no_cut_is_better(num_levels, share, rng):
         is_slip[:2] = True, False
         weights = torch.ones(17, dtype=torch.float64)
         given = torch.from_numpy(features), torch.from_numpy(is_slip), weights
-        index, threshold, sign = best_threshold(*given)
+        index, threshold, sign = _best_threshold(*given)
         found = balanced_accuracy_score(is_slip, sign * features[:, index] > sign * threshold)
         assert found == pytest.approx(best_of_all(features, is_slip), abs=1e-12)
 

@@ -13,9 +13,9 @@ from tactslip_torch.model import fit
 from tactslip_torch.model.fit import (
     HeldOut,
     TrainingBins,
+    _solve_symmetric,
     fit_machine,
     held_out_scores,
-    solve_symmetric,
 )
 from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial
 
@@ -43,7 +43,7 @@ def test_what_is_null_is_left_out_as_by_the_pseudo_inverse(num, weighted, penalt
     matrix, right = singular(rng, num, num // 3), rng.choice([-1.0, 1.0], num)
     weights = 10.0 ** rng.uniform(-2, 2, num) if weighted else np.ones(num)
     root = np.sqrt(weights)
-    x, report, factor = solve_symmetric(*tensors(matrix, right), penalty, *tensors(weights))
+    x, report, factor = _solve_symmetric(*tensors(matrix, right), penalty, *tensors(weights))
     assert (report.method, report.rank, factor) == ("pinv", num // 3, None)
     across = torch.from_numpy(root[:, None] * matrix * root)
     pseudo = torch.linalg.pinv(across, rtol=1e-12, hermitian=True).numpy()
@@ -58,7 +58,7 @@ def test_the_stated_error_grows_with_the_root_of_the_size(copies):
     """Of one block many times over the condition is that of the block."""
     block = np.array([[1.0, 1 - 1e-6], [1 - 1e-6, 1.0]])
     matrix = np.kron(np.eye(copies), block)
-    _, report, _ = solve_symmetric(*tensors(matrix, np.ones(2 * copies)), 1e12)
+    _, report, _ = _solve_symmetric(*tensors(matrix, np.ones(2 * copies)), 1e12)
     assert report.condition == pytest.approx(2e6, rel=1e-3)
     assert report.error == pytest.approx(np.sqrt(2 * copies) * 2.0**-52 * 2e6, rel=1e-3)
 
@@ -139,10 +139,10 @@ def test_a_number_that_is_none_is_named(penalty, rng):
         spoilt = matrix.copy()
         spoilt[27, 3] = spoilt[3, 27] = bad
         with pytest.raises(ValueError, match=rf"^gram must be finite, got {bad} at \[3, 27\]; le"):
-            solve_symmetric(*tensors(spoilt, right), penalty, name="gram")
+            _solve_symmetric(*tensors(spoilt, right), penalty, name="gram")
     right[7] = np.nan
     with pytest.raises(ValueError, match=r"^right-hand side of gram must be .* nan at \[7\]"):
-        solve_symmetric(*tensors(matrix, right), penalty, name="gram")
+        _solve_symmetric(*tensors(matrix, right), penalty, name="gram")
 
 
 BASIS = np.linalg.qr(np.random.default_rng(0).standard_normal((40, 40)))[0]
@@ -169,15 +169,15 @@ UNSOLVABLE = [
 def test_what_cannot_be_solved_is_refused_in_one_line(matrix, penalty, options, message):
     right = np.ones(len(matrix)) - 2.0 * (np.arange(len(matrix)) % 2)
     with pytest.raises(ValueError, match=message) as caught:
-        solve_symmetric(*tensors(matrix, right), penalty, name="gram", **options)
+        _solve_symmetric(*tensors(matrix, right), penalty, name="gram", **options)
     assert "\n" not in str(caught.value)
 
 
 def test_a_condition_is_refused_beyond_its_limit_alone_and_float32_always():
     right = torch.ones(40).double()
-    solve_symmetric(*tensors(KNOWN), right, 1e9, most_condition=1e8)
+    _solve_symmetric(*tensors(KNOWN), right, 1e9, most_condition=1e8)
     with pytest.raises(ValueError, match=r"expected gram in float64, got torch.float32"):
-        solve_symmetric(torch.eye(40), right, 1.0, name="gram")
+        _solve_symmetric(torch.eye(40), right, 1.0, name="gram")
 
 
 LINE = Polynomial(1, 0.7)

@@ -62,7 +62,7 @@ class _Solution(NamedTuple):
     factor: Tensor | None
 
 
-def solve_symmetric(
+def _solve_symmetric(
     matrix: Tensor,
     right: Tensor,
     penalty: float,
@@ -98,7 +98,7 @@ def solve_symmetric(
 
     Example:
         >>> twice = torch.ones(2, 2, dtype=torch.float64)  # one bin, twice
-        >>> x, report, _ = solve_symmetric(twice, twice[0], penalty=1e30)
+        >>> x, report, _ = _solve_symmetric(twice, twice[0], penalty=1e30)
         >>> x, report.method, report.rank
         (tensor([0.5000, 0.5000], dtype=torch.float64), 'pinv', 1)
     """
@@ -240,12 +240,12 @@ def solve_normal_equations(
         penalty: the paper's ``C``.
         kernel: of the machine.
         num_features: ``K``.
-        most_condition: as ``solve_symmetric``, like the errors and the factor.
+        most_condition: as ``_solve_symmetric``, like the errors and the factor.
 
     Shape:
         - normal: ``[P, P]``; moment: ``[P]``
     """
-    x, report, factor = solve_symmetric(
+    x, report, factor = _solve_symmetric(
         normal, moment, penalty, name="X'WX", in_span=True, most_condition=most_condition
     )
     head = kernel.head(x, num_features)
@@ -318,7 +318,7 @@ def fit_machine(
         route: ``"auto"`` for the cheaper, or the one to take.
 
     Raises:
-        ValueError: if there is no bin, a number is not finite, or as ``solve_symmetric``.
+        ValueError: if there is no bin, a number is not finite, or as ``_solve_symmetric``.
     """
     if len(bins.features) == 0:
         raise ValueError("a machine needs training bins, got none; add bins of both classes")
@@ -329,7 +329,7 @@ def fit_machine(
         moment = kernel.sum_of_monomials(z, bins.sample_weight * bins.targets)
         return solve_normal_equations(normal, moment, penalty, kernel, num_features)[0]
     gram = _gram_matrix(kernel, z)
-    beta, report, _ = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
+    beta, report, _ = _solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
     head = collapse(z, beta, kernel)
     head.solved = report
     return head
@@ -437,7 +437,7 @@ class HeldOut:
         return _HeldOutFit(head, scores)
 
     def _dual(self, penalty: float) -> tuple[QuadraticForm, Tensor]:
-        beta, report, factor = solve_symmetric(
+        beta, report, factor = _solve_symmetric(
             self._system, self._targets, penalty, self._weights, name="gram",
             most_condition=MOST_CONDITION,
         )  # fmt: skip
@@ -596,7 +596,7 @@ def held_out_scores(
     Polynomial(2, offset.item())  # checks it
     z, targets, sample_weight = bins.features[order], bins.targets[order], bins.sample_weight[order]
     gram = (z @ z.mT + offset).square()
-    solve_symmetric(
+    _solve_symmetric(
         gram, targets, c.item(), sample_weight, name="gram", most_condition=MOST_CONDITION
     )
     inverse = torch.linalg.inv(gram + (1 / (c * sample_weight)).diag())

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 
-class Solution(NamedTuple):
+class _Solution(NamedTuple):
     """Weights of columns (primal) or of bins (dual), and the intercept.
 
     Shape:
@@ -100,7 +100,7 @@ class ClassSums:
         """Whether every class has a bin."""
         return bool((self.weight > 1e-9 * self.weight.sum()).all())
 
-    def solve(self, ridges: Sequence[float], targets: Tensor) -> Iterator[Solution]:
+    def solve(self, ridges: Sequence[float], targets: Tensor) -> Iterator[_Solution]:
         """The machine for each ridge, by the primal.
 
         Shape:
@@ -121,7 +121,7 @@ class ClassSums:
         for ridge in ridges:
             factor = torch.linalg.cholesky(system + ridge * eye)
             linear = torch.cholesky_solve(right, factor)
-            yield Solution(linear, level - middle @ linear)
+            yield _Solution(linear, level - middle @ linear)
 
 
 def balanced_weights(labels: Tensor, weights: Tensor, num_classes: int) -> Tensor:
@@ -139,7 +139,7 @@ def balanced_weights(labels: Tensor, weights: Tensor, num_classes: int) -> Tenso
 
 def solve_dual(
     gram: Tensor, labels: Tensor, weights: Tensor, ridges: Sequence[float], targets: Tensor
-) -> Iterator[Solution]:
+) -> Iterator[_Solution]:
     """The machine for each ridge, by the dual: the score is ``kernel @ weights + intercept``.
 
     Args:
@@ -164,4 +164,4 @@ def solve_dual(
         found = torch.cholesky_solve(right, factor)
         sums = root @ found
         intercept = sums[:-1] / sums[-1]
-        yield Solution((found[:, :-1] - found[:, -1:] * intercept) * root[:, None], intercept)
+        yield _Solution((found[:, :-1] - found[:, -1:] * intercept) * root[:, None], intercept)

@@ -116,7 +116,7 @@ class _PooledNumber:
         features = sample.features[:: -(-len(sample.features) // CONSTANT_BINS)][:, places]
         layer = ChannelPooling.fit(pool.hand, names, features, ["mean", "std"])
         columns = layer(sample.features[:, pool.places(layer.inputs)].double())
-        index, self._threshold, self._sign = best_threshold(columns, sample.is_slip, sample.weight)
+        index, self._threshold, self._sign = _best_threshold(columns, sample.is_slip, sample.weight)
         self._layer = layer.select([index])
         self._inputs = pool.places(self._layer.inputs)
         self.name = self._layer.names[0]
@@ -183,7 +183,7 @@ class Baselines:
         return found
 
 
-def best_threshold(features: Tensor, is_slip: Tensor, weights: Tensor) -> tuple[int, float, int]:
+def _best_threshold(features: Tensor, is_slip: Tensor, weights: Tensor) -> tuple[int, float, int]:
     """The single feature, threshold and sign of the best balanced accuracy on training bins.
 
     Slip is where ``sign * feature > sign * threshold``.
