@@ -189,7 +189,7 @@ def script(path, text):
 
 def quick_compiler(folder):
     """The compiler, told last not to optimise: enough where the library is built, not used."""
-    found = build._find_compiler()
+    found = build.find_compiler()
     if found is None or "ziglang" in found:
         pytest.skip("no C++ compiler of the system")
     return str(script(folder / "c++", f'exec {shlex.join(found)} "$@" -O0'))
@@ -221,7 +221,7 @@ def test_without_a_compiler_the_remedy_is_named(monkeypatch, tmp_path):
 def test_a_compiler_that_fails_is_passed_over_or_quoted(monkeypatch, tmp_path):
     broken = script(tmp_path / "broken", "exit 1")
     monkeypatch.setenv("CXX", str(broken))
-    found = build._find_compiler()
+    found = build.find_compiler()
     assert found is None or found[0] != str(broken)
     small = script(tmp_path / "small", 'case "$*" in *line.cpp*) exit 0;; esac\n'
                    'echo "engine.cpp:1: error: out of ideas" >&2; exit 1')  # fmt: skip

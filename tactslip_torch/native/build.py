@@ -54,7 +54,7 @@ def library_name() -> str:
     return f"library.{digest.hexdigest()[:16]}{'.dll' if os.name == 'nt' else '.so'}"
 
 
-def _find_compiler() -> list[str] | None:
+def find_compiler() -> list[str] | None:
     """The first that compiles a line: ``$CXX``, the system's, ziglang's; None if none does."""
     chosen = os.environ.get("CXX")
     commands = [shlex.split(chosen)] if chosen else []
@@ -70,7 +70,7 @@ def build_library(folder: Path) -> Path:
     Raises:
         OSError: if there is no compiler, it fails, or the folder cannot be written to.
     """
-    compiler = _find_compiler()
+    compiler = find_compiler()
     if compiler is None:
         raise OSError(f"no C++ compiler that works was found; {REMEDY}")
     folder.mkdir(parents=True, exist_ok=True)
