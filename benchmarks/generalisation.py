@@ -138,10 +138,17 @@ class Generalisation(Benchmark):
         numbers = report["numbers"]
         own = numbers["experiments"]["unseen4"]
         found = []
-        for measure in ("test", "held-out materials", "another session"):
-            values = [of[measure] for of in own.values()]
+
+        def add(measure: str, values: Sequence[float]) -> None:
             by_seed = ", ".join(f"{value:.2f}" for value in values)
             found.append({"": measure, "mean ± sd": mean_sd(values), "by seed": by_seed})
+
+        for measure, role in (("test", "test"), ("held-out materials", "unseen")):
+            add(measure, [of[measure] for of in own.values()])
+            for label in BASELINES:
+                name = f"{measure}, {BASELINES[label]}"
+                add(name, [of["baselines"][label][role] for of in own.values()])
+        add("another session", [of["another session"] for of in own.values()])
         text = [
             "It prints among others (seed 0, `python -m benchmarks.generalisation`, code "
             f"{numbers['code']['unseen4']}):\n",
