@@ -108,7 +108,7 @@ def test_the_hosts_agree_about_every_decision(room, shot):
     }
     said["page"] = ran(shot.splitlines())
     expected = truth(slipping_stream())
-    assert sum(row["alarm"] for row in expected) > 1
+    assert any(row["alarm"] for row in expected)
     for each in said.values():
         assert each.summary == said["page"].summary
         assert_same(each, expected)

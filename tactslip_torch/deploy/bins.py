@@ -257,7 +257,9 @@ def described(windows: Value, detector: SlipDetector) -> tuple[Value, Value, Val
     samples, alive, span = zip(
         *(_samples(windows, detector, frame) for frame in frames), strict=True
     )
-    dtype = torch.float64 if windows.dtype == F64 else torch.float32
+    # strongly compressed columns magnify the rounding of features
+    is_wide = windows.dtype == F64 or detector.scaler.columns is not None
+    dtype = torch.float64 if is_wide else torch.float32
     features: Any = Bank(detector.pool.maps, detector.extractor.plan, frames, dtype)(samples)
     order = [channel for frame in frames for channel in frame.channels]
     places = [order.index(channel) for channel in used]
@@ -422,9 +424,12 @@ def scaled(features: Value, scaler: FeatureScaler) -> Value:
 
 
 def machine(z: Value, head: QuadraticForm, dtype: np.dtype[Any]) -> Value:
-    """The score of scaled columns, in its dtype: ``[B, S] -> [B]``."""
-    z, num = z.cast(dtype), head.quadratic.shape[1]
-    pull: Value = z.graph.constant(head.linear.double(), dtype)
+    """The score of scaled columns, in its dtype: ``[B, S] -> [B]``.
+
+    Computed in float64: columns that are scaled more than once have terms that cancel.
+    """
+    num = head.quadratic.shape[1]
+    pull: Value = z.graph.constant(head.linear.double(), F64)
     is_whole = num == head.num_features and head.signs is None
     if is_whole:
         pull = z @ head.quadratic.double() + pull
@@ -435,7 +440,7 @@ def machine(z: Value, head: QuadraticForm, dtype: np.dtype[Any]) -> Value:
             score = score + (first @ head.quadratic.double() * first).sum(1)
         else:
             products: Value = first @ head.quadratic.double().mT
-            signs = z.graph.constant(head.signs.double(), dtype)
+            signs = z.graph.constant(head.signs.double(), F64)
             score = score + (products * products * signs).sum(1)
     largest = float(np.finfo(dtype).max)
     return score.clamp(-largest, largest).cast(dtype)

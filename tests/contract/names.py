@@ -85,7 +85,7 @@ UNSEEN_EXPERIMENT = "unseen4"
 TRAIN, TEST, HELD_OUT = "train", "test", "unseen"
 SPLITS = "splits"
 CONFUSION = "confusion"
-FIT_FACTS = ("selected", "penalty", "kernel", "solve", "validation", "num_bins")
+FIT_FACTS = ("selected", "penalty", "validated", "solve", "validation", "num_bins")
 TRAINING_RECORDINGS = "train_recordings"  # in the detector's info
 
 STREAM_OUTPUTS = {
