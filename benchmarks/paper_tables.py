@@ -34,7 +34,12 @@ from benchmarks.subjects import composed
 from benchmarks.tables import Report, Table, number
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.data.splits import Split
-from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
+from tactslip_torch.features.selection import (
+    ClassMoments,
+    forward_selection,
+    rank_features,
+    t_scores,
+)
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
@@ -380,33 +385,11 @@ def _material_order(bins: _Sampled) -> Tensor:
 def forward_order(z: Tensor, is_slip: Tensor, weights: Tensor, num: int) -> Tensor:
     """Features in the order in which greedy least squares takes them, ``[num]``.
 
-    Each step takes the feature that lessens the weighted squared error of a linear machine most,
-    given those that are taken: columns of a Cholesky factor of the normal equations, pivoted by
-    that. A small ridge keeps near duplicates out.
-
     Shape:
         - z: ``[N, F]``, float64; is_slip, weights: ``[N]``
     """
-    columns = torch.nn.functional.pad(z, (0, 1), value=1.0)
-    weights = weights / weights.sum()
-    gram = columns.mT @ (columns * weights[:, None])
-    left = gram.diagonal().clone()
-    left[:-1] += RIDGE
-    error = columns.mT @ (weights * torch.where(is_slip, 1.0, -1.0).double())
-    factor, taken = gram.new_zeros(num + 1, len(gram)), [len(gram) - 1]  # the constant is free
-    for step in range(num + 1):
-        if step:
-            gain = error.square() / left
-            gain[taken] = -1
-            taken.append(int(gain.argmax()))
-        best = taken[step]
-        row = gram[best] - factor[:step, best] @ factor[:step]
-        row[best] = left[best]
-        row = row / left[best].sqrt()
-        factor[step] = row
-        error = error - row * (error[best] / left[best].sqrt())
-        left = (left - row.square()).clamp(min=1e-12)
-    return torch.tensor(taken[1:])
+    targets = torch.where(is_slip, 1.0, -1.0).double()[:, None]
+    return torch.tensor(forward_selection(z, targets, weights / weights.sum(), num, RIDGE))
 
 
 def _component_order(z: Tensor, is_slip: Tensor, dims: int, steps: int) -> Tensor:

@@ -507,21 +507,6 @@ def test_words_stay_in_the_figure_and_apart_for_any_hand(drawn, tmp_path, rng, n
                 assert low.y1 < high.y0 + 1
 
 
-def of_view(view, weight, penalty, is_chosen=False, **scores):
-    """A row of a view; one with no group of both classes has no scores by group."""
-    row = choice(40, penalty, **scores or {"M1": 0.75})
-    row |= {} if scores else {"balanced_accuracy": {}}
-    return row | {"view": view, "weight": weight} | ({"chosen": True} if is_chosen else {})
-
-
-VIEW_CHOICES = [
-    of_view("simple", 0.7, 0.1, True, M1=0.9, M2=0.7),
-    of_view("simple", 0.7, 1.0, M1=0.9, M2=0.72),
-    of_view("channel", 0.0, 0.1),
-    of_view("pooled", 0.3, 1.0, True, M1=0.85, M2=0.65),
-]
-
-
 # Tables ----------------------------------------------------------------------------------------
 
 

@@ -229,8 +229,8 @@ def forward_selection(
     x, t = (root * (each - share @ each) for each in (columns, targets))
     square = x.square().sum(0) + ridge
     whole, cross = square.clone(), x.mT @ t
-    taken, rows = list[int](), list[Tensor]()
-    for _ in range(min(num, columns.shape[1])):
+    taken, rows = list[int](), x.new_empty(min(num, x.shape[1]), x.shape[1])
+    for step in range(len(rows)):
         gain = cross.square().sum(1) / square.clamp(min=1e-300)
         gain = torch.where(square > _LEFT * whole, gain, -1.0)
         gain[taken] = -1.0
@@ -239,12 +239,10 @@ def forward_selection(
             break
         row = x.mT @ x[:, best]
         row[best] += ridge
-        if rows:
-            before = torch.stack(rows)
-            row -= before.mT @ before[:, best]
+        row -= rows[:step].mT @ rows[:step, best]
         row /= square[best].sqrt()
         taken.append(best)
-        rows.append(row)
+        rows[step] = row
         cross -= row[:, None] * (cross[best] / row[best])
         square -= row.square()
     return taken

@@ -73,8 +73,48 @@ POOLING = ("mean", "std", "min", "max")
 """Statistics over channels of the default."""
 
 
+class _Fitted:
+    """What the fits of two classes and of several share."""
+
+    selection: FeatureSelection
+    imputation: Tensor
+    sensing: Sensing
+
+    @property
+    @abstractmethod
+    def first_head(self) -> QuadraticForm:
+        """The machine that a detector gets."""
+
+    def detector(
+        self,
+        pool: FeaturePool,
+        channel_filter: ChannelFilter,
+        metadata: Mapping[str, Any],
+    ) -> SlipDetector:
+        """The detector with this machine; of several classes with the first.
+
+        Args:
+            pool: of the features of the bins, whole or a selection of one.
+            channel_filter: of the bins.
+            metadata: to be kept with it, JSON-able.
+        """
+        whole = FeaturePool(pool.hand, **pool.config(), backend=pool.backend)
+        return SlipDetector(
+            whole,
+            channel_filter,
+            tuple(pool.selected[index] for index in self.selection.selected),
+            self.selection.scaler,
+            self.first_head,
+            metadata,
+            self.imputation,
+            self.selection.pooling,
+            sensing=self.sensing,
+            backend=whole.backend,
+        )
+
+
 @dataclass(frozen=True)
-class Fit:
+class Fit(_Fitted):
     """A machine, and how it was made.
 
     Attributes:
@@ -119,24 +159,14 @@ class Fit:
             "solve": {} if self.head.solved is None else self.head.solved.metadata(),
         }
 
-    def detector(
-        self,
-        pool: FeaturePool,
-        channel_filter: ChannelFilter,
-        metadata: Mapping[str, Any],
-    ) -> SlipDetector:
-        """The detector with this machine.
-
-        Args:
-            pool: of the features of the bins, whole or a selection of one.
-            channel_filter: of the bins.
-            metadata: to be kept with it, JSON-able.
-        """
-        return _detector(self, self.head, pool, channel_filter, metadata)
+    @property
+    def first_head(self) -> QuadraticForm:
+        """The machine."""
+        return self.head
 
 
 @dataclass(frozen=True)
-class ClassFit:
+class ClassFit(_Fitted):
     """Machines of several classes, one for each, on the same columns.
 
     Attributes:
@@ -153,38 +183,10 @@ class ClassFit:
     sensing: Sensing
     choice: Choice
 
-    def detector(
-        self,
-        pool: FeaturePool,
-        channel_filter: ChannelFilter,
-        metadata: Mapping[str, Any],
-    ) -> SlipDetector:
-        """A detector with the first of the heads; arguments as in ``Fit.detector``."""
-        return _detector(self, self.heads[0], pool, channel_filter, metadata)
-
-
-def _detector(
-    fit: Fit | ClassFit,
-    head: QuadraticForm,
-    pool: FeaturePool,
-    channel_filter: ChannelFilter,
-    metadata: Mapping[str, Any],
-) -> SlipDetector:
-    """The detector with a head of a fit."""
-    whole = FeaturePool(pool.hand, **pool.config(), backend=pool.backend)
-    selection = fit.selection
-    return SlipDetector(
-        whole,
-        channel_filter,
-        tuple(pool.selected[index] for index in selection.selected),
-        selection.scaler,
-        head,
-        metadata,
-        fit.imputation,
-        selection.pooling,
-        sensing=fit.sensing,
-        backend=whole.backend,
-    )
+    @property
+    def first_head(self) -> QuadraticForm:
+        """That of the first class."""
+        return self.heads[0]
 
 
 @dataclass(frozen=True)
@@ -472,7 +474,9 @@ class General(_Recipe):
         Views, penalties and weights are those of the best mean recall of the class of the highest
         score; features and factorisations are shared by all machines.
         """
-        choice = self.choose(bins, pool)
+        settings = self.settings()
+        views = base_views(bins, pool, self.allowed_by_view(pool), settings)
+        choice = choose_views(bins, views, settings)
         selection, heads = merged(choice, choice.parts(bins))
         assert selection.fill is not None  # of views
         fraction = self._alive_fraction(selection)
@@ -482,12 +486,6 @@ class General(_Recipe):
     def _alive_fraction(self, selection: FeatureSelection) -> float:
         """Part of the channels that must be alive for a valid decision."""
         return 1 - self.drop_channels if selection.pooling and self.drop_channels else 0.5
-
-    def choose(self, bins: ViewBins, pool: FeaturePool, show: bool = False) -> Choice:
-        """Views, penalties and weights by bins in memory, of two classes or more."""
-        settings = self.settings()
-        views = base_views(bins, pool, self.allowed_by_view(pool), settings)
-        return choose_views(bins, views, settings, show=show)
 
     def second_copies(self, name: str, num_bins: int, pool: FeaturePool) -> Tensor | None:
         """Channels that second copies of bins are without, ``[N, C]``, bool; ``None``: no copies.

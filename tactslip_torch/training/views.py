@@ -305,8 +305,10 @@ def _validated(
     num = settings.num_features
     if num is not None and num >= view.selection.size:
         num = None
-    z = view.selection.in_parts(bins.features)
-    rows = _Rows.of(view, bins, z)
+    rows = _Rows.of(view, bins, view.selection.in_parts(bins.features))
+    if sums is None and view.degree == 1 and view.selection.size <= MOST_SUMMED:
+        groups = range(len(bins.group_names))
+        sums = [rows.sums(rows.groups == group, bins.num_classes) for group in groups]
     held_out = _left_out(rows, bins, settings.penalties, num, sums)
     whole = None if sums is None else ClassSums.added(sums)
     if num is None:
@@ -417,9 +419,7 @@ def _left_out(
     groups = rows.groups.unique().tolist()
     is_dual = DEGREE[rows.name] == 2 or rows.u.shape[1] > MOST_SUMMED
     whole, gram = None, None
-    if not is_dual:
-        if sums is None:
-            sums = [rows.sums(rows.groups == g, len(targets)) for g in range(len(bins.group_names))]
+    if not is_dual and sums is not None:
         whole = ClassSums.added(sums)
     elif num_features is None:
         gram = rows.kernel(rows.u, rows.u)
