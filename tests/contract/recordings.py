@@ -25,12 +25,12 @@ SLIDE_S = (1.2, 2.6)
 
 
 def samples_of(material: str, trial: int, version: int = 0) -> np.ndarray:
-    """Three seconds, volts ``[T, C]``; another version has other samples throughout."""
+    """Three seconds, volts ``[T, C]``; another version has others, and a faint slip."""
     rng = np.random.default_rng([ord(material), trial, version])
     time_s = np.arange(3 * RATE_HZ) / RATE_HZ
     samples = 0.1 * rng.standard_normal((len(time_s), len(NAMES)))
     is_sliding = (time_s >= SLIDE_S[0]) & (time_s < SLIDE_S[1])
-    samples[is_sliding] *= rng.uniform(1.15, 1.6) + 0.5 * version
+    samples[is_sliding] *= rng.uniform(1.15, 1.6) - 0.6 * version
     samples[is_sliding, :2] *= 2  # so that channels of both kinds are worth selecting
     samples[:, :2] += 1 + 0.1 * rng.standard_normal(2)
     return samples.astype(np.float32)
