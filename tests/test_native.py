@@ -56,7 +56,8 @@ def test_instruction_sets_agree_on_the_papers_hand(level, monkeypatch):
     assert native.instruction_set() == min(level, best)
     fresh = made(pool)
     for num in (1, 20):
-        torch.testing.assert_close(fresh(bins[:num]), plain[:num], rtol=1e-12, atol=1e-12)
+        # v2 has no product and sum in one rounding, which a cv of a mean about 0 magnifies
+        torch.testing.assert_close(fresh(bins[:num]), plain[:num], rtol=1e-11, atol=1e-11)
 
 
 @needs_engine

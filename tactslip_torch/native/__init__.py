@@ -715,14 +715,13 @@ def _spectra_read(need: Array, num_branches: int) -> list[bool]:
     Shape:
         - need: ``[C, rows]``, descriptors wanted of each row
     """
-    wanted = need[:, num_branches : 2 * num_branches] | need[:, 2 * num_branches, None]
-    read = wanted.any(0)
-    approximations = read[::2].nonzero()[0]
+    wanted: Array = need[:, num_branches : 2 * num_branches] | need[:, 2 * num_branches, None]
+    read: Array = np.any(wanted, 0)
+    levels = read[::2].nonzero()[0]  # of approximations
     read[::2] = False
-    if len(approximations):
-        coarsest = [row.nonzero()[0][-1] for row in wanted[:, ::2] if row.any()]
-        read[2 * np.array(coarsest)] = True
-        read[2 * approximations[0] + 3 : 2 * approximations[-1] + 2 : 2] = True
+    if len(levels):
+        read[[2 * row.nonzero()[0][-1] for row in wanted[:, ::2] if row.any()]] = True
+        read[2 * levels[0] + 3 : 2 * levels[-1] + 2 : 2] = True
     return [bool(each) for each in read]
 
 
