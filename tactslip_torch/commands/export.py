@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.deploy.export import export_detector, summary, wanted_graphs
-from tactslip_torch.deploy.native import export_native
+from tactslip_torch.deploy.native import NativeFile
 from tactslip_torch.model.detector import SlipDetector
 
 
@@ -26,8 +27,8 @@ def export(config: DictConfig, results: Path) -> None:
     if folder.suffix == ".onnx" or folder.is_file():
         raise ValueError(f"output must be a folder, got {folder}; the files have their names")
     if config.graph == "native":
-        given = OmegaConf.to_container(config.native)
-        for path in export_native(detector, folder, config.precision, **given):
+        given: Any = OmegaConf.to_container(config.native)
+        for path in NativeFile.export(detector, folder, config.precision, **given):
             print(f"{path}: {path.stat().st_size / 1000:.0f} kB, {config.precision}")
         return
     graphs = wanted_graphs(config.graph, detector)

@@ -1,9 +1,9 @@
 """A detector as one file for libtactslip, the C library (``native/tactslip.h``).
 
-``detector.tslip`` is little-endian and read in place: a head with version, length and checksum, then
-what the library reads in its order (``native/file.h``), each table at a multiple of its numbers'
-size. It holds all that a stream needs: filter, features, scaling, head, rule and threshold, the
-onset classifier, floors of channels, and scale and offset of a converter.
+``detector.tslip`` is little-endian and read in place: a head with version, length and checksum,
+then what the library reads in its order (``native/file.h``), each table at a multiple of its
+numbers' size. It holds all that a stream needs: filter, features, scaling, head, rule and
+threshold, the onset classifier, floors of channels, and scale and offset of a converter.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import os
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ from tactslip_torch.signals.filtering import past_matrix
 FILE, SOURCE = "detector.tslip", "detector.c"
 FORMAT = 1
 _MAGIC = b"tactslip"
-_HEAD = struct.Struct("<8sIIII")  # magic, version, bytes, checksum of what follows, bytes of a number
+_HEAD = struct.Struct("<8sIIII")  # magic, version, bytes, checksum of the rest, bytes of a number
 _WHOLE = 16  # engine.h
 
 Array = NDArray[Any]
@@ -88,90 +89,111 @@ def _pointed(address: int | None, count: int, dtype: Any) -> Array:
     return np.frombuffer(memory, dtype)
 
 
-def export_native(
-    detector: SlipDetector,
-    folder: str | os.PathLike[str],
-    precision: Precision = "float32",
-    *,
-    scale: float | Sequence[float] = 1.0,
-    offset: float | Sequence[float] = 0.0,
-    source: bool = False,
-) -> tuple[Path, ...]:
-    """Write ``detector.tslip``, checked against torch; with its bytes as C constants on request.
+@dataclass(frozen=True)
+class NativeFile:
+    """A detector as the C library reads it.
 
     Args:
-        detector: with alarm settings.
-        folder: for the files.
-        precision: of all numbers.
-        scale: of a converter (``native_file``).
-        offset: likewise.
-        source: whether ``detector.c`` is written too, for a detector in flash.
-
-    Raises:
-        ValueError: as ``native_file``, or if the file fails its check: nothing is written then.
+        content: of ``detector.tslip``.
     """
-    content = native_file(detector, precision, scale=scale, offset=offset)
-    try:
-        compare(_runner(content), detector, "stream", precision)
-    except ValueError as error:
-        raise ValueError(f"{FILE} was not written: {error}") from error
-    contents = {FILE: content} | ({SOURCE: _c_source(content)} if source else {})
-    for name, each in contents.items():
-        with whole_file(Path(folder) / name) as temporary:
-            temporary.write_bytes(each)
-    return tuple(Path(folder) / name for name in contents)
 
+    content: bytes
 
-def _c_source(content: bytes) -> bytes:
-    """The file as constants, at a multiple of 8 bytes."""
-    words = ",\n".join(f"0x{word:x}ull" for word in np.frombuffer(content, "<u8").tolist())
-    return (
-        "/* Written by tactslip export graph=native. */\n#include <stddef.h>\n#include <stdint.h>\n"
-        f"const uint64_t tactslip_detector[] = {{\n{words}}};\n"
-        "const size_t tactslip_detector_bytes = sizeof tactslip_detector;\n"
-    ).encode()
+    @classmethod
+    def of(
+        cls,
+        detector: SlipDetector,
+        precision: Precision = "float32",
+        *,
+        scale: float | Sequence[float] = 1.0,
+        offset: float | Sequence[float] = 0.0,
+    ) -> NativeFile:
+        """That of a detector with alarm settings.
 
+        Args:
+            detector: as fitted.
+            precision: of all numbers, samples and scores: float32 or float64.
+            scale: of a converter, one number or one a channel: a sample is scale * count + offset.
+            offset: likewise.
 
-def native_file(
-    detector: SlipDetector,
-    precision: Precision = "float32",
-    *,
-    scale: float | Sequence[float] = 1.0,
-    offset: float | Sequence[float] = 0.0,
-) -> bytes:
-    """The content of ``detector.tslip``.
+        Raises:
+            ValueError: if the detector has no alarm settings, or a number is none of these.
+        """
+        dtype, settings = dtype_of(precision), AlarmSettings.of(detector)
+        given = torch.float32 if precision == "float32" else torch.float64
+        out, num_channels = _Writer(dtype), len(detector.pool.hand)
+        _write_stream(out, detector, settings)
+        for name, values in (("scale", scale), ("offset", offset)):
+            numbers = np.asarray(values, np.float64)
+            if numbers.shape not in ((), (num_channels,)) or not np.isfinite(numbers).all():
+                raise ValueError(
+                    f"native.{name} must be finite, one number or one for each of {num_channels} "
+                    f"channels, got {values}"
+                )
+            out.table(np.broadcast_to(numbers, num_channels))
+        _write_filters(out, detector, given)
+        features, machine = detector.engine_tables()
+        _write_plan(out, features)
+        _write_machine(out, machine)
+        if settings.onset is not None:
+            evidence = settings.onset.evidence
+            hold = round(settings.hold_s * evidence.sample_rate_hz)
+            window = evidence.context + evidence.hop_samples
+            _write_onset(out, settings.onset, most_lost(window, hold, evidence.hop_samples))
+        return cls(out.whole())
 
-    Args:
-        detector: with alarm settings.
-        precision: of all numbers, samples and scores: float32 or float64.
-        scale: of a converter, one number or one a channel; a sample is scale * count + offset.
-        offset: likewise.
+    @classmethod
+    def export(
+        cls,
+        detector: SlipDetector,
+        folder: str | os.PathLike[str],
+        precision: Precision = "float32",
+        *,
+        source: bool = False,
+        **counts: float | Sequence[float],
+    ) -> tuple[Path, ...]:
+        """Write ``detector.tslip``, checked against torch; with its bytes as constants on request.
 
-    Raises:
-        ValueError: if the detector has no alarm settings, or a number is none of these.
-    """
-    dtype, settings = dtype_of(precision), AlarmSettings.of(detector)
-    given = torch.float32 if precision == "float32" else torch.float64
-    out, num_channels = _Writer(dtype), len(detector.pool.hand)
-    _write_stream(out, detector, settings)
-    for name, values in (("scale", scale), ("offset", offset)):
-        numbers = np.asarray(values, np.float64)
-        if numbers.shape not in ((), (num_channels,)) or not np.isfinite(numbers).all():
-            raise ValueError(
-                f"counts.{name} must be finite, one number or one for each of {num_channels} "
-                f"channels, got {values}"
-            )
-        out.table(np.broadcast_to(numbers, num_channels))
-    _write_filters(out, detector, given)
-    features, machine = detector.engine_tables()
-    _write_plan(out, features)
-    _write_machine(out, machine)
-    if settings.onset is not None:
-        evidence = settings.onset.evidence
-        hold = round(settings.hold_s * evidence.sample_rate_hz)
-        window = evidence.context + evidence.hop_samples
-        _write_onset(out, settings.onset, most_lost(window, hold, evidence.hop_samples))
-    return out.whole()
+        Args:
+            detector: as of ``of``.
+            folder: for the files.
+            precision: of all numbers.
+            source: whether ``detector.c`` is written too, for a detector in flash.
+            counts: ``scale`` and ``offset``.
+
+        Raises:
+            ValueError: as ``of``, or if the file fails its check: nothing is written then.
+        """
+        made = cls.of(detector, precision, **counts)
+        try:
+            compare(_runner(made), detector, "stream", precision)
+        except ValueError as error:
+            raise ValueError(f"{FILE} was not written: {error}") from error
+        contents = {FILE: made.content} | ({SOURCE: made.as_constants()} if source else {})
+        for name, each in contents.items():
+            with whole_file(Path(folder) / name) as temporary:
+                temporary.write_bytes(each)
+        return tuple(Path(folder) / name for name in contents)
+
+    def as_constants(self) -> bytes:
+        """The file as C source, at a multiple of 8 bytes."""
+        words = np.frombuffer(self.content, "<u8").tolist()
+        lines = ",\n".join(f"0x{word:x}ull" for word in words)
+        return (
+            "/* Written by tactslip export graph=native. */\n"
+            "#include <stddef.h>\n#include <stdint.h>\n"
+            f"const uint64_t tactslip_detector[] = {{\n{lines}}};\n"
+            "const size_t tactslip_detector_bytes = sizeof tactslip_detector;\n"
+        ).encode()
+
+    def stream(self) -> _NativeStream:
+        """A stream that the library decides on, as any C program runs it.
+
+        Raises:
+            ValueError: if this is no such file, or a damaged one, in the library's words.
+            OSError: if the library is not available.
+        """
+        return _NativeStream(self.content)
 
 
 def _write_stream(out: _Writer, detector: SlipDetector, settings: AlarmSettings) -> None:
@@ -340,22 +362,15 @@ class _Decision(ctypes.Structure):
     )  # fmt: skip
 
 
-class NativeStream:
-    """A stream that libtactslip decides on, as any C program runs it.
-
-    Args:
-        content: of a ``.tslip`` file.
+class _NativeStream:
+    """``tactslip.h`` by ctypes.
 
     Attributes:
         channels: names, in the order of samples.
-
-    Raises:
-        ValueError: if it is no such file, or a damaged one, in the library's words.
-        OSError: if the library is not available.
     """
 
     def __init__(self, content: bytes) -> None:
-        self._library, self._info = native.library(), _Info()
+        self._library, self._info = native._library(), _Info()
         self._content = np.frombuffer(content + bytes(-len(content) % 8), np.uint64).copy()
         file = ctypes.c_void_p(self._content.ctypes.data), ctypes.c_size_t(len(content))
         self._check(self._library.tactslip_open(*file, ctypes.byref(self._info)))
@@ -389,7 +404,7 @@ class NativeStream:
         push = getattr(self._library, f"tactslip_push{kinds[samples.dtype.name]}")
         push.restype, samples, at = ctypes.c_size_t, np.ascontiguousarray(samples), 0
         rows, lost = list[list[float]](), list[Array]()
-        made, names = _Decision(), [name for name, _ in _Decision._fields_[:-1]]
+        made, names = _Decision(), [name for name, *_ in _Decision._fields_[:-1]]
         while at < len(samples) or not at:
             address, num = samples[at:].ctypes.data, len(samples) - at
             at += push(self._handle, ctypes.c_void_p(address), ctypes.c_size_t(num)) if num else 1
@@ -398,8 +413,8 @@ class NativeStream:
                 flags = ctypes.string_at(made.channels_lost, self._info.num_channels)
                 lost.append(np.frombuffer(flags, np.bool_))
         table = dict(zip(names, np.array(rows, np.float64).reshape(-1, len(names)).T, strict=True))
-        flags = ("valid", "in_range", "alarm", "on", "by_onset", "hint")
-        table |= {name: table[name].astype(bool) for name in flags}
+        is_flag = ("valid", "in_range", "alarm", "on", "by_onset", "hint")
+        table |= {name: table[name].astype(bool) for name in is_flag}
         table["channels_lost"] = np.array(lost, bool).reshape(-1, self._info.num_channels)
         return table
 
@@ -412,13 +427,13 @@ class NativeStream:
         self._library.tactslip_reset(self._handle)
 
 
-def _runner(content: bytes) -> Run:
+def _runner(made: NativeFile) -> Run:
     """The file as ``compare`` runs a graph: a stream begins where no state is given."""
-    streams: list[NativeStream] = []
+    streams: list[_NativeStream] = []
 
     def run(inputs: Mapping[str, Array]) -> dict[str, Array]:
         if not len(inputs["state"]):
-            streams[:] = [NativeStream(content)]
+            streams[:] = [made.stream()]
             if len(inputs["threshold"]):
                 streams[0].set_threshold(float(inputs["threshold"][0]))
         found = streams[0].push(inputs["samples"])

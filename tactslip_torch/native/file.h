@@ -32,9 +32,9 @@ struct Arena {
   }
 };
 
-// The file from its beginning on. Once something does not fit, all that follows is wrong: numbers
-// are the least there are, and arrays null.
-struct Reader {
+// The file from its beginning on, of numbers E. Once something does not fit, all that follows is
+// wrong: numbers are the least there are, and arrays null.
+template <class E> struct Reader {
   const char* file;
   size_t size, at = sizeof(Head);
   bool is_wrong = false;
@@ -50,32 +50,58 @@ struct Reader {
     return it;
   }
 
+  struct Number {
+    int32_t* to;
+    int32_t least, most;
+  };
+  template <int N> void all(const Number (&numbers)[N]) {
+    for (const Number& each : numbers) *each.to = number(each.least, each.most);
+  }
+
   int32_t number(int32_t least, int32_t most) {
     const int32_t* it = array<int32_t>(1);
     expect(it && *it >= least && *it <= most);
     return is_wrong ? least : *it;
   }
 
-  const int32_t* numbers(int64_t count, int32_t least, int32_t most) {
-    const int32_t* all = array<int32_t>(count);
-    for (int64_t i = 0; all && i < count; ++i) is_wrong |= all[i] < least || all[i] > most;
-    return is_wrong ? nullptr : all;
+  struct Numbers {
+    const int32_t** to;
+    int64_t count;
+    int32_t least, most;
+  };
+  template <int N> void all(const Numbers (&tables)[N]) {
+    for (const Numbers& each : tables) {
+      const int32_t* table = array<int32_t>(each.count);
+      for (int64_t i = 0; table && i < each.count; ++i)
+        is_wrong |= table[i] < each.least || table[i] > each.most;
+      *each.to = is_wrong ? nullptr : table;
+    }
   }
 
-  // Finite ones.
-  template <class E> const E* reals(int64_t count) {
-    const E* all = array<E>(count);
-    for (int64_t i = 0; all && i < count; ++i) is_wrong |= !(all[i] - all[i] == 0);
-    return is_wrong ? nullptr : all;
+  struct Reals {  // finite ones
+    const E** to;
+    int64_t count;
+  };
+  template <int N> void all(const Reals (&tables)[N]) {
+    for (const Reals& each : tables) {
+      const E* table = array<E>(each.count);
+      for (int64_t i = 0; table && i < each.count; ++i) is_wrong |= !(table[i] - table[i] == 0);
+      *each.to = is_wrong ? nullptr : table;
+    }
   }
 
-  // In 8 bytes whatever the precision, at any place; least > -infinity refuses NaN too.
-  double real(double least, double most) {
-    const char* bytes = array<char>(sizeof(double));
-    double value = least;
-    if (bytes) memcpy(&value, bytes, sizeof(double));
-    expect(value >= least && value <= most);
-    return value;
+  // In 8 bytes whatever the precision, at any place; may be infinite.
+  struct Real {
+    double* to;
+    double least = (double)-INFINITY;
+  };
+  template <int N> void all(const Real (&reals)[N]) {
+    for (const Real& each : reals) {
+      const char* bytes = array<char>(sizeof(double));
+      *each.to = each.least;
+      if (bytes) memcpy(each.to, bytes, sizeof(double));
+      expect(*each.to >= each.least);
+    }
   }
 
   const uint8_t* flags(int64_t count) {
@@ -114,7 +140,7 @@ template <class E> struct Model {
   Onset<E> onset;
 
   // Whether all fits. Structures lie in the arena; nothing is written where it only counts.
-  bool read(Reader& in, Arena& arena) {
+  bool read(Reader<E>& in, Arena& arena) {
     read_stream(in);
     read_filters(in, arena);
     if (!in.is_wrong) read_plan(in, arena);
@@ -125,72 +151,46 @@ template <class E> struct Model {
   }
 
  private:
-  void read_stream(Reader& in) {
-    num_channels = in.number(1, MOST_CHANNELS);
-    bin = in.number(2, MOST_BIN);
-    before = in.number(0, MOST_FRAME);
-    after = in.number(0, MOST_FRAME);
-    frame = in.number(1, MOST_FRAME);
-    hop = in.number(1, MOST);
-    stuck = in.number(1, MOST);
-    hold = in.number(0, MOST);
-    n = in.number(0, MOST_RULE);
-    k = in.number(n ? 1 : 0, n);
-    rearm = in.number(0, MOST);
-    refractory = in.number(0, MOST);
-    has_onset = in.number(0, 1);
-    const double most = 1.7e308, inf = (double)INFINITY;
-    rate_hz = in.real(1e-9, most);
-    slope = in.real(0, most);
-    offset = in.real(-most, most);
-    log_odds = in.real(-most, most);
-    drift = in.real(-most, most);
-    evidence = in.real(0, 1);
-    ceiling = in.real(0, inf);
-    threshold = in.real(-inf, inf);
-    lead_s = in.real(-most, most);
-    onset_threshold = in.real(-inf, inf);
-    onset_hint = in.real(-inf, inf);
-    onset_lead_s = in.real(-most, most);
+  void read_stream(Reader<E>& in) {
+    in.all({{&num_channels, 1, MOST_CHANNELS}, {&bin, 2, MOST_BIN}, {&before, 0, MOST_FRAME},
+            {&after, 0, MOST_FRAME}, {&frame, 1, MOST_FRAME}, {&hop, 1, MOST}, {&stuck, 1, MOST},
+            {&hold, 0, MOST}, {&n, 0, MOST_RULE}, {&k, 0, MOST_RULE}, {&rearm, 0, MOST},
+            {&refractory, 0, MOST}, {&has_onset, 0, 1}});
+    in.expect(k <= n && (k || !n));
+    in.all({{&rate_hz, 1e-9}, {&slope, 0}, {&offset}, {&log_odds}, {&drift}, {&evidence, 0},
+            {&ceiling, 0}, {&threshold}, {&lead_s}, {&onset_threshold}, {&onset_hint},
+            {&onset_lead_s}});
     int32_t num_bytes = in.number(1, MOST), num_ends = 0;
-    names = in.array<char>(num_bytes);
+    names = in.template array<char>(num_bytes);
     for (int32_t i = 0; names && i < num_bytes; ++i) num_ends += !names[i];
     in.expect(names && num_ends == num_channels + 1 && !names[num_bytes - 1]);
-    scale = in.template reals<E>(num_channels);
-    zero = in.template reals<E>(num_channels);
+    in.all({{&scale, num_channels}, {&zero, num_channels}});
   }
 
-  void read_filters(Reader& in, Arena& arena) {
-    int32_t num = in.number(1, num_channels), width = before + bin + after;
+  void read_filters(Reader<E>& in, Arena& arena) {
+    int32_t num = in.number(1, num_channels);
     Frame<E>* own = arena.take<Frame<E>>(num);
     Filter<E>* made = arena.take<Filter<E>>(num_channels);
     longest = 1;
     for (int32_t i = 0; i < num && !in.is_wrong; ++i) {
       Frame<E> each = {};
-      each.length = in.number(1, MOST_FRAME);
-      each.reach = in.number(0, each.length - 1);
-      each.weights = in.template reals<E>(each.length);
-      each.past = in.template reals<E>((int64_t)each.reach * each.length);
-      in.expect(each.reach <= before && each.length <= frame &&
-                each.length - each.reach - 1 <= after && width >= bin + each.length - 1);
+      in.all({{&each.length, 1, MOST_FRAME}, {&each.reach, 0, MOST_FRAME}});
+      in.all({{&each.weights, each.length}, {&each.past, (int64_t)each.reach * each.length}});
+      in.expect(each.reach <= before && each.reach < each.length && each.length <= frame &&
+                each.length - each.reach - 1 <= after);
       longest = each.length > longest ? each.length : longest;
       put(own, i, each);
     }
-    frame_of = in.numbers(num_channels, -1, num - 1);  // -1: a channel that is not read
-    const E* one = in.template reals<E>(1);
+    const E* one;
+    in.all({{&frame_of, num_channels, -1, num - 1}});  // -1: a channel that is not read
+    in.all({{&one, 1}});
     for (int32_t c = 0; made && frame_of && c < num_channels; ++c) {
-      if (frame_of[c] < 0) {
-        put(made, c, Filter<E>{one, 1, 0});
-      } else {
-        const Frame<E>& each = own[frame_of[c]];
-        put(made, c, Filter<E>{each.weights, each.length, before - each.reach});
-      }
+      Frame<E> each = frame_of[c] < 0 ? Frame<E>{1, before, one, nullptr} : own[frame_of[c]];
+      made[c] = {each.weights, each.length, before - each.reach};
     }
     frames = own, filters = made;
-    sensing.inverse_span = in.template reals<E>(num_channels);
-    sensing.floor = in.template reals<E>(num_channels);
-    sensing.low = in.template reals<E>(num_channels);
-    sensing.high = in.template reals<E>(num_channels);
+    in.all({{&sensing.inverse_span, num_channels}, {&sensing.floor, num_channels},
+            {&sensing.low, num_channels}, {&sensing.high, num_channels}});
     sensing.counted = in.flags(num_channels);
     sensing.min_alive = in.number(1, num_channels);
   }
@@ -207,36 +207,34 @@ template <class E> struct Model {
   }
 
   // R rows a block; 0 blocks where `may_lack` it.
-  template <int R> Matrix<E> matrix(Reader& in, int32_t num_rows, int32_t most_columns,
+  template <int R> Matrix<E> matrix(Reader<E>& in, int32_t num_rows, int32_t most_columns,
                                     bool may_lack) {
     Matrix<E> own = {};
     own.num_blocks = in.number(may_lack ? 0 : 1, (num_rows + R - 1) / R);
     own.num_columns = in.number(own.num_blocks ? 1 : 0, most_columns);
     own.width = in.number(own.num_blocks ? 1 : 0, own.num_columns);
-    own.first = in.numbers(own.num_blocks, 0, own.num_columns - own.width);
-    own.values = in.template reals<E>((int64_t)own.num_blocks * own.width * R);
+    in.all({{&own.first, own.num_blocks, 0, own.num_columns - own.width}});
+    in.all({{&own.values, (int64_t)own.num_blocks * own.width * R}});
     if (!own.num_blocks) own.values = nullptr;
     return own;
   }
 
-  void read_plan(Reader& in, Arena& arena) {
+  void read_plan(Reader<E>& in, Arena& arena) {
     Plan<E>& p = plan;
     p.num_channels = num_channels, p.num_samples = bin;
-    p.num_lines = in.number(1, MOST_BIN);
-    int32_t num_levels = in.number(0, MAX_BRANCHES / 2);
+    int32_t num_levels, last = num_channels - 1;
+    in.all({{&p.num_lines, 1, MOST_BIN}, {&num_levels, 0, MAX_BRANCHES / 2},
+            {&p.num_features, 1, MOST}, {&p.num_slow, 0, num_channels},
+            {&p.num_fast, 0, num_channels}});
     p.num_branches = 2 * num_levels;
-    p.num_features = in.number(1, MOST);
-    p.num_slow = in.number(0, num_channels);
-    p.num_fast = in.number(0, num_channels);
-    p.slow = in.numbers(p.num_slow, 0, num_channels - 1);
-    p.fast = in.numbers(p.num_fast, 0, num_channels - 1);
+    in.all({{&p.slow, p.num_slow, 0, last}, {&p.fast, p.num_fast, 0, last}});
     in.expect(p.num_slow + p.num_fast > 0 && (num_levels || !p.num_fast));
     in.expect(!in.is_wrong && is_apart(p.slow, p.num_slow, p.fast, p.num_fast));
     int64_t num_rows = 2 * p.num_branches + 2, num_places = num_rows * num_channels;
-    p.first = in.numbers(num_places + 1, 0, p.num_features);
-    p.descriptor = in.numbers(p.num_features, 0, MAX_BRANCHES - 1);
-    p.column = in.numbers(p.num_features, 0, p.num_features - 1);
-    p.need = in.array<uint32_t>(num_places);
+    in.all({{&p.first, num_places + 1, 0, p.num_features},
+            {&p.descriptor, p.num_features, 0, MAX_BRANCHES - 1},
+            {&p.column, p.num_features, 0, p.num_features - 1}});
+    p.need = in.template array<uint32_t>(num_places);
     for (int64_t at = 0; !in.is_wrong && at < num_places; ++at) {
       bool is_ratios = at % num_rows == num_rows - 2;  // the descriptor is a branch there
       int32_t most = is_ratios ? p.num_branches : NUM_DESCRIPTORS;
@@ -267,100 +265,75 @@ template <class E> struct Model {
         put(lines, b, matrix<8>(in, 2 * p.num_lines, most, true));
       }
     }
-    p.ones = in.template reals<E>(2 * p.num_lines);
-    p.frequency_hz = in.template reals<E>(p.num_lines);
-    p.gain_time = in.template reals<E>(bin);
-    p.gain_lines = in.template reals<E>(p.num_lines);
+    in.all({{&p.ones, 2 * p.num_lines}, {&p.frequency_hz, p.num_lines}, {&p.gain_time, bin},
+            {&p.gain_lines, p.num_lines}});
   }
 
   static int32_t filled(int32_t num) { return (num + WHOLE - 1) / WHOLE * WHOLE; }
 
-  void read_machine(Reader& in, Arena& arena) {
+  void read_machine(Reader<E>& in, Arena& arena) {
     Machine<E>& m = machine;
     m = {};
     m.num_channels = num_channels, m.num_inputs = plan.num_features;
-    m.num_columns = in.number(1, MOST);
-    m.num_scaled = in.number(1, MOST);
-    m.num_singles = in.number(0, m.num_columns);
-    m.num_pools = in.number(0, num_channels);
-    m.single_inputs = in.numbers(m.num_singles, 0, m.num_inputs - 1);
-    m.single_columns = in.numbers(m.num_singles, 0, m.num_columns - 1);
+    in.all({{&m.num_columns, 1, MOST}, {&m.num_scaled, 1, MOST}, {&m.num_singles, 0, MOST},
+            {&m.num_pools, 0, num_channels}});
+    in.all({{&m.single_inputs, m.num_singles, 0, m.num_inputs - 1},
+            {&m.single_columns, m.num_singles, 0, m.num_columns - 1}});
     Pool<E>* pools = arena.take<Pool<E>>(m.num_pools);
     for (int32_t i = 0; i < m.num_pools && !in.is_wrong; ++i) put(pools, i, pool(in));
     m.pools = pools;
-    if (m.num_pools) m.fill = in.template reals<E>(m.num_columns);
+    if (m.num_pools) in.all({{&m.fill, m.num_columns}});
     int64_t num = filled(m.num_scaled);
-    m.sources = in.numbers(num, 0, m.num_columns - 1);
-    m.minimum = in.template reals<E>(num);
-    m.maximum = in.template reals<E>(num);
-    if (in.number(0, 1)) m.compression = in.template reals<E>(num);
-    m.imputation = in.template reals<E>(m.num_scaled);
-    m.channels = in.numbers(m.num_scaled, -1, num_channels - 1);
-    m.linear = in.template reals<E>(num);
-    m.constant = (E)in.real(-1.7e308, 1.7e308);
-    m.num_factors = in.number(0, MOST);
-    m.num_quadratic = in.number(0, filled(m.num_scaled));
+    in.all({{&m.sources, num, 0, m.num_columns - 1}});
+    in.all({{&m.minimum, num}, {&m.maximum, num}});
+    if (in.number(0, 1)) in.all({{&m.compression, num}});
+    in.all({{&m.imputation, m.num_scaled}});
+    in.all({{&m.channels, m.num_scaled, -1, num_channels - 1}});
+    in.all({{&m.linear, num}});
+    in.all({{&m.constant}});
+    in.all({{&m.num_factors, 0, MOST}, {&m.num_quadratic, 0, filled(m.num_scaled)}});
     int32_t num_rows = m.num_factors ? m.num_factors : m.num_quadratic;
     in.expect(m.num_factors ? m.num_quadratic % WHOLE == 0 : m.num_quadratic <= m.num_scaled);
-    if (m.num_factors) m.signs = in.template reals<E>(filled(m.num_factors));
-    if (m.num_quadratic)
-      m.quadratic = in.template reals<E>((int64_t)filled(num_rows) * m.num_quadratic);
+    if (m.num_factors) in.all({{&m.signs, filled(m.num_factors)}});
+    if (m.num_quadratic) in.all({{&m.quadratic, (int64_t)filled(num_rows) * m.num_quadratic}});
   }
 
-  Pool<E> pool(Reader& in) {
+  Pool<E> pool(Reader<E>& in) {
     Pool<E> p = {};
-    p.num_channels = in.number(1, num_channels);
-    p.num_families = in.number(1, MOST);
-    p.num_statistics = in.number(1, 256);
+    in.all({{&p.num_channels, 1, num_channels}, {&p.num_families, 1, MOST},
+            {&p.num_statistics, 1, 256}});
     int64_t num = filled(p.num_families);
-    p.channels = in.numbers(p.num_channels, 0, num_channels - 1);
-    p.inputs = in.numbers(p.num_channels * num, 0, machine.num_inputs - 1);
-    p.statistics = in.numbers(p.num_statistics, 0, POOLED_ORDER);
-    p.columns = in.numbers(p.num_statistics * num, -1, machine.num_columns - 1);
-    p.fractions = in.template reals<E>(p.num_statistics);
-    p.scales = in.template reals<E>(num);
+    in.all({{&p.channels, p.num_channels, 0, num_channels - 1},
+            {&p.inputs, p.num_channels * num, 0, machine.num_inputs - 1},
+            {&p.statistics, p.num_statistics, 0, POOLED_ORDER},
+            {&p.columns, p.num_statistics * num, -1, machine.num_columns - 1}});
+    in.all({{&p.fractions, p.num_statistics}, {&p.scales, num}});
     if (p.num_channels > machine.most_channels) machine.most_channels = p.num_channels;
     return p;
   }
 
-  void read_onset(Reader& in) {
+  void read_onset(Reader<E>& in) {
     Onset<E>& o = onset;
     o = {};
-    o.num_fast = in.number(0, num_channels);
-    o.num_slow = in.number(0, num_channels);
-    o.num_filters = in.number(1, 16);
-    o.num_windows = in.number(2, 16);
-    o.num_pairs = in.number(0, MOST_BIN * 4);
-    o.num_steps = in.number(1, 64);
-    o.num_lags = in.number(0, 16);
-    o.num_columns = in.number(1, MOST);
-    o.num_layers = in.number(0, 8);
-    o.hop = in.number(1, MOST_BIN);
-    o.context = in.number(0, MOST_FRAME);
-    o.delay = in.number(1, MOST_BIN);
-    o.step_length = in.number(1, MOST_FRAME);
-    o.blind = in.number(0, MOST);
-    o.min_alive = in.number(1, num_channels);
-    o.most_lost = in.number(0, MOST);
+    in.all({{&o.num_fast, 0, num_channels}, {&o.num_slow, 0, num_channels}, {&o.num_filters, 1, 16},
+            {&o.num_windows, 2, 16}, {&o.num_pairs, 0, 4096}, {&o.num_steps, 1, 64},
+            {&o.num_lags, 0, 16}, {&o.num_columns, 1, MOST}, {&o.num_layers, 0, 8},
+            {&o.hop, 1, MOST_BIN}, {&o.context, 0, MOST_FRAME}, {&o.delay, 1, MOST_BIN},
+            {&o.step_length, 1, MOST_FRAME}, {&o.blind, 0, MOST}, {&o.min_alive, 1, num_channels},
+            {&o.most_lost, 0, MOST}});
     in.expect(o.num_fast + o.num_slow > 0 && o.num_columns == num_onset_columns());
     if (in.is_wrong) return;
-    int64_t num_fast = o.num_fast, num_filters = o.num_filters, num_columns = o.num_columns;
-    o.fast = in.numbers(num_fast, 0, num_channels - 1);
-    o.slow = in.numbers(o.num_slow, 0, num_channels - 1);
-    o.windows = in.numbers(o.num_windows, 1, o.delay);
-    o.first = in.numbers(o.num_pairs, 0, o.num_fast - 1);
-    o.second = in.numbers(o.num_pairs, 0, o.num_fast - 1);
-    o.lags = in.numbers(o.num_lags, 1, 256);
-    o.widths = in.numbers(o.num_layers ? o.num_layers + 1 : 0, 1, MOST);
+    int64_t num_logs = (int64_t)o.num_filters * o.num_fast, num_columns = o.num_columns;
+    int32_t last = num_channels - 1, last_fast = o.num_fast - 1;
+    in.all({{&o.fast, o.num_fast, 0, last}, {&o.slow, o.num_slow, 0, last},
+            {&o.windows, o.num_windows, 1, o.delay}, {&o.first, o.num_pairs, 0, last_fast},
+            {&o.second, o.num_pairs, 0, last_fast}, {&o.lags, o.num_lags, 1, 256},
+            {&o.widths, o.num_layers ? o.num_layers + 1 : 0, 1, MOST}});
     for (int32_t i = 1; !in.is_wrong && i < o.num_lags; ++i) in.expect(o.lags[i - 1] < o.lags[i]);
-    o.filters = in.template reals<E>((o.context + o.hop) * num_filters * o.hop);
-    o.steps = in.template reals<E>((int64_t)o.step_length * o.num_steps);
-    o.rounding = in.template reals<E>(num_filters * num_fast);
-    o.silence = in.template reals<E>(num_filters * num_fast);
-    o.least_step = in.template reals<E>(o.num_slow);
-    o.rates = in.template reals<E>(NUM_FLOORS);
-    o.slope = in.template reals<E>(num_columns);
-    o.offset = in.template reals<E>(num_columns);
+    in.all({{&o.filters, (int64_t)(o.context + o.hop) * o.num_filters * o.hop},
+            {&o.steps, (int64_t)o.step_length * o.num_steps}, {&o.rounding, num_logs},
+            {&o.silence, num_logs}, {&o.least_step, o.num_slow}, {&o.rates, NUM_FLOORS},
+            {&o.slope, num_columns}, {&o.offset, num_columns}});
     if (o.num_layers) {
       int64_t num_weights = 0, num_biases = 0;
       for (int32_t i = 0; !in.is_wrong && i < o.num_layers; ++i) {
@@ -370,15 +343,14 @@ template <class E> struct Model {
       }
       in.expect(!in.is_wrong && o.widths[o.num_layers] == 1 &&
                 o.widths[0] == num_columns * (1 + o.num_lags));
-      o.weights = in.template reals<E>(num_weights);
-      o.biases = in.template reals<E>(num_biases);
+      in.all({{&o.weights, num_weights}, {&o.biases, num_biases}});
     } else {
       in.expect(!o.num_lags);
-      if (in.number(0, 1)) o.quadratic = in.template reals<E>(num_columns * num_columns);
-      o.linear = in.template reals<E>(num_columns);
-      o.constant = (E)in.real(-1.7e308, 1.7e308);
+      if (in.number(0, 1)) in.all({{&o.quadratic, num_columns * num_columns}});
+      in.all({{&o.linear, num_columns}});
+      in.all({{&o.constant}});
     }
-    o.is_still = in.flags(num_fast);
+    o.is_still = in.flags(o.num_fast);
   }
 
   // As many as onset.cpp writes.

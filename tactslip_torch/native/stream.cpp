@@ -69,39 +69,36 @@ template <class E> struct Stream : tactslip {
   int32_t num_lost;
   double hint;
   tactslip_decision bin;  // the last one
-  void *of_features, *of_onset;
+  void* space;  // of the engine, to work in
 
-  // The file and where all lies in the arena; nothing is written where that only counts.
-  static bool lay_out(Stream* self, Model<E>& model, Reader& in, Arena& arena) {
+  // Reads the file, and gives all parts of the state their place in the arena, whose start may be
+  // null: then they are counted, and not to be used.
+  bool lay_out(Reader<E>& in, Arena& arena) {
     if (!model.read(in, arena)) return false;
     const Model<E>& m = model;
     int64_t reach = m.before + (m.frame > m.bin + m.after ? m.frame : m.bin + m.after);
-    int32_t hop = m.has_onset ? m.onset.hop : 0;
-    if (m.has_onset && m.onset.context > reach) reach = m.onset.context;
-    int64_t capacity = reach + hop + (m.hop < m.bin ? m.hop : m.bin);
-    Plan<E> numbers = m.plan;  // what its size depends on
+    int64_t of_hop = m.has_onset ? m.onset.hop : 0, num_kept = 0, for_onset = 0;
+    is_double = sizeof(E) == 8, level = tactslip_level(), hint = m.onset_hint;
+    if (m.has_onset) {
+      reach = m.onset.context > reach ? m.onset.context : reach;
+      num_kept = (int64_t)OF_LEVEL(level, onset_memory<E>(&m.onset));
+      for_onset = (int64_t)OF_LEVEL(level, onset_space<E>(&m.onset));
+    }
+    capacity = (int32_t)(reach + of_hop + (m.hop < m.bin ? m.hop : m.bin));
+    Plan<E> numbers = m.plan;  // what the space depends on
     numbers.num_channels = 1;
     const Filter<E> longest = {nullptr, m.longest, 0};
     Bins<E> one = {};
     one.num_bins = 1, one.filters = &longest;
-    int level = tactslip_level();
-    E* held = arena.take<E>(m.num_channels * capacity);
-    E* last = arena.take<E>(m.num_channels);
-    E* span = arena.take<E>(m.num_channels);
-    E* memory = arena.take<E>(m.has_onset ? (int64_t)OF_LEVEL(level, onset_memory<E>(&m.onset)) : 0);
-    int32_t* run = arena.take<int32_t>(m.num_channels);
-    auto* of_features = arena.take<uint64_t>(
-        (int64_t)(OF_LEVEL(level, features_space<E>(&numbers, &m.machine, &one)) + 7) / 8);
-    auto* of_onset = arena.take<uint64_t>(
-        m.has_onset ? (int64_t)(OF_LEVEL(level, onset_space<E>(&m.onset)) + 7) / 8 : 0);
-    uint8_t* is_lost = arena.take<uint8_t>(m.num_channels);
-    uint8_t* used = arena.take<uint8_t>(m.num_channels);
-    if (!self) return true;
-    self->is_double = sizeof(E) == 8;
-    self->level = level, self->capacity = (int32_t)capacity;
-    self->held = held, self->last = last, self->run = run, self->span = span;
-    self->memory = memory, self->is_lost = is_lost, self->used = used;
-    self->of_features = of_features, self->of_onset = of_onset;
+    auto for_features = (int64_t)OF_LEVEL(level, features_space<E>(&numbers, &m.machine, &one));
+    space = arena.take<uint64_t>(((for_features > for_onset ? for_features : for_onset) + 7) / 8);
+    held = arena.take<E>((int64_t)m.num_channels * capacity);
+    last = arena.take<E>(m.num_channels);
+    span = arena.take<E>(m.num_channels);
+    memory = arena.take<E>(num_kept);
+    run = arena.take<int32_t>(m.num_channels);
+    is_lost = arena.take<uint8_t>(m.num_channels);
+    used = arena.take<uint8_t>(m.num_channels);
     return true;
   }
 
@@ -146,9 +143,8 @@ template <class E> struct Stream : tactslip {
     if (room < (int64_t)n) n = (size_t)room;
     for (size_t i = 0; i < n; ++i)
       for (int32_t c = 0; c < m.num_channels; ++c) {
-        E x = (E)NAN;
-        if (rows && are_counts) x = m.scale[c] * (E)rows[i * (size_t)m.num_channels + (size_t)c] + m.zero[c];
-        if (rows && !are_counts) x = (E)rows[i * (size_t)m.num_channels + (size_t)c];
+        E x = rows ? (E)rows[i * (size_t)m.num_channels + (size_t)c] : (E)NAN;
+        if (are_counts) x = m.scale[c] * x + m.zero[c];
         run[c] = x == last[c] ? run[c] < MOST ? run[c] + 1 : run[c] : 1;
         last[c] = x;
         held[(int64_t)c * capacity + num_held + (int64_t)i] = run[c] > m.stuck ? (E)NAN : x;
@@ -233,7 +229,7 @@ template <class E> struct Stream : tactslip {
     bins.filters = m.filters, bins.is_odd = &is_odd, bins.score = &score;
     bins.sensing = &m.sensing, bins.is_lost = is_lost, bins.is_valid = &is_valid;
     bins.in_range = &in_range, bins.span = span, bins.score_as_float = sizeof(E) == 4;
-    OF_LEVEL(level, features<E>(&m.plan, &m.machine, &bins, of_features));
+    OF_LEVEL(level, features<E>(&m.plan, &m.machine, &bins, space));
     is_valid = is_valid && !is_odd && score - score == 0;
     E ratio = is_valid ? ratio_of(score) : (E)NAN, statistic = (E)NAN;
     if (is_valid && of_bins.begins_anew()) forget();
@@ -310,7 +306,7 @@ template <class E> struct Stream : tactslip {
     run_of.is_float = sizeof(E) == 4, run_of.channel_stride = capacity, run_of.num_hops = 1;
     run_of.num_lost = num_lost, run_of.memory = memory, run_of.in_use = used;
     run_of.score = &score, run_of.is_lost = &lost;
-    OF_LEVEL(level, onset<E>(&m.onset, &run_of, of_onset));
+    OF_LEVEL(level, onset<E>(&m.onset, &run_of, space));
     num_lost = run_of.num_lost;
     if (lost) return NOTHING_YET;
     double sum = (double)scores[0] + (double)scores[1] + (double)score;
@@ -353,24 +349,30 @@ int check_head(const void* file, size_t bytes, Head& head) {
   return (uintptr_t)file % head.number_bytes ? TACTSLIP_ALIGNMENT : TACTSLIP_OK;
 }
 
-constexpr size_t aligned(size_t bytes) { return (bytes + 7) / 8 * 8; }
+// One of several texts, one behind the other.
+const char* text_of(const char* texts, uint32_t index) {
+  while (index--) texts += strlen(texts) + 1;
+  return texts;
+}
+
+constexpr size_t aligned_up(size_t bytes) { return (bytes + 7) / 8 * 8; }
 
 template <class E> int describe(const char* file, size_t bytes, tactslip_info* info) {
-  Model<E> model;
-  Reader in = {file, bytes};
+  Stream<E> stream;
+  Reader<E> in = {file, bytes};
   Arena arena = {nullptr};
-  if (!Stream<E>::lay_out(nullptr, model, in, arena)) return TACTSLIP_INVALID;
+  if (!stream.lay_out(in, arena)) return TACTSLIP_INVALID;
   if (!info) return TACTSLIP_OK;
-  const char* unit = model.names;
-  for (int32_t c = 0; c < model.num_channels; ++c) unit += strlen(unit) + 1;
-  info->state_bytes = aligned(sizeof(Stream<E>)) + arena.used;
+  const Model<E>& model = stream.model;
+  info->state_bytes = aligned_up(sizeof(Stream<E>)) + arena.used;
   info->num_channels = (uint32_t)model.num_channels;
   info->hop_samples = (uint32_t)(model.has_onset ? model.onset.hop : model.hop);
   int32_t first = model.bin + model.after;
   info->first_samples = (uint32_t)(first > model.frame ? first : model.frame);
   info->bin_samples = (uint32_t)model.bin;
   info->sample_rate_hz = model.rate_hz;
-  info->is_double = sizeof(E) == 8, info->has_onset = model.has_onset, info->unit = unit;
+  info->is_double = sizeof(E) == 8, info->has_onset = model.has_onset;
+  info->unit = text_of(model.names, info->num_channels);
   return TACTSLIP_OK;
 }
 
@@ -383,10 +385,9 @@ int make(const char* file, size_t bytes, char* state, size_t state_bytes, tactsl
   if ((uintptr_t)state % 8) return TACTSLIP_ALIGNMENT;
   auto* stream = (Stream<E>*)state;
   memset(state, 0, info.state_bytes);
-  Reader in = {file, bytes};
-  Arena arena = {state + aligned(sizeof(Stream<E>))};
-  Stream<E>::lay_out(stream, stream->model, in, arena);
-  stream->hint = stream->model.onset_hint;
+  Reader<E> in = {file, bytes};
+  Arena arena = {state + aligned_up(sizeof(Stream<E>))};
+  stream->lay_out(in, arena);
   stream->reset();
   *to = stream;
   return TACTSLIP_OK;
@@ -394,84 +395,70 @@ int make(const char* file, size_t bytes, char* state, size_t state_bytes, tactsl
 
 #ifdef TACTSLIP_FLOAT
 #define OF(self, call) ((Stream<float>*)(self))->call
+#define OF_NUMBERS(head, function, arguments) function<float> arguments
 #else
 #define OF(self, call) \
   ((self)->is_double ? ((Stream<double>*)(self))->call : ((Stream<float>*)(self))->call)
+#define OF_NUMBERS(head, function, arguments) \
+  (head.number_bytes == 8 ? function<double> arguments : function<float> arguments)
 #endif
 
 }  // namespace
 
 extern "C" {
 
-TACTSLIP_API int tactslip_open(const void* file, size_t bytes, tactslip_info* info) {
+int tactslip_open(const void* file, size_t bytes, tactslip_info* info) {
   Head head;
   int code = check_head(file, bytes, head);
   if (code) return code;
   constexpr size_t begin = offsetof(Head, number_bytes);
   if (checksum_of((const char*)file + begin, bytes - begin) != head.checksum)
     return TACTSLIP_DAMAGED;
-#ifndef TACTSLIP_FLOAT
-  if (head.number_bytes == 8) return describe<double>((const char*)file, bytes, info);
-#endif
-  return describe<float>((const char*)file, bytes, info);
+  return OF_NUMBERS(head, describe, ((const char*)file, bytes, info));
 }
 
-TACTSLIP_API int tactslip_init(const void* file, size_t bytes, void* state, size_t state_bytes,
-                               tactslip** detector) {
+int tactslip_init(
+    const void* file, size_t bytes, void* state, size_t state_bytes, tactslip** detector) {
   Head head;
   int code = check_head(file, bytes, head);
   if (code) return code;
-#ifndef TACTSLIP_FLOAT
-  if (head.number_bytes == 8)
-    return make<double>((const char*)file, bytes, (char*)state, state_bytes, detector);
-#endif
-  return make<float>((const char*)file, bytes, (char*)state, state_bytes, detector);
+  return OF_NUMBERS(head, make, ((const char*)file, bytes, (char*)state, state_bytes, detector));
 }
 
-TACTSLIP_API size_t tactslip_push(tactslip* self, const float* samples, size_t n) {
+size_t tactslip_push(tactslip* self, const float* samples, size_t n) {
   return OF(self, push(samples, n, false));
 }
-TACTSLIP_API size_t tactslip_push_double(tactslip* self, const double* samples, size_t n) {
+size_t tactslip_push_double(tactslip* self, const double* samples, size_t n) {
   return OF(self, push(samples, n, false));
 }
-TACTSLIP_API size_t tactslip_push_int16(tactslip* self, const int16_t* counts, size_t n) {
+size_t tactslip_push_int16(tactslip* self, const int16_t* counts, size_t n) {
   return OF(self, push(counts, n, true));
 }
-TACTSLIP_API size_t tactslip_push_int32(tactslip* self, const int32_t* counts, size_t n) {
+size_t tactslip_push_int32(tactslip* self, const int32_t* counts, size_t n) {
   return OF(self, push(counts, n, true));
 }
+int tactslip_next(tactslip* self, tactslip_decision* decision) { return OF(self, next(decision)); }
+void tactslip_set_threshold(tactslip* self, double value) { OF(self, set_threshold(value)); }
+void tactslip_reset(tactslip* self) { OF(self, reset()); }
 
-TACTSLIP_API int tactslip_next(tactslip* self, tactslip_decision* decision) {
-  return OF(self, next(decision));
+const char* tactslip_channel(const tactslip* self, uint32_t index) {
+  if (index >= (uint32_t)OF(self, model.num_channels)) return nullptr;
+  return text_of(OF(self, model.names), index);
 }
 
-TACTSLIP_API void tactslip_set_threshold(tactslip* self, double threshold) {
-  OF(self, set_threshold(threshold));
-}
+const char* tactslip_version() { return "libtactslip, file format 1"; }
 
-TACTSLIP_API void tactslip_reset(tactslip* self) { OF(self, reset()); }
-
-TACTSLIP_API const char* tactslip_channel(const tactslip* self, uint32_t index) {
-  const char* name = OF(self, model.names);
-  uint32_t num = (uint32_t)OF(self, model.num_channels);
-  if (index >= num) return nullptr;
-  for (uint32_t i = 0; i < index; ++i) name += strlen(name) + 1;
-  return name;
-}
-
-TACTSLIP_API const char* tactslip_version() { return "libtactslip, file format 1"; }
-
-TACTSLIP_API const char* tactslip_error(int code) {
-  switch (code) {
-    case TACTSLIP_OK: return "no error";
-    case TACTSLIP_NO_FILE: return "not a .tslip file; write one with tactslip export graph=native";
-    case TACTSLIP_VERSION: return "a file of another format version; export the detector again";
-    case TACTSLIP_DAMAGED: return "the file is damaged: another length or checksum; copy it again";
-    case TACTSLIP_INVALID: return "the file's numbers do not fit each other; export it again";
-    case TACTSLIP_PRECISION: return "a float64 file in a float32 library; export precision=float32";
-    case TACTSLIP_ALIGNMENT: return "file or state must begin at a multiple of 8 bytes";
-    case TACTSLIP_STATE: return "the state has fewer bytes than tactslip_open says";
-  }
-  return "no such code";
+const char* tactslip_error(int code) {
+  static const char* const texts[] = {
+      "no error",
+      "not a .tslip file; write one with tactslip export graph=native",
+      "a file of another format version; export the detector again",
+      "the file is damaged: another length or checksum; copy it again",
+      "the file's numbers do not fit each other; export it again",
+      "a float64 file in a library for float32; export it with precision=float32",
+      "file or state must begin at a multiple of 8 bytes",
+      "the state has fewer bytes than tactslip_open says",
+  };
+  return code >= 0 && code <= TACTSLIP_STATE ? texts[code] : "no such code";
 }
 }

@@ -14,7 +14,7 @@ extern const uint64_t tactslip_detector[];
 extern const size_t tactslip_detector_bytes;
 extern const int16_t recording[];
 extern const size_t recording_samples;
-extern uint32_t data_begin, data_end, data_kept, bss_begin, bss_end, stack_end;
+extern uint32_t data_begin[], data_end[], data_kept[], bss_begin[], bss_end[], stack_end[];
 
 static uint64_t state[STATE_BYTES / 8];
 static volatile uint32_t *const TICKS = (uint32_t *)0xE000E010; /* SysTick: control, reload, value */
@@ -65,7 +65,7 @@ int main(void) {
         say(tactslip_error(code));
         return 1;
     }
-    uint32_t *stack = &stack_end - STACK_WORDS;
+    uint32_t *stack = stack_end - STACK_WORDS;
     for (uint32_t *at = stack; at < (uint32_t *)&code - 64; at++) *at = 0xA5A5A5A5;
     for (size_t at = 0; at < recording_samples;) {
         size_t n = recording_samples - at < PUSH ? recording_samples - at : PUSH;
@@ -87,10 +87,11 @@ int main(void) {
     say_number("{\"decisions\": ", num);
     say_number(", \"instructions\": ", of_bins / num);
     say_number(", \"most_instructions\": ", most);
-    say_number(", \"instructions_of_push\": ", of_pushes * PUSH / recording_samples);
+    say_number(", \"instructions_of_sample\": ", of_pushes / recording_samples);
     say_number(", \"instructions_of_open\": ", of_open);
+    say_number(", \"hop_samples\": ", info.hop_samples);
     say_number(", \"state_bytes\": ", info.state_bytes);
-    say_number(", \"stack_bytes\": ", (uint64_t)(&stack_end - stack) * 4);
+    say_number(", \"stack_bytes\": ", (uint64_t)(stack_end - stack) * 4);
     say("}\n");
     return 0;
 }
@@ -98,11 +99,10 @@ int main(void) {
 void start(void) {
     *(volatile uint32_t *)0xE000ED88 |= 0xF << 20; /* floating point on */
     __asm__ volatile("dsb\nisb");
-    const uint32_t *from = &data_kept;
-    for (uint32_t *to = &data_begin; to < &data_end;) *to++ = *from++;
-    for (uint32_t *to = &bss_begin; to < &bss_end;) *to++ = 0;
-    static const uint32_t reasons[] = {0x20026, 0}; /* the program has ended; it has failed */
-    call_host(0x18, (const void *)(uintptr_t)(main() ? 0x20023 : reasons[0]));
+    const uint32_t *from = data_kept;
+    for (uint32_t *to = data_begin; to < data_end;) *to++ = *from++;
+    for (uint32_t *to = bss_begin; to < bss_end;) *to++ = 0;
+    call_host(0x18, (const void *)(uintptr_t)(main() ? 0x20023 : 0x20026)); /* failed, or ended */
     for (;;) {}
 }
 
@@ -112,4 +112,4 @@ static void fault(void) {
 }
 
 __attribute__((section(".vectors"), used)) static const void *const vectors[16] = {
-    &stack_end, (void *)start, (void *)fault, (void *)fault, (void *)fault, (void *)fault, (void *)fault};
+    stack_end, (void *)start, (void *)fault, (void *)fault, (void *)fault, (void *)fault, (void *)fault};
