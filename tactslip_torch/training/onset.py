@@ -286,7 +286,7 @@ def _columns_of(evidence: OnsetEvidence, samples: Tensor) -> tuple[Array, Array]
         - output: ``[k, K]`` and ``[k]``, bool
     """
     num = evidence.num_columns
-    if reason_unavailable() is None:
+    if not reason_unavailable():
         scaler = FeatureScaler(-torch.ones(num).double(), torch.ones(num).double())
         form = QuadraticForm(torch.zeros(0, 0), torch.zeros(num), torch.tensor(0.0))
         classifier = OnsetClassifier(evidence, scaler, form.double(), math.inf)
