@@ -169,13 +169,14 @@ class Alarms(Benchmark):
             given = ["+exp=onset", f"seed={seed}", *self.overrides, *job.overrides]
             folder, has_detail = job.folder / f"seed-{seed}", seed == self.seeds[0]
             made_by = [*given, f"detail={has_detail}"]
+            of_worlds = [*made_by, *self.worlds, f"sessions={self.sessions}"]
             say(f"the alarm of seed {seed}")
             fit = partial(_fitted, given, folder / "detector.pt", has_detail)
             alarm = resumed(folder / "alarm.json", made_by, fit)
             say(f"{len(self.worlds)} worlds of seed {seed}")
             detector = SlipDetector.load(folder / "detector.pt")
             run = partial(_slips, detector, alarm, self, seed)
-            slips += resumed(folder / "worlds.json", [*made_by, repr(self)], run)
+            slips += resumed(folder / "worlds.json", of_worlds, run)
             budgets.append(alarm["budget"])
             amounts = alarm["streams"]["calibrate"]
             heads.append(alarm["classifier"]["head"])
