@@ -23,10 +23,10 @@ from typing import Any, ClassVar
 import numpy as np
 from hydra.utils import instantiate
 
-from benchmarks.harness import Benchmark, Job, resumed, say
+from benchmarks.harness import Benchmark, Job
 from benchmarks.tables import Table, by, percent
+from benchmarks.trainings import composed, resumed, say
 from tactslip_torch import AlarmSettings, SlipDetector
-from tactslip_torch.commands.configuration import compose_config
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.decisions import Scorer
@@ -43,6 +43,7 @@ from tactslip_torch.training.alarm import (
     score_streams,
 )
 
+SOURCES = ("tactslip_torch/pretrained/paper24-sim.pt",)
 FOUND_S, EARLY_S, HINT_S = 0.25, 0.2, 0.1
 """Of the first release: an alarm until then finds a slip, before it is early; a hint is in time."""
 HINT, BINS = "hint", "bins"
@@ -204,7 +205,7 @@ class Alarms(Benchmark):
 
 def _fitted(given: Sequence[str], path: Path, has_detail: bool) -> dict[str, Any]:
     """What came of setting the alarm of the detector that comes with the package; kept there."""
-    config, detector = compose_config("train", given), SlipDetector.pretrained()
+    config, detector = composed("train", given), SlipDetector.pretrained()
     scorers = _scorers(detector, has_detail)
     others = {name: scorer for name, scorer in scorers.items() if name != OURS}
     set_alarm = instantiate(config.onset, _convert_="all")
