@@ -107,7 +107,7 @@ OVERRIDES = (
     "onset.streams.slips=60",
     "onset.streams.confounders.held=600",
     *(f"onset.streams.confounders.{kind}=60" for kind in CONFOUNDERS if kind != "held"),
-    "onset.hours={held:1.5,slip:0.07,others:0.15}",
+    "onset.hours={held:1.5,slip:0.06,others:0.15}",
     "onset.check_hours={held:2,slip:0.05,others:0.2}",
 )
 """Of ``+exp=onset``: fewer hours than by default set the threshold, so at the point estimate."""
