@@ -101,11 +101,16 @@ def operators(graph):
                 yield from operators(attribute.g)
 
 
+def loaded(model):
+    """As a host loads a file that knows no options: onnxruntime says what it warns of."""
+    return onnxruntime.InferenceSession(model.SerializeToString())
+
+
 def test_a_file_has_operators_of_onnx_alone_and_one_input(capfd):
     model = bin_graph(with_imputation()).model()
     assert [each.domain for each in model.opset_import] == [""]
     assert not SLOW.intersection(operators(model.graph))
-    session = _session_of(model)
+    session = loaded(model)
     assert not session.get_overridable_initializers()
     assert capfd.readouterr().err == ""  # no warning
     assert [each.name for each in session.get_inputs()] == ["samples"]
@@ -346,6 +351,14 @@ def test_any_cut_gives_what_the_detector_gives(
     samples = with_losses(signal(4000, 6), losses)[:, :num_samples]
     options = {"kind": kind, "align": align, "rule": rule, "hop": hop, "onset": onset}
     assert_same_stream(samples, cuts, precision, floors=floors, **options)
+
+
+@pytest.mark.parametrize("onset", [None, ONSET])
+@pytest.mark.parametrize("rule", RULES)
+def test_a_stream_graph_is_loaded_without_a_warning(capfd, rule, onset):
+    detector, settings, _ = watching(rule=rule, onset=onset, floors=True)
+    assert loaded(stream_graph(detector, settings).model()).get_inputs()
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("onset", [None, ONSET])

@@ -389,15 +389,15 @@ def _without_stuck(samples: Value, known: Value, most: int) -> tuple[Value, Valu
         )
         before = graph.concat(last.cast(samples.dtype), samples.slice(0, -1, 0), axis=0)
         is_new = ~samples.eq(before)
-        place = (_count_up(num) + 1).unsqueeze(1)  # [n, 1]
-        counted, places = num.cast(F64), place.cast(F64)
+        places = (_count_up(num).cast(F64) + 1.0).unsqueeze(1)  # [n, 1]
+        counted = num.cast(F64)
         began = graph.where(is_new, places, 0.0).amax(0, keepdim=True)
         run_after = graph.where(began > 0.0, counted + 1.0 - began, run + counted)
 
         def is_stuck() -> list[Value]:
             seen = is_new.cast(I64).cumsum(0)
             none = graph.op("Sub", seen.slice(0, 1, 0), seen.slice(0, 1, 0))
-            ago = graph.op("Max", place - most, graph.axes(0)).squeeze(1)
+            ago = (places - float(most)).maximum(0.0).squeeze(1).cast(I64)
             earlier = graph.op("Gather", graph.concat(none, seen, axis=0), ago, axis=0)
             keeps = seen.eq(earlier) & ((run + places) > float(most))
             return [graph.where(keeps, math.nan, samples)]
