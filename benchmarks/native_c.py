@@ -1,6 +1,6 @@
 """The C library on this machine and on emulated boards: ``python -m benchmarks.native_c``.
 
-The main job's detector and one of 20 columns as ``.tslip`` files, run by C programs that are built
+The detector that comes with the package as a ``.tslip`` file, run by C programs that are built
 here: time and memory of a decision beside onnxruntime and the package, and the stream of the sample
 recording on two boards that QEMU emulates, in instructions. Needs what ``.ci/boards`` installs.
 """
@@ -26,13 +26,14 @@ from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import Array, loaded
 from benchmarks.tables import Table
 from benchmarks.timing import interleaved, on_threads
-from benchmarks.trainings import main_job_detector, trained
+from benchmarks.trainings import trained
 from tactslip_torch import SlipDetector, StreamingDetector, sample_recording
 from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.deploy.native import FILE, SOURCE, NativeFile
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.decisions import KEY, AlarmSettings
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence, Perceptron
+from tactslip_torch.pretrained import NAME
 
 HOST = ROOT / "export" / "native"
 SOURCES = ("export/native/*", "export/native/board/*", "export/c/*.c", "export/c/*.h")
@@ -95,21 +96,21 @@ class NativeC(Benchmark):
     """The C library here, by an emulated processor of another kind, and on emulated boards.
 
     Args:
-        columns: of the small detector.
+        columns: of a second, smaller detector, which is trained; 0: there is none.
         rounds: of the sample recording, for each way in turn.
     """
 
     title = "The C library"
     about = (
-        "the detector of the main job (`+exp=unseen4`, the default recipe) as `detector.tslip` in "
-        "C programs, on 1 thread; boards are emulated by QEMU, which counts instructions and says "
-        "nothing of time"
+        "the detector that comes with the package, made by the default recipe, as `detector.tslip` "
+        "in C programs, on 1 thread; boards are emulated by QEMU, which counts instructions and "
+        "says nothing of time"
     )
     page = "docs/deploy.md"
     charts: ClassVar = {"": (("A decision on this machine", "us a decision"),)}
-    quick = "columns=0 rounds=2"
+    quick = "rounds=2"
     libraries = ("onnxruntime",)
-    columns: int = 20
+    columns: int = 0
     rounds: int = 20
 
     @torch.inference_mode()
@@ -117,17 +118,18 @@ class NativeC(Benchmark):
         """Programs on this machine, aarch64 in QEMU, boards."""
         if missing := missing_tools():
             raise ValueError(f"not installed: {', '.join(missing)}; run .ci/boards")
-        detectors = {"main job": loaded(main_job_detector(job))}
+        detectors = {NAME: SlipDetector.pretrained()}
         if self.columns:
             words = ["+exp=unseen4", "baselines=false", "recipe.views=[pooled]"]
             words += [f"recipe.num_features={self.columns}"]
             small = job.folder.parent / f"{self.columns} columns"
-            trained(words, small, job.folder.parent / "main job" / "cache")
+            trained(words, small, small / "cache")
             detectors[f"{self.columns} columns"] = loaded(small / "detector.pt")
         with TemporaryDirectory(prefix="tactslip-bench-") as folder, on_threads(1):
             tables = {
                 "A decision on this machine": _here(detectors, Path(folder), self.rounds),
-                "The same file on aarch64": _on_aarch64(detectors["main job"], Path(folder)),
+                "The same file on aarch64": _on_aarch64(detectors[NAME], Path(folder)),
+                "Error of float32": _float32(detectors[NAME]),
                 "Emulated boards": _boards(detectors, Path(folder)),
             }
             return {"tables": tables}
@@ -152,7 +154,7 @@ def _here(detectors: Mapping[str, SlipDetector], folder: Path, rounds: int) -> T
             row["MB resident"] = f"{found['resident_kb'] / 1e3:.1f}"
             row["kB of the file"] = f"{(place / FILE).stat().st_size / 1e3:.0f}"
             rows.append(row)
-    detector = detectors["main job"]
+    detector = detectors[NAME]
     for way, us in _others(detector, folder, samples, rounds).items():
         rows.append({"way": way, "us a decision": f"{us:.1f}"})
     return Table(rows, "CPU time of a decision, the median; from start to a score: of the process.")
@@ -194,7 +196,7 @@ def _on_aarch64(detector: SlipDetector, folder: Path) -> Table:
     for precision in ("float64", "float32"):
         samples = np.load(folder / "recording.npy").astype(precision)
         np.save(folder / "given.npy", samples)
-        file = folder / "main job" / precision / FILE
+        file = folder / NAME / precision / FILE
         words = ["qemu-aarch64", folder / "aarch64" / "detect", file, folder / "given.npy"]
         command = [*map(str, words), "--decisions"]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -214,13 +216,36 @@ def _on_aarch64(detector: SlipDetector, folder: Path) -> Table:
     return Table(rows, "The program for aarch64, run by qemu-aarch64 (user mode).")
 
 
+def _float32(detector: SlipDetector) -> Table:
+    """Scores of a float32 file on the sample recording, and with other gains and offsets."""
+    samples = sample_recording().samples.T.numpy()
+    streams = {"as it is": samples}
+    streams |= {f"times {gain:g}": samples * np.float32(gain) for gain in (0.3, 1000.0)}
+    streams |= {f"plus {by:g} V": samples + np.float32(by) for by in (1.0, 10.0, 100.0, 1000.0)}
+    rows = []
+    for name, given in streams.items():
+        found = NativeFile.of(detector, "float32").stream().push(given)
+        wanted = StreamingDetector(detector).push(given)
+        score = wanted.score.double().numpy()
+        off = np.abs(found["score"] - score).max() / score.std()
+        changed = int((found["on"] != wanted.is_on.numpy()).sum())
+        rows.append(
+            {
+                "sample recording": name,
+                "largest difference of a score, sd": f"{off:.1e}",
+                "decisions with another status": f"{changed} of {len(score)}",
+            }
+        )
+    return Table(rows, "Against the package, which computes in float64.")
+
+
 def _boards(detectors: Mapping[str, SlipDetector], folder: Path) -> Table:
     counts, scale = sample_counts()
     rows = []
-    detectors = {**detectors, "main job, with a network": _with_network(detectors["main job"])}
+    detectors = {**detectors, f"{NAME}, with a network": _with_network(detectors[NAME])}
     for name, detector in detectors.items():
-        place = folder / name / "board"
-        place.mkdir(parents=True)
+        place = folder / "board"  # where the library is built once
+        place.mkdir(exist_ok=True)
         NativeFile.export(detector, place, "float32", scale=scale, source=True)
         decided = StreamingDetector(detector).push(counts.astype(np.float32) * np.float32(scale))
         wanted = [(alarm.alarm_s, alarm.onset_s) for alarm in decided.alarms]
