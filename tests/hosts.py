@@ -200,7 +200,8 @@ def truth(
         settings = settings.at_threshold(threshold)
     decisions = StreamingDetector(detector, settings, dtype=torch.float64).push(samples)
     fields = STREAM_OUTPUTS | {"in_range": "in_range", "onset_score": "onset_score"}
-    of_onset = ["onset_score"] if settings.onset else []
+    fields |= {"hint": "is_hint"}
+    of_onset = ["onset_score", "hint"] if settings.onset else []
     kinds = {alarm.alarm_s: alarm.raised_by for alarm in decisions.alarms}
     rows = []
     for i, lost in enumerate(map(decisions.names_lost, range(len(decisions.number)))):
