@@ -1,6 +1,4 @@
 """What is timed and compared, one file a subject; run from a checkout, not installed."""
 
-from pathlib import Path
-
-ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
+from benchmarks.sources import RESULTS as RESULTS
+from benchmarks.sources import ROOT as ROOT

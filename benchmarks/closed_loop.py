@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from benchmarks.gripper import Array
-from benchmarks.harness import Benchmark, Job, resumed, say
+from benchmarks.harness import Benchmark, Job, say
 from benchmarks.lifts import (
     HOP,
     REACH_MM,
@@ -35,11 +35,13 @@ from benchmarks.lifts import (
     run_lift,
 )
 from benchmarks.tables import Report, Table, percent
+from benchmarks.trainings import resumed
 from tactslip_torch import AlarmSettings, SlipDetector
 from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.report import style
 from tactslip_torch.simulation import SEEN_MATERIALS
 
+SOURCES = ("tactslip_torch/pretrained/paper24-sim.pt",)
 _CYCLE = ("gradual", "sudden", "heavy", "gradual", "sudden", "steady") * 2
 _KINDS = (*_CYCLE[:-1], "sudden, 1.4")
 """Of lifts, in turn; the last is shown apart, as few grips can save it."""

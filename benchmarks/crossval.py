@@ -18,9 +18,9 @@ from typing import Any, ClassVar
 import torch
 from hydra.utils import instantiate
 
-from benchmarks.harness import Benchmark, Job, code_digest, resumed
-from benchmarks.subjects import composed
+from benchmarks.harness import Benchmark, Job
 from benchmarks.tables import Report, Table, percent
+from benchmarks.trainings import composed, resumed
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import seen6
 from tactslip_torch.features.pool import FeaturePool
@@ -148,7 +148,7 @@ class Crossval(Benchmark):
             place = job.folder / f"seed-{seed}.json"
             sizes = f"{self.num_unseen} {self.train_bins} {self.scored_bins} {self.recipes}"
             kept = resumed(place, [*overrides, sizes], partial(self.one, overrides))
-            runs.append(kept | {"seed": seed, "code": code_digest()})
+            runs.append(kept | {"seed": seed})
         return {"runs": runs, "simulated": runs[0]["simulated"]}
 
     def one(self, overrides: Sequence[str]) -> dict[str, Any]:
@@ -186,7 +186,7 @@ class Crossval(Benchmark):
             seed = f", seed {run['seed']}" if len(runs) > 1 else ""
             note = (
                 f"Balanced accuracy, %, seed {run['seed']}; machines fitted on "
-                f"{run['train_bins']} bins of each material and class; code {run['code']}."
+                f"{run['train_bins']} bins of each material and class."
             )
             found[f"By choice{seed}"] = Table(split_rows(run), note)
             found[f"By material{seed}"] = Table(material_rows(run), f"Seed {run['seed']}.")

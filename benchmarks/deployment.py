@@ -26,17 +26,19 @@ from benchmarks.subjects import (
     RATE_HZ,
     WINDOW_LENGTHS,
     Array,
+    loaded,
     pushing,
     raw_bins,
-    shipped,
     stream_samples,
 )
 from benchmarks.tables import Table, times
 from benchmarks.timing import in_fresh_process, interleaved, on_threads, timed
+from benchmarks.trainings import main_job_detector
 from tactslip_torch import SlipDetector, StreamingDetector
 from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.signals.filtering import ChannelFilter
 
+SOURCES = ("export/python/*.py", "benchmarks/starts.py")
 DTYPES: dict[Literal["float32", "float64"], torch.dtype] = {
     "float32": torch.float32,
     "float64": torch.float64,
@@ -84,8 +86,8 @@ class Deployment(Benchmark):
 
     title = "Deployed: files in onnxruntime"
     about = (
-        "the detector that comes with the package, exported to ONNX and run by onnxruntime, beside "
-        "the package, on 1 thread"
+        "the detector of the main job (`+exp=unseen4`, the default recipe), exported to ONNX and "
+        "run by onnxruntime, beside the package, on 1 thread"
     )
     charts: ClassVar = {"": (("Bins", "us a bin"), ("A stream", "us a push"))}
     quick = "recordings=1 evaluated=16 rounds=2 bulk=[4] push=100 streamed_s=2.0 starts=1"
@@ -103,12 +105,13 @@ class Deployment(Benchmark):
         """Files, bins, streams and fresh processes."""
         with TemporaryDirectory(prefix="tactslip-bench-") as folder, on_threads(1):
             files = []
-            shipped().save(Path(folder) / "detector.pt")
+            detector = loaded(main_job_detector(job))
+            detector.save(Path(folder) / "detector.pt")
             for precision in DTYPES:
                 say(f"deployment: export, {precision}")
                 place = Path(folder) / precision
                 place.mkdir()
-                export = partial(export_detector, shipped(), place, precision=precision)
+                export = partial(export_detector, detector, place, precision=precision)
                 seconds, _ = timed(export)
                 for name in ("model.onnx", "stream.onnx"):
                     row = {"file": f"{name}, {precision}"}
@@ -129,10 +132,11 @@ class Deployment(Benchmark):
 
 def _bins(folder: Path, sizes: Deployment) -> list[dict[str, Any]]:
     ways: dict[str, Callable[[torch.Tensor], Any]] = {}
+    detector = partial(loaded, folder / "detector.pt")
     for precision, dtype in DTYPES.items():
         ways[f"onnxruntime, {precision}"] = bin_scores(folder / precision / "model.onnx")
-        ways[f"tactslip_torch, {precision}"] = partial(_score, shipped(dtype), dtype)
-    ways[REFERENCE] = partial(_score, shipped(torch.float64, "torch"), torch.float64)
+        ways[f"tactslip_torch, {precision}"] = partial(_score, detector(dtype), dtype)
+    ways[REFERENCE] = partial(_score, detector(torch.float64, "torch"), torch.float64)
     rows: dict[str, dict[str, Any]] = {name: {"way": name} for name in ways}
     for size in (1, *sizes.bulk):
         say(f"deployment: {size} bins at once")
@@ -159,7 +163,7 @@ def _streams(folder: Path, sizes: Deployment) -> list[dict[str, Any]]:
     pushes: dict[str, Callable[[Array], Any]] = {}
     scores = {}
     for precision, dtype in DTYPES.items():
-        file, detector = folder / precision / "stream.onnx", shipped(dtype)
+        file, detector = folder / precision / "stream.onnx", loaded(folder / "detector.pt", dtype)
         ways: dict[str, Callable[[], Any]] = {
             f"onnxruntime, {precision}": partial(host("stream").Stream, file),
             f"tactslip_torch, {precision}": partial(StreamingDetector, detector, dtype=dtype),

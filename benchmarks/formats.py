@@ -26,6 +26,7 @@ from tactslip_torch.data.formats import FORMATS, Archived, pieces
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 
 LOAD, STRETCHES, SAVE, LIBRARY = "loaded whole", "read by stretches", "written", "by its library"
+SOURCES = ("tactslip_torch/data/formats/*.py",)
 WAYS = (LOAD, STRETCHES, SAVE, LIBRARY)
 LIMITED = ("npz", "hdf5", "mcap")
 

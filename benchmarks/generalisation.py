@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from pathlib import Path
 from statistics import fmean
 from typing import Any, ClassVar, NamedTuple
 
@@ -26,9 +25,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks import ROOT
-from benchmarks.harness import Benchmark, Job, code_digest, put_between, resumed, trained
-from benchmarks.subjects import composed, features_of_some
+from benchmarks.harness import Benchmark, Job, put_between
 from benchmarks.tables import Report, Table, lines, mean_sd
+from benchmarks.trainings import composed, features_of_some, resumed, trained
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
@@ -108,7 +107,7 @@ class Generalisation(Benchmark):
                 given = [f"seed={seed}", *self.overrides, *job.overrides]
                 run = partial(_on_hard if name == "hard" else _measured, name, given, job, self)
                 own[str(seed)] = resumed(job.folder / f"measures-{name}-{seed}.json", given, run)
-        found = {"code": dict.fromkeys(by_name, code_digest()), "hard": by_name.pop("hard")}
+        found: dict[str, Any] = {"hard": by_name.pop("hard")}
         found["experiments"] = {name: own for name, own in by_name.items() if own}
         metrics = json.loads((job.folder / "unseen4-seed-0" / "metrics.json").read_text())
         return found | {"main job": splits_table(metrics)}
@@ -118,23 +117,20 @@ class Generalisation(Benchmark):
         found = {}
         for name, own in numbers["experiments"].items():
             chosen = "; ".join(f"seed {seed}: {of['chosen']}" for seed, of in own.items())
-            about = f"Seeds {', '.join(own)}; code {numbers['code'][name]}."
-            found[f"`+exp={name}`"] = Table(_measures(own, name), f"{about} Chosen: {chosen}.")
+            about = f"Seeds {', '.join(own)}. Chosen: {chosen}."
+            found[f"`+exp={name}`"] = Table(_measures(own, name), about)
             found[f"`+exp={name}`, seed by seed"] = Table(_by_seed(own), _validation(own))
             baselines = [of["baselines"] for of in own.values()]
             found[f"`+exp={name}`, baselines"] = Table(_rows(baselines, ("test", "unseen")))
         if hard := numbers["hard"]:
             by_seed = list(hard.values())
-            about = f"Seeds {', '.join(hard)}; code {numbers['code']['hard']}. {_ahead(by_seed)}"
+            about = f"Seeds {', '.join(hard)}. {_ahead(by_seed)}"
             rows = _rows(by_seed, ("nested validation", "test", "unseen"))
             found["`+exp=hard`"] = Table(rows, about)
         return found
 
-    def publish(self, report: Report, folder: Path) -> None:
-        """The page, and README's first result: what the main job prints, and all seeds."""
-        super().publish(report, folder)
-        if report["quick"]:
-            return
+    def publish_more(self, report: Report) -> None:
+        """README's first result: what the main job prints, and all seeds."""
         numbers = report["numbers"]
         own = numbers["experiments"]["unseen4"]
         found = []
@@ -151,7 +147,7 @@ class Generalisation(Benchmark):
         add("another session", [of["another session"] for of in own.values()])
         text = [
             "It prints among others (seed 0, `python -m benchmarks.generalisation`, code "
-            f"{numbers['code']['unseen4']}):\n",
+            f"{report['code']}):\n",
             f"```\n{numbers['main job']}\n```\n",
             f"Balanced accuracy, %, {len(own)} seeds, **simulated**. *Unseen*",
             "are held-out materials, *another session* another mounting of the six seen ones:\n",

@@ -10,19 +10,15 @@ writes the same from the kept JSON. ``sizes.FIELD=value`` changes how much is me
 from __future__ import annotations
 
 import argparse
-import hashlib
 import inspect
-import io
 import json
 import os
 import platform
 import re
 import shlex
 import shutil
-import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from importlib import metadata
 from pathlib import Path
@@ -34,19 +30,17 @@ from omegaconf import OmegaConf
 from threadpoolctl import threadpool_info  # type: ignore[import-untyped]
 
 from benchmarks import RESULTS, ROOT
+from benchmarks.sources import digest
 from benchmarks.tables import Report, Table, chart, is_barred, lines
-from tactslip_torch.__main__ import run
+from benchmarks.trainings import resumed as resumed
+from benchmarks.trainings import say as say
+from benchmarks.trainings import trained as trained
+from benchmarks.trainings import write_text
 from tactslip_torch.commands.stopping import errors_in_one_line, stopping
-from tactslip_torch.features.cache import source_digest
 from tactslip_torch.report import style
 from tactslip_torch.runtime import whole_file
 
 QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"
-
-
-def say(text: str) -> None:
-    """A progress line on standard error."""
-    print(text, file=sys.stderr, flush=True)
 
 
 # ------------------------------------------------------------------------------------ machine
@@ -89,71 +83,12 @@ def ran_on(report: Report) -> str:
     return "; ".join(filter(None, parts))
 
 
-# ------------------------------------------------------------------------------------- trainings
-def trained(overrides: Sequence[str], folder: Path, cache: Path) -> dict[str, Any]:
-    """The metrics of a training, from its folder if this code finished it there, else made now.
-
-    Args:
-        overrides: of ``tactslip train``.
-        folder: of its results.
-        cache: of features.
-
-    Raises:
-        SystemExit: if the training fails, which has printed why.
-    """
-    given = [*overrides, "export=false", f"cache={cache}"]
-    return result_of("train", given, folder, "metrics.json")
-
-
-def code_digest() -> str:
-    """Of everything that decides a result: sources, calibrated parameters, configuration."""
-    digest = hashlib.sha256(source_digest().encode())
-    others = [*(ROOT / "tactslip_torch").rglob("*.json"), *(ROOT / "conf").rglob("*.yaml")]
-    for path in sorted(others):
-        digest.update(path.relative_to(ROOT).as_posix().encode())
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def result_of(command: str, overrides: Sequence[str], folder: Path, name: str) -> dict[str, Any]:
-    """The JSON file ``name`` that ``tactslip COMMAND`` leaves in the folder, made by this code.
-
-    Raises:
-        SystemExit: if the command fails, which has printed why.
-    """
-
-    def made() -> Any:
-        say(" ".join(["tactslip", command, *overrides]))
-        with redirect_stdout(io.StringIO()):
-            run(command, [*overrides, f"hydra.run.dir='{folder}'"])
-        return json.loads((folder / name).read_text(encoding="utf-8"))
-
-    found: dict[str, Any] = resumed(folder / f"{command}.json", [command, *overrides], made)
-    return found
-
-
-def resumed(path: Path, overrides: Sequence[str], make: Callable[[], Any]) -> Any:
-    """What ``make`` gives, or the JSON file has from this code with these overrides; kept there."""
-    made_by = [code_digest(), *overrides]
-    if not path.exists() or (kept := json.loads(path.read_text()))["made_by"] != made_by:
-        kept = {"made_by": made_by, "of": make()}
-        write_text(path, json.dumps(kept) + "\n")
-    return kept["of"]
-
-
 # ------------------------------------------------------------------------------ files and figures
 def keep_numbers(report: Report, path: Path) -> None:
     """Write a report as JSON, whole or not at all, and say where."""
     text = json.dumps(report, indent=1, allow_nan=False) + "\n"
     write_text(path, text.replace(f"{ROOT}/", "./"))  # no paths of this machine
     print(f"\nnumbers in {path}")
-
-
-def write_text(path: Path, content: str) -> None:
-    """Write a file, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as temporary:
-        temporary.write_text(content, encoding="utf-8")
 
 
 def between_markers(text: str, name: str, content: str) -> str:
@@ -295,16 +230,21 @@ class Benchmark(ABC):
         return "\n\n".join(parts)
 
     def publish(self, report: Report, folder: Path) -> None:
-        """Print and write the page section, of a quick run a page of its own; write figures."""
+        """Print and write the section and the figures; a quick run's and ``--out``'s elsewhere."""
         section = self.section(report)
         print(section)
         self.figures(report, folder / f"{self.name}.png")
-        page = folder / f"{self.name}.md" if report["quick"] else ROOT / self.page
-        if report["quick"]:
+        if report["quick"] or folder != RESULTS:
+            page = folder / f"{self.name}.md"
             write_text(page, section + "\n")
         else:
+            page = ROOT / self.page
             put_between(page, self.markers or self.name, section)
+            self.publish_more(report)
         print(f"section in {page}")
+
+    def publish_more(self, report: Report) -> None:  # noqa: B027
+        """Write what else in the pages comes from these numbers: nothing."""
 
     def run(self, arguments: Sequence[str] | None = None) -> int:
         """Entry point; the exit status, 0.
@@ -318,7 +258,7 @@ class Benchmark(ABC):
         text = "very little, to see that it runs; no tracked file is touched"
         parser.add_argument("--quick", action="store_true", help=text)
         parser.add_argument("--render", action="store_true", help="show the kept numbers again")
-        text = "of numbers, figure and, if quick, the page (benchmarks/results, quick: outputs)"
+        text = "of numbers, figure and section; no tracked file is touched"
         parser.add_argument("--out", type=Path, metavar="FOLDER", help=text)
         names = ", ".join(field.name for field in fields(self))
         text = f"passed on to the commands that are run; sizes.NAME=value, of {names}: how much"
@@ -344,7 +284,7 @@ class Benchmark(ABC):
             machine = machine_description()  # before the load of the measurement
             numbers = asked.measure(Job(runs, overrides, given.quick))
         report = {
-            "code": code_digest(),
+            "code": digest(self.name),
             "simulated": self.is_simulated,
             "quick": given.quick,
             "machine": machine,

@@ -19,9 +19,10 @@ import torch
 from benchmarks.deployment import bin_scores
 from benchmarks.harness import Benchmark, Job, say
 from benchmarks.peers import others
-from benchmarks.subjects import WINDOW_LENGTHS, labelled_bins, raw_bins, shipped
+from benchmarks.subjects import WINDOW_LENGTHS, labelled_bins, loaded, raw_bins
 from benchmarks.tables import Table, limits, number
 from benchmarks.timing import interleaved, on_threads
+from benchmarks.trainings import main_job_detector
 from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -45,8 +46,8 @@ class Latency(Benchmark):
 
     title = "Latency"
     about = (
-        "one raw bin of 24 channels with its context to a score, by the detector that comes with "
-        "the package, one bin at a time on 1 thread"
+        "one raw bin of 24 channels with its context to a score, by the detector of the main job "
+        "(`+exp=unseen4`, the default recipe), one bin at a time on 1 thread"
     )
     charts: ClassVar = {"": (("One bin to its score", ("median, us", "99th percentile, us")),)}
     quick = "recordings=1 bins=4 rounds=2 block_s=0.002 num_kernels=168"
@@ -60,9 +61,9 @@ class Latency(Benchmark):
     @torch.inference_mode()
     def measure(self, job: Job) -> dict[str, Any]:
         """Seconds of single calls of every way, and errors of its scores."""
-        samples = raw_bins(self.bins)
+        samples, detector = raw_bins(self.bins), main_job_detector(job)
         with on_threads(1):
-            ways = self._ways()
+            ways = self._ways(detector)
         with on_threads(1):  # of the libraries loaded by now as well
             say(f"latency: {self.rounds} rounds of {len(ways)} ways")
             calls = {name: _in_turn(score, samples) for name, score in ways.items()}
@@ -87,10 +88,10 @@ class Latency(Benchmark):
         tables = {"Limits": limits([goal]), "One bin to its score": Table(rows, note)}
         return {"tables": tables}
 
-    def _ways(self) -> dict[str, Score]:
+    def _ways(self, path: Path) -> dict[str, Score]:
         """From one raw bin ``[1, C, n + 2 * context]``, float32, to its score."""
-        fast, exact = shipped(torch.float32), shipped()
-        slow = shipped(backend="torch")
+        fast, exact = loaded(path, torch.float32), loaded(path)
+        slow = loaded(path, backend="torch")
         with TemporaryDirectory(prefix="tactslip-bench-") as folder:
             say("latency: export to ONNX")
             export_detector(exact, Path(folder), ("bin",), "float32")

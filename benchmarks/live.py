@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import shutil
 import socket
 import struct
 import subprocess
@@ -35,8 +36,10 @@ from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import RATE_HZ, Array
 from benchmarks.tables import Report, Table, limits, lines
 from benchmarks.timing import growth_mb
+from benchmarks.trainings import main_job_detector
 from tactslip_torch import SlipDetector, StreamingDetector, sample_recording
 
+SOURCES = ("tactslip_torch/commands/stream.py", "tactslip_torch/data/formats/*.py")
 HEADER, FRAME_SAMPLES = "AA55", 2
 MARGIN_MS, MOST_GROWTH_MB = 5.0, 5.0
 _FRAME = (
@@ -57,7 +60,8 @@ class Live(Benchmark):
 
     title = "Live"
     about = (
-        "`tactslip stream` in a process of its own, fed the sample recording again and again: 24 "
+        "`tactslip stream` in a process of its own with the detector of the main job "
+        "(`+exp=unseen4`, the default recipe), fed the sample recording again and again: 24 "
         f"channels at 2 kHz, {FRAME_SAMPLES} samples a frame, a line for each decision; from when "
         "a sample was sent to when the line of the first decision on it could be read"
     )
@@ -71,7 +75,7 @@ class Live(Benchmark):
         """Latencies, memory and what was lost, by source."""
         with TemporaryDirectory(prefix="tactslip-live-") as name:
             folder = Path(name)
-            SlipDetector.pretrained("paper24-sim").save(folder / "detector.pt")
+            shutil.copy(main_job_detector(job), folder / "detector.pt")
             rows = [_fed(kind, folder, self) for kind in ("pseudo-terminal", "socket")]
         goals, shown = [], []
         for row in rows:
@@ -161,7 +165,7 @@ def _fed(kind: str, folder: Path, sizes: Live) -> dict[str, Any]:
         run.terminate()
         run.wait(30)
         reading.join(30)
-    stream = StreamingDetector(SlipDetector.pretrained("paper24-sim"), dtype=torch.float64)
+    stream = StreamingDetector(SlipDetector.load(folder / "detector.pt"), dtype=torch.float64)
     decided = [(came_s, row) for came_s, row in came if "score" in row]
     end = np.rint([row["time_s"] * RATE_HZ for _, row in decided]).astype(int)  # behind the last
     in_time = end <= len(sent_s) * FRAME_SAMPLES  # those that are flushed wait for what never came

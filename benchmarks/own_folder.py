@@ -29,6 +29,13 @@ from benchmarks.tables import Table
 from tactslip_torch import HandLayout, Recording
 from tactslip_torch.data.formats import FORMATS
 
+SOURCES = (
+    "tactslip_torch/pretrained/paper24-sim.pt",
+    "tactslip_torch/commands/detect.py",
+    "tactslip_torch/commands/train.py",
+    "tactslip_torch/data/formats/*.py",
+    "conf/**/*.yaml",
+)
 _MODEL = ROOT / "tactslip_torch" / "pretrained" / "paper24-sim.pt"
 _RATE_HZ, _MINUTE = 2000, 120_000
 _LOST = 40  # samples of a gap

@@ -29,9 +29,9 @@ from omegaconf import DictConfig
 from sklearn.neighbors import NeighborhoodComponentsAnalysis
 from torch import Tensor
 
-from benchmarks.harness import Benchmark, Job, resumed
-from benchmarks.subjects import composed
+from benchmarks.harness import Benchmark, Job
 from benchmarks.tables import Report, Table, number
+from benchmarks.trainings import composed, resumed
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.selection import (

@@ -19,9 +19,10 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from benchmarks import ROOT
-from benchmarks.harness import Benchmark, Job, put_between, trained
+from benchmarks.harness import Benchmark, Job, put_between
 from benchmarks.signal_checks import check_signals, filtered
 from benchmarks.tables import Report, Table, mean_sd, percent
+from benchmarks.trainings import trained
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.report import published
@@ -138,12 +139,10 @@ class Reproduction(Benchmark):
         found["What was run"] = Table(ran)
         return {title: table for title, table in found.items() if table.rows}
 
-    def publish(self, report: Report, folder: Path) -> None:
-        """The page, and its summary between markers of its own."""
-        super().publish(report, folder)
-        if not report["quick"]:
-            table = _short_table(report["numbers"]["runs"]).markdown()
-            put_between(ROOT / self.page, "reproduction", table)
+    def publish_more(self, report: Report) -> None:
+        """The page's summary, between markers of its own."""
+        table = _short_table(report["numbers"]["runs"]).markdown()
+        put_between(ROOT / self.page, "reproduction", table)
 
 
 def _signal_checks(seed: int, cycles: int) -> list[dict[str, Any]]:

@@ -21,8 +21,8 @@ import torch
 from hydra.utils import instantiate
 
 from benchmarks.harness import Benchmark, Job
-from benchmarks.subjects import composed
 from benchmarks.tables import Table, by
+from benchmarks.trainings import composed
 from tactslip_torch.data.recording import PAPER_SCENE
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.pool import FeaturePool

@@ -16,9 +16,9 @@ import torch
 from hydra.utils import instantiate
 
 from benchmarks.harness import Benchmark, Job, say
-from benchmarks.subjects import composed
 from benchmarks.tables import Table, percent, times
 from benchmarks.timing import interleaved, on_threads
+from benchmarks.trainings import composed
 from tactslip_torch.data.splits import seen6
 from tactslip_torch.simulation import SEEN_MATERIALS, Dynamics, Scene, simulate, timeline
 from tactslip_torch.simulation.simulate import SimulatedRecordings

@@ -1,8 +1,8 @@
-"""What is measured on: bins, streams, a detector of the main job's size, and trained detectors."""
+"""What is measured on: bins, streams, and a detector with settings for them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import cycle
@@ -11,16 +11,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from hydra.utils import instantiate
 from numpy.typing import NDArray
-from omegaconf import DictConfig
 from torch import Tensor
 
 from tactslip_torch import AlarmSettings, FeaturePool, SlipDetector
-from tactslip_torch.commands.configuration import checked
 from tactslip_torch.data.labels import LabelRule
-from tactslip_torch.data.recording import RecordingId, RecordingSource
-from tactslip_torch.data.splits import Split
+from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
@@ -30,8 +26,7 @@ from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.simulate import SimulatedRecordings
-from tactslip_torch.training.datamodule import FeatureMaker, RecordingFeatures, SlipDataModule
-from tactslip_torch.training.experiment import feature_cache, feature_maker
+from tactslip_torch.training.datamodule import FeatureMaker
 
 Array = NDArray[Any]
 WINDOW_LENGTHS = (51,) * 14 + (11,) * 10
@@ -80,11 +75,14 @@ def pushing(push: Callable[[Array], object], samples: Array, num: int) -> Callab
 
 
 # ------------------------------------------------------------------------------- a detector
-def shipped(
-    dtype: torch.dtype = torch.float64, backend: BackendName = "auto", hop: int = 20
+def loaded(
+    path: str | Path,
+    dtype: torch.dtype = torch.float64,
+    backend: BackendName = "auto",
+    hop: int = 20,
 ) -> SlipDetector:
-    """The detector that comes with the package, in this dtype, with settings for streams."""
-    detector = SlipDetector.pretrained(backend=backend)
+    """The detector of a file, in this dtype, with settings for streams."""
+    detector = SlipDetector.load(path, backend=backend)
     detector.info[KEY] = alarm_settings(hop).to_dict()
     return detector.to(dtype).eval()
 
@@ -110,37 +108,3 @@ def onset_settings(detector: SlipDetector, samples: Array) -> AlarmSettings:
     head = QuadraticForm(*map(torch.from_numpy, numbers))
     onset = OnsetClassifier(plain, FeatureScaler.fit(columns), head, threshold=1e9)
     return replace(settings, onset=onset)
-
-
-# -------------------------------------------------------------------------- trained detectors
-def composed(command: str, overrides: Sequence[str]) -> DictConfig:
-    """The configuration of a command.
-
-    Raises:
-        ValueError: if an override names what does not exist.
-    """
-    config = checked(command, overrides).config
-    del config.hydra
-    return config
-
-
-def features_of_some(
-    config: DictConfig,
-    cache: Path,
-    keep: Callable[[RecordingSource], Sequence[RecordingId]],
-) -> Iterator[RecordingFeatures]:
-    """The features of some recordings of a set, made by processes and kept.
-
-    Args:
-        config: of ``tactslip train``.
-        cache: of features.
-        keep: which recordings.
-    """
-    source = instantiate(config.data, _convert_="all")
-    maker = feature_maker(source, instantiate(config.labels), **config.features)
-    chosen = keep(source)
-    with feature_cache(str(cache)) as maker.cache:
-        fold = Split("benchmark", dict.fromkeys(chosen, "unseen"))
-        data = SlipDataModule(maker, [fold], config.num_workers)
-        data.setup()
-        yield from data.features("unseen")

@@ -2,7 +2,8 @@
 
 ``README.md`` is the first page. Files that pages link to (figures of benchmarks, a host's README)
 are added under their path in the repository, and links follow them. A notebook becomes a page of
-its cells and kept outputs; nothing is executed.
+its cells and kept outputs; nothing is executed. A section whose benchmark has changed since it was
+measured says so.
 """
 
 from __future__ import annotations
@@ -10,12 +11,17 @@ from __future__ import annotations
 import json
 import posixpath
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT))
+
+from benchmarks import sources  # noqa: E402
+
 LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)")
 """The target of a link in Markdown, without its anchor."""
 
@@ -39,7 +45,7 @@ OUTSIDE = ("README.md", "CHANGELOG.md")  # pages of the navigation
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Links as they are in the repository become those of the site."""
+    """Links become those of the site, and sections of earlier code say so."""
     uri = page.file.src_uri
     path = f"docs/{uri}" if page.file.src_dir else uri
     folder = posixpath.dirname(uri)
@@ -49,7 +55,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         is_there = files.get_file_from_path(new) is not None
         return posixpath.relpath(new, folder or ".") if is_there else found[0]
 
-    return LINK.sub(moved, markdown)
+    return LINK.sub(moved, sources.marked(markdown))
 
 
 def _target(path: str, link: str) -> str:
