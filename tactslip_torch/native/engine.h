@@ -12,9 +12,11 @@ enum Descriptor {
 };
 constexpr int MAX_BRANCHES = 32;  // and at least NUM_DESCRIPTORS, whose place band energy ratios take
 
-// Blocks of rows, 4 or 8; of each block `width` columns from `first` on are not zero.
+constexpr int ROWS = 8;  // of a block of a matrix
+
+// Blocks of rows, of each of which `width` columns from `first` on are not zero.
 template <class E> struct Matrix {
-  const E* values;       // [num_blocks, width, rows of a block]; null: nothing reads it
+  const E* values;       // [num_blocks, width, ROWS]; null: nothing reads it
   const int32_t* first;  // [num_blocks]
   int32_t num_blocks, num_columns, width;
 };
