@@ -590,7 +590,7 @@ template <class E> struct Group : Describe<E> {
 
 // Which bins are valid, and which in range (features/sensing.py: is_enough).
 template <class E>
-void judge_channels(const Plan<E>& plan, const Bins<E>& bins, int32_t start, int32_t num_bins) {
+void count_channels(const Plan<E>& plan, const Bins<E>& bins, int32_t start, int32_t num_bins) {
   const Sensing<E>& sensing = *bins.sensing;
   for (int32_t b = start; b < start + num_bins; ++b) {
     int32_t num_alive = 0, num_fit = 0;
@@ -612,7 +612,7 @@ template <class E> struct Run {
   const Bins<E>& bins;
   alignas(VECTOR_BYTES) Group<E> group;
   E* features;
-  void* for_judge;
+  void* for_scores;
 
   Run(const Plan<E>* plan, const Machine<E>* machine, const Bins<E>& bins)
       : machine(machine), bins(bins), group(plan ? *plan : no_plan, bins) {}
@@ -622,8 +622,8 @@ template <class E> struct Run {
     features = (E*)group.place(space);
     if (!machine) return (char*)features;
     int32_t num = bins.num_bins < CHUNK ? bins.num_bins : CHUNK;
-    for_judge = features + (size_t)num * group.plan.num_features;
-    return (char*)for_judge + LEVEL::judge_space(machine, bins.num_bins);
+    for_scores = features + (size_t)num * group.plan.num_features;
+    return (char*)for_scores + LEVEL::scores_space(machine, bins.num_bins);
   }
 
   void go() {
@@ -635,12 +635,12 @@ template <class E> struct Run {
       group.first_bin = machine ? start : 0;
       group.out = machine ? features : bins.features;
       describe(plan, start, num);
-      if (bins.sensing) judge_channels(plan, bins, start, num);
+      if (bins.sensing) count_channels(plan, bins, start, num);
       if (!machine) continue;
       int32_t stride = plan.num_features ? plan.num_features : bins.bin_stride;
       const E* given = (const E*)bins.samples + (ptrdiff_t)start * stride;
       const E* inputs = plan.num_features ? features : given;
-      LEVEL::judge(machine, &bins, inputs, stride, start, num, for_judge);
+      LEVEL::scores(machine, &bins, inputs, stride, start, num, for_scores);
     }
   }
 

@@ -143,9 +143,9 @@ template <class E> struct OnsetHops {
   namespace level {                                                                                \
   template <class E> size_t features_space(const Plan<E>*, const Machine<E>*, const Bins<E>*);     \
   template <class E> void features(const Plan<E>*, const Machine<E>*, const Bins<E>*, void* space); \
-  template <class E> size_t judge_space(const Machine<E>*, int32_t num_bins);                      \
+  template <class E> size_t scores_space(const Machine<E>*, int32_t num_bins);                     \
   template <class E>                                                                               \
-  void judge(const Machine<E>*, const Bins<E>*, const E* inputs, int32_t stride, int32_t start,    \
+  void scores(const Machine<E>*, const Bins<E>*, const E* inputs, int32_t stride, int32_t start,   \
              int32_t num, void* space); /* of features: what features() calls */                   \
   template <class E> size_t onset_memory(const Onset<E>*); /* in numbers */                        \
   template <class E> size_t onset_space(const Onset<E>*);                                          \

@@ -74,7 +74,7 @@ enum Across { BINS, ONE_BIN };
 
 constexpr int32_t filled_up(int32_t num) { return (num + WHOLE - 1) / WHOLE * WHOLE; }
 
-template <class E> struct Judge {
+template <class E> struct Scorer {
   static constexpr int L = Lanes<E>::NUM;
   typedef typename Lanes<E>::V V;
   const Machine<E>& machine;
@@ -84,7 +84,7 @@ template <class E> struct Judge {
   int few;
   const uint8_t* is_lost;  // of these bins
 
-  explicit Judge(const Machine<E>& machine) : machine(machine) {}
+  explicit Scorer(const Machine<E>& machine) : machine(machine) {}
 
   char* place(char* at, int32_t num_bins) {
     int32_t lanes = num_bins > 1 ? L : 1, most = machine.most_channels;
@@ -98,21 +98,21 @@ template <class E> struct Judge {
   }
 
   // Of inputs of bins from `start` on.
-  void judge(const E* inputs, int32_t stride, int32_t start, int32_t num, const Bins<E>& bins) {
+  void run(const E* inputs, int32_t stride, int32_t start, int32_t num, const Bins<E>& bins) {
     for (int32_t b = 0; b < num; b += few) {
       at = start + b;
       few = (int)(num - b < L ? num - b : L);
       if (2 * few <= L) few = 1;  // up to here it is quicker
       is_lost = bins.is_lost ? bins.is_lost + (ptrdiff_t)at * machine.num_channels : nullptr;
       if (few == 1)
-        judge_few<ONE_BIN>(inputs + b * stride, stride, bins);
+        score_few<ONE_BIN>(inputs + b * stride, stride, bins);
       else
-        judge_few<BINS>(inputs + b * stride, stride, bins);
+        score_few<BINS>(inputs + b * stride, stride, bins);
     }
   }
 
   template <Across ACROSS>
-  void judge_few(const E* inputs, int32_t stride, const Bins<E>& bins) {
+  void score_few(const E* inputs, int32_t stride, const Bins<E>& bins) {
     const Machine<E>& m = machine;
     const V* x = ACROSS == BINS ? several : (const V*)inputs;
     for (int32_t i = 0; ACROSS == BINS && i < m.num_inputs; ++i)
@@ -293,21 +293,21 @@ template <class E> struct Judge {
 
 namespace LEVEL {
 
-template <class E> size_t judge_space(const Machine<E>* machine, int32_t num_bins) {
-  return (size_t)Judge<E>(*machine).place(nullptr, num_bins) + VECTOR_BYTES;
+template <class E> size_t scores_space(const Machine<E>* machine, int32_t num_bins) {
+  return (size_t)Scorer<E>(*machine).place(nullptr, num_bins) + VECTOR_BYTES;
 }
 
 template <class E>
-void judge(const Machine<E>* machine, const Bins<E>* bins, const E* inputs, int32_t stride,
+void scores(const Machine<E>* machine, const Bins<E>* bins, const E* inputs, int32_t stride,
            int32_t start, int32_t num, void* space) {
-  Judge<E> judge(*machine);
-  judge.place((char*)space, bins->num_bins);
-  judge.judge(inputs, stride, start, num, *bins);
+  Scorer<E> scorer(*machine);
+  scorer.place((char*)space, bins->num_bins);
+  scorer.run(inputs, stride, start, num, *bins);
 }
 
 #define MAKE(E)                                                                                    \
-  template size_t judge_space(const Machine<E>*, int32_t);                                         \
-  template void judge(const Machine<E>*, const Bins<E>*, const E*, int32_t, int32_t, int32_t, void*);
+  template size_t scores_space(const Machine<E>*, int32_t);                                        \
+  template void scores(const Machine<E>*, const Bins<E>*, const E*, int32_t, int32_t, int32_t, void*);
 MAKE(float)
 MAKE(double)
 
