@@ -38,9 +38,11 @@ def digest(name: str) -> str:
 
 
 def is_current(name: str) -> bool:
-    """Whether the kept numbers of a benchmark are of its present sources."""
+    """Whether the kept numbers of a benchmark, and those it takes, are of the present sources."""
     path = RESULTS / f"{name}.json"
-    return path.exists() and json.loads(path.read_text(encoding="utf-8"))["code"] == digest(name)
+    if not path.exists() or json.loads(path.read_text(encoding="utf-8"))["code"] != digest(name):
+        return False
+    return all(is_current(of.stem) for of in sources(name) if of.parent == RESULTS)
 
 
 def sections(page: str) -> list[tuple[str, str]]:
@@ -77,6 +79,8 @@ def _followed(path: Path) -> list[Path]:
     tree = _tree(path)
     needed = [of for module, name in _imports(tree) if (of := _defined(module, name))]
     needed += [of for of in path.parent.iterdir() if of.suffix in _BESIDE]
+    if path == ROOT / "tactslip_torch" / "commands" / "configuration.py":
+        needed += ROOT.glob("conf/**/*.yaml")
     for node in tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "SOURCES":
             for pattern in ast.literal_eval(node.value):
