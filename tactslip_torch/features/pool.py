@@ -84,8 +84,8 @@ class FeaturePool(nn.Module):
     everywhere with ``backend="torch"``.
 
     float32 bins are computed in float64 and rounded once at the end. If ``arithmetic`` is
-    ``"native"``, their branches and order statistics are still float64, all other statistics
-    float32.
+    ``"native"``, they are computed in float32 throughout by the native engine; by torch, their
+    branches and order statistics are still float64.
 
     Args:
         hand: the channels, in the order in which bins hold them.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -590,33 +591,38 @@ class _Engine:
         of_channel = np.where(of_channel < len(hand), of_channel, -1)
         more["imputation"] = detector.imputation.double().numpy(), of_channel
         if detector.pooling is not None:
-            self._machine = detector.pooling.machine(**more)
+            make = detector.pooling.machine
         else:
             num = len(detector.selected)
-            self._machine = Machine(
+            singles = [(i, i) for i in range(num)]
+            make = partial(
+                Machine,
                 num_channels=len(hand),
                 num_inputs=num,
                 num_columns=num,
-                singles=[(i, i) for i in range(num)],
-                **more,
+                singles=singles,
             )
         channels = range(len(hand))
-        self._filters = Filters(
-            [channel_filter.kernel(c).numpy() for c in channels],
-            [channel_filter.context_before - channel_filter.reaches[c][0] for c in channels],
-        )
+        kernels = [channel_filter.kernel(c).numpy() for c in channels]
+        reaches = [channel_filter.reaches[c][0] for c in channels]
+        starts = [channel_filter.context_before - reach for reach in reaches]
         self._unused = ~detector._is_used.numpy()
 
-        # by dtypes of bins, and of samples they were filtered from
+        # by dtypes of bins, of the engine, and of samples that bins were filtered from
         self._engines = {dtype: detector.extractor.engine(dtype) for dtype in _DTYPES}
+        numbers = {engine.dtype for engine in self._engines.values()}
+        self._machines = {number: make(**more, dtype=number) for number in numbers}
+        self._filters = {number: Filters(kernels, starts, number) for number in numbers}
         self._channels = {
-            (dtype, is_raw): Channels(
+            (number, dtype, is_raw): Channels(
                 detector.pool.inverse_span(dtype, is_raw).numpy(),
                 sensing.floor,
                 sensing.bounds,
                 detector.counted.numpy(),
                 sensing.min_alive,
+                number,
             )
+            for number in numbers
             for dtype in _DTYPES
             for is_raw in (False, True)
         }
@@ -626,9 +632,11 @@ class _Engine:
         flat = x.detach().numpy().reshape(-1, *x.shape[-2:])
         if flat.strides[-1] != flat.itemsize:
             flat = np.ascontiguousarray(flat)
-        engine, filters = self._engines[x.dtype], self._filters if is_raw else None
-        channels = self._channels[given, is_raw]
-        found = engine.score(self._machine, flat, filters, _DTYPES[given], channels)
+        engine = self._engines[x.dtype]
+        number = engine.dtype
+        filters = self._filters[number] if is_raw else None
+        channels = self._channels[number, given, is_raw]
+        found = engine.score(self._machines[number], flat, filters, _DTYPES[given], channels)
         is_valid, score = found.is_valid, found.score
         if score is None:
             made = self._of.head(torch.from_numpy(found.scaled).to(self._of.imputation))

@@ -1,5 +1,8 @@
 """ctypes bindings of the native engine (``engine.cpp`` and its neighbours).
 
+The engine computes in one number type throughout, float64 or float32, which the arrays that it is
+given have as well.
+
 The library lies beside this file if the package was installed, or is built at the first use, into
 this folder or the user's cache. Without it (no compiler, or ``TACTSLIP_NATIVE=0``) what it does is
 done by torch; ``reason_unavailable`` says why. ``TACTSLIP_NATIVE=v3`` uses no instruction set
@@ -25,25 +28,26 @@ import numpy as np
 from tactslip_torch.native.build import REMEDY, SWITCH, build_library, is_off, library_name
 
 Array = np.ndarray[Any, Any]
+Number = type[np.float64] | type[np.float32]
 BackendName = Literal["auto", "native", "torch"]
 _LOG = logging.getLogger(__name__)
 MAX_BRANCHES = 32
-_WHOLE = 8  # numbers to a multiple of which arrays of the machine are filled up
+_WHOLE = 16  # numbers to a multiple of which arrays of the machine are filled up
 
 
 class _Matrix(ctypes.Structure):
     _fields_ = (
         ("values", ctypes.c_void_p),
         ("first", ctypes.c_void_p),
-        ("num_blocks", ctypes.c_int64),
-        ("num_columns", ctypes.c_int64),
-        ("width", ctypes.c_int64),
+        ("num_blocks", ctypes.c_int32),
+        ("num_columns", ctypes.c_int32),
+        ("width", ctypes.c_int32),
     )
 
 
 class _Plan(ctypes.Structure):
     _numbers = (
-        *("is_float", "num_channels", "num_samples", "num_lines", "num_branches"),
+        *("num_channels", "num_samples", "num_lines", "num_branches"),
         *("num_features", "num_coefficients", "num_slow", "num_fast"),
     )
     _pointers = (
@@ -51,7 +55,7 @@ class _Plan(ctypes.Structure):
         *("low", "high", "out", "lines", "ones", "frequency_hz", "gain_time", "gain_lines"),
     )
     _fields_ = tuple(
-        [(name, ctypes.c_int64) for name in _numbers]
+        [(name, ctypes.c_int32) for name in _numbers]
         + [(name, ctypes.c_void_p) for name in _pointers]
     )
 
@@ -59,34 +63,34 @@ class _Plan(ctypes.Structure):
 class _Filter(ctypes.Structure):
     _fields_ = (
         ("weights", ctypes.c_void_p),
-        ("length", ctypes.c_int64),
-        ("start", ctypes.c_int64),
+        ("length", ctypes.c_int32),
+        ("start", ctypes.c_int32),
     )
 
 
 class _Sensing(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_void_p) for name in ("inverse_span", "floor", "low", "high", "counted")),
-        ("min_alive", ctypes.c_int64),
+        ("min_alive", ctypes.c_int32),
     )
 
 
 class _Bins(ctypes.Structure):
     _fields_ = (
         ("samples", ctypes.c_void_p),
-        *((name, ctypes.c_int64) for name in (
+        *((name, ctypes.c_int32) for name in (
             "is_float", "num_bins", "bin_stride", "channel_stride")),
         *((name, ctypes.c_void_p) for name in ("filters", "features")),
-        ("features_are_float", ctypes.c_int64),
+        ("features_are_float", ctypes.c_int32),
         *((name, ctypes.c_void_p) for name in (
             "is_odd", "scaled", "score", "sensing", "is_lost", "is_valid", "in_range", "span")),
-        ("score_as_float", ctypes.c_int64),
+        ("score_as_float", ctypes.c_int32),
     )  # fmt: skip
 
 
 class _Pool(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("num_channels", "num_families", "num_statistics")),
+        *((name, ctypes.c_int32) for name in ("num_channels", "num_families", "num_statistics")),
         *((name, ctypes.c_void_p) for name in (
             "channels", "inputs", "statistics", "columns", "fractions", "scales")),
     )  # fmt: skip
@@ -94,7 +98,7 @@ class _Pool(ctypes.Structure):
 
 class _Machine(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int64) for name in (
+        *((name, ctypes.c_int32) for name in (
             "num_channels", "num_inputs", "num_columns", "num_scaled", "num_quadratic",
             "num_factors", "num_singles", "num_pools", "most_channels")),
         *((name, ctypes.c_void_p) for name in (
@@ -117,7 +121,7 @@ class _BristleRun(ctypes.Structure):
 
 class _Onset(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int64) for name in (
+        *((name, ctypes.c_int32) for name in (
             "num_fast", "num_slow", "num_filters", "num_windows", "num_pairs", "num_steps",
             "num_lags", "num_columns", "num_layers", "hop", "context", "delay", "step_length",
             "blind", "min_alive", "most_lost")),
@@ -132,7 +136,7 @@ class _Onset(ctypes.Structure):
 class _OnsetHops(ctypes.Structure):
     _fields_ = (
         ("samples", ctypes.c_void_p),
-        *((name, ctypes.c_int64) for name in (
+        *((name, ctypes.c_int32) for name in (
             "is_float", "channel_stride", "num_hops", "num_lost")),
         *((name, ctypes.c_void_p) for name in (
             "memory", "in_use", "score", "is_lost", "columns")),
@@ -142,36 +146,40 @@ class _OnsetHops(ctypes.Structure):
 class _Kept:
     """The library, and the arrays that its structures point to."""
 
-    def __init__(self) -> None:
+    def __init__(self, dtype: Number = np.float64) -> None:
         self._library = _library()
         self._level = _level(self._library)
         self._held: list[object] = []
+        self.dtype = dtype
 
-    def _array(self, values: Any, dtype: Any) -> int:
-        array = np.array(values, dtype, order="C")  # a copy: tensors may move their memory
+    def _array(self, values: Any, dtype: Any = None) -> int:
+        array = np.array(values, dtype or self.dtype, order="C")  # a copy: tensors may move theirs
         self._held.append(array)
         return array.ctypes.data
 
-    def _filled_up(self, values: Any, dtype: Any, filler: float) -> int:
+    def _filled_up(self, values: Any, filler: float, dtype: Any = None) -> int:
         """An array whose last axis is filled up, so that any vector of the engine reads whole."""
-        array = np.asarray(values, dtype)
+        array = np.asarray(values)
         widths = [(0, 0)] * (array.ndim - 1) + [(0, -array.shape[-1] % _WHOLE)]
         return self._array(np.pad(array, widths, constant_values=filler), dtype)
 
     def _run(self, plan: Any, machine: Any, bins: _Bins) -> None:
         pointers = (each and ctypes.byref(each) for each in (plan, machine, bins))
-        if self._library.tactslip_features(self._level, *pointers):
+        is_float = self.dtype is np.float32
+        if self._library.tactslip_features(self._level, is_float, *pointers):
             raise MemoryError("the native engine found no memory to work in")
 
 
 class Filters(_Kept):
     """Filters of channels: weights, and where the frame of a bin's first sample begins."""
 
-    def __init__(self, weights: Sequence[Array], starts: Sequence[int]) -> None:
-        super().__init__()
+    def __init__(
+        self, weights: Sequence[Array], starts: Sequence[int], dtype: Number = np.float64
+    ) -> None:
+        super().__init__(dtype)
         made = (_Filter * len(weights))()
         for to, own, start in zip(made, weights, starts, strict=True):
-            to.weights, to.length, to.start = self._array(own, np.float64), len(own), start
+            to.weights, to.length, to.start = self._array(own), len(own), start
         self._held.append(made)
         self.address = ctypes.addressof(made)
 
@@ -185,6 +193,7 @@ class Channels(_Kept):
         bounds: least and largest span in range.
         counted: channels that count among those that must be alive.
         min_alive: how many of them.
+        dtype: number type of the engine that asks.
 
     Shape:
         - all but the last: ``[C]``
@@ -197,9 +206,10 @@ class Channels(_Kept):
         bounds: tuple[Sequence[float], Sequence[float]],
         counted: Array,
         min_alive: int,
+        dtype: Number = np.float64,
     ) -> None:
-        super().__init__()
-        spans = [self._array(each, np.float64) for each in (inverse_span, floor, *bounds)]
+        super().__init__(dtype)
+        spans = [self._array(each) for each in (inverse_span, floor, *bounds)]
         self.of = _Sensing(*spans, self._array(counted, np.uint8), min_alive)
         self.address = ctypes.addressof(self.of)
 
@@ -208,7 +218,7 @@ class FeatureEngine(_Kept):
     """Features of bins by the native engine; called from several threads at once.
 
     Args:
-        dtype: of the statistics; float32 for rows scaled to order one.
+        dtype: number type of the engine.
         num_channels: of bins.
         slow: indices of the channels that are described as they are.
         fast: indices of the channels whose branches and spectra are described.
@@ -232,7 +242,7 @@ class FeatureEngine(_Kept):
     def __init__(
         self,
         *,
-        dtype: type[np.floating[Any]],
+        dtype: Number,
         num_channels: int,
         slow: Sequence[int],
         fast: Sequence[int],
@@ -243,7 +253,7 @@ class FeatureEngine(_Kept):
         spectrum: Array,
         frequency_hz: Array,
     ) -> None:
-        super().__init__()
+        super().__init__(dtype)
         num_branches = len(out)
         if num_branches > MAX_BRANCHES:
             raise ValueError(
@@ -251,18 +261,21 @@ class FeatureEngine(_Kept):
                 '; use backend="torch"'
             )
         self._num_rows = 2 * num_branches + 2
-        bands = [self._matrices(group, 4, np.float64) for group in (low, high, out)]
-        lines = [spectrum @ matrix for matrix in out]
+        bands = [self._matrices(group, 4) for group in (low, high, out)]
         wanted = sorted(wanted)
-        place = np.array([w[0] * self._num_rows + w[1] for w in wanted], np.int64)
+        place = np.array([w[0] * self._num_rows + w[1] for w in wanted], np.int32)
         first = np.searchsorted(place, np.arange(num_channels * self._num_rows + 1))
-        descriptor = np.array([w[2] for w in wanted], np.int64)
+        descriptor = np.array([w[2] for w in wanted], np.int32)
         need = np.zeros(num_channels * self._num_rows, np.uint32)
         np.bitwise_or.at(need, place, np.uint32(1) << descriptor.astype(np.uint32))
+        is_read = _spectra_read(need.reshape(num_channels, -1), num_branches)
+        lines = [
+            spectrum @ matrix if read else matrix[:0]
+            for read, matrix in zip(is_read, out, strict=True)
+        ]
         self.num_channels, self.num_features = num_channels, len(wanted)
-        self._none = Filters([np.ones(1)] * num_channels, [0] * num_channels)
+        self._none = Filters([np.ones(1)] * num_channels, [0] * num_channels, dtype)
         self._plan = _Plan(
-            dtype is np.float32,
             num_channels,
             spectrum.shape[1],
             len(frequency_hz),
@@ -270,18 +283,18 @@ class FeatureEngine(_Kept):
             len(wanted),
             sum(len(matrix) + 8 for matrix in low) + 8,
             *map(len, (slow, fast)),
-            self._array(slow, np.int64),
-            self._array(fast, np.int64),
-            self._array(first, np.int64),
-            self._array(descriptor, np.int64),
-            self._array([w[3] for w in wanted], np.int64),
+            self._array(slow, np.int32),
+            self._array(fast, np.int32),
+            self._array(first, np.int32),
+            self._array(descriptor, np.int32),
+            self._array([w[3] for w in wanted], np.int32),
             self._array(need, np.uint32),
             *bands,
-            self._matrices(lines, 8, dtype),
-            self._array(spectrum.sum(-1), dtype),
-            self._array(frequency_hz, np.float64),
-            self._array(_entropy_growth(spectrum.shape[1]), np.float64),
-            self._array(_entropy_growth(len(frequency_hz)), np.float64),
+            self._matrices(lines, 8),
+            self._array(spectrum.sum(-1)),
+            self._array(frequency_hz),
+            self._array(_entropy_growth(spectrum.shape[1])),
+            self._array(_entropy_growth(len(frequency_hz))),
         )
 
     def __call__(self, bins: Array, out: Array) -> Array:
@@ -322,8 +335,9 @@ class FeatureEngine(_Kept):
               side
         """
         num, width = len(bins), 0 if machine.has_head else machine.num_scaled
-        each = self.num_channels
-        ends = [*accumulate((8 * num, 8 * num * each, 8 * num * width, num, num, num, num * each))]
+        each, own = self.num_channels, self.dtype
+        sizes = np.dtype(own).itemsize * np.array([num, num * each, num * width])
+        ends = [*accumulate((*sizes.tolist(), num, num, num, num * each))]
         memory = np.zeros(ends[-1], np.uint8)  # of all that is found: one address to ask for
         start = memory.ctypes.data
         call = _Bins(
@@ -336,18 +350,20 @@ class FeatureEngine(_Kept):
         flags = memory[ends[2] :].view(np.bool_)
         return Scores(
             flags[:num],
-            memory[ends[1] : ends[2]].view(np.float64).reshape(num, width),
-            memory[: ends[0]].view(np.float64).astype(given) if machine.has_head else None,
+            memory[ends[1] : ends[2]].view(own).reshape(num, width),
+            memory[: ends[0]].view(own).astype(given) if machine.has_head else None,
             flags[num : 2 * num],
             flags[2 * num : 3 * num],
             flags[3 * num :].reshape(num, each),
-            memory[ends[0] : ends[1]].view(np.float64).reshape(num, each),
+            memory[ends[0] : ends[1]].view(own).reshape(num, each),
         )
 
-    def _matrices(self, matrices: Sequence[Array], rows: int, dtype: Any) -> int:
+    def _matrices(self, matrices: Sequence[Array], rows: int) -> int:
         """Matrices in blocks of rows, each with the columns that are not zero in it."""
         made = (_Matrix * max(1, len(matrices)))()
         for to, matrix in zip(made, matrices, strict=False):
+            if not len(matrix):
+                continue
             num = -(-len(matrix) // rows)
             blocks = np.zeros((num * rows, matrix.shape[1]))
             blocks[: len(matrix)] = matrix
@@ -358,7 +374,7 @@ class FeatureEngine(_Kept):
             start = np.minimum(start, matrix.shape[1] - width)
             columns = start[:, None] + np.arange(width)
             values = blocks[np.arange(num)[:, None], :, columns]  # [num, width, rows]
-            to.values, to.first = self._array(values, dtype), self._array(start, np.int64)
+            to.values, to.first = self._array(values), self._array(start, np.int32)
             to.num_blocks, to.num_columns, to.width = num, matrix.shape[1], width
         self._held.append(made)
         return ctypes.addressof(made)
@@ -384,7 +400,7 @@ class Pool:
 
 
 class Machine(_Kept):
-    """From inputs, the features that are read, to columns, scaled columns and a score; float64.
+    """From inputs, the features that are read, to columns, scaled columns and a score.
 
     Args:
         num_channels: of the hand.
@@ -400,6 +416,7 @@ class Machine(_Kept):
         head: quadratic part ``[m, m]`` of the first m scaled columns (or empty), linear part
             ``[S]`` and constant; None: no score.
         signs: of the factors, ``[r]``, which are then the quadratic part, ``[r, m]``.
+        dtype: number type of the engine.
     """
 
     def __init__(
@@ -415,8 +432,9 @@ class Machine(_Kept):
         imputation: tuple[Array, Array] | None = None,
         head: tuple[Array, Array, float] | None = None,
         signs: Array | None = None,
+        dtype: Number = np.float64,
     ) -> None:
-        super().__init__()
+        super().__init__(dtype)
         minimum, maximum, compression, sources = scaling or (None,) * 4
         if sources is None:
             sources = np.arange(num_columns)
@@ -428,33 +446,33 @@ class Machine(_Kept):
             fractions = [0.0 if isinstance(s, str) else s for s in pool.statistics]
             to.num_channels, to.num_families = len(pool.channels), len(pool.scales)
             to.num_statistics = len(codes)
-            to.channels = self._array(pool.channels, np.int64)
-            to.statistics = self._array(codes, np.int64)
-            to.fractions = self._array(fractions, np.float64)
-            to.inputs = self._filled_up(pool.inputs.T, np.int64, 0)
-            to.columns = self._filled_up(pool.columns, np.int64, -1)
-            to.scales = self._filled_up(pool.scales, np.float64, 1.0)
+            to.channels = self._array(pool.channels, np.int32)
+            to.statistics = self._array(codes, np.int32)
+            to.fractions = self._array(fractions)
+            to.inputs = self._filled_up(pool.inputs.T, 0, np.int32)
+            to.columns = self._filled_up(pool.columns, -1, np.int32)
+            to.scales = self._filled_up(pool.scales, 1.0)
         self._held.append(made)
-        places = np.array(singles, np.int64).reshape(-1, 2)
+        places = np.array(singles, np.int32).reshape(-1, 2)
         self.of = _Machine(
             num_channels, num_inputs, num_columns, self.num_scaled, 0, 0, len(places), len(pools),
             max((len(pool.channels) for pool in pools), default=0),
-            *(self._array(each, np.int64) for each in places.T), ctypes.addressof(made),
+            *(self._array(each, np.int32) for each in places.T), ctypes.addressof(made),
         )  # fmt: skip
-        self.of.sources = self._filled_up(sources, np.int64, 0)
+        self.of.sources = self._filled_up(sources, 0, np.int32)
         if fill is not None:
-            self.of.fill = self._array(fill, np.float64)
+            self.of.fill = self._array(fill)
         if minimum is not None:
-            self.of.minimum = self._filled_up(minimum, np.float64, 0.0)
-            self.of.maximum = self._filled_up(maximum, np.float64, 0.0)
+            self.of.minimum = self._filled_up(minimum, 0.0)
+            self.of.maximum = self._filled_up(maximum, 0.0)
         if compression is not None:
-            self.of.compression = self._filled_up(compression, np.float64, 1.0)
+            self.of.compression = self._filled_up(compression, 1.0)
         if imputation is not None:
-            self.of.imputation = self._array(imputation[0], np.float64)
-            self.of.channels = self._array(imputation[1], np.int64)
+            self.of.imputation = self._array(imputation[0])
+            self.of.channels = self._array(imputation[1], np.int32)
         if head is not None:
             quadratic, linear, constant = head
-            self.of.linear = self._filled_up(linear, np.float64, 0.0)
+            self.of.linear = self._filled_up(linear, 0.0)
             self.of.constant = constant
             rows = quadratic
             if signs is None:
@@ -462,23 +480,23 @@ class Machine(_Kept):
                 rows[np.diag_indices_from(rows)] /= 2
             elif len(signs):
                 self.of.num_factors = len(signs)
-                self.of.signs = self._filled_up(signs, np.float64, 0.0)
+                self.of.signs = self._filled_up(signs, 0.0)
                 rows = np.pad(rows, [(0, 0), (0, -rows.shape[1] % _WHOLE)])
             if len(rows):
                 blocks = np.pad(rows, [(0, -len(rows) % _WHOLE), (0, 0)])
                 blocks = blocks.reshape(-1, _WHOLE, rows.shape[1]).swapaxes(1, 2)
                 self.of.num_quadratic = rows.shape[1]
-                self.of.quadratic = self._array(blocks, np.float64)
+                self.of.quadratic = self._array(blocks)
 
     def columns(self, inputs: Array, is_lost: Array | None = None) -> Array:
         """Columns of bins, scaled if there is a scaling, ``[M, S]``.
 
         Shape:
-            - inputs: ``[M, inputs]``, float32 or float64
+            - inputs: ``[M, inputs]``
             - is_lost: ``[M, C]``, bool, channels that are left out of their pools
         """
-        found = np.empty((len(inputs), self.num_scaled))
-        inputs = np.asarray(inputs, np.float64)  # has a name, or it is gone before it is read
+        found = np.empty((len(inputs), self.num_scaled), self.dtype)
+        inputs = np.asarray(inputs, self.dtype)  # has a name, or it is gone before it is read
         call = _Bins(*_samples_of(inputs), scaled=found.ctypes.data)
         if is_lost is not None:
             is_lost = np.ascontiguousarray(is_lost)
@@ -598,8 +616,8 @@ class OnsetEngine(_Kept):
         self._of = _Onset(
             len(fast), len(slow), num_filters, len(windows), pairs.shape[1], num_steps, len(lags),
             num_columns, len(layers), hop, context, delay, len(steps), blind, min_alive, most_lost,
-            *(self._array(each, np.int64) for each in whole),
-            *(self._array(each, np.float64) if np.size(each) else None for each in numbers),
+            *(self._array(each, np.int32) for each in whole),
+            *(self._array(each) if np.size(each) else None for each in numbers),
             self._array(is_still, np.uint8), constant,
         )  # fmt: skip
         num_logs, num_sizes = num_filters * len(fast), num_steps * len(slow)
@@ -680,9 +698,31 @@ def carry_bristles(
 
 
 def _entropy_growth(num: int) -> Array:
-    """What the value of each rank in its cell adds to the entropy of ``num`` values, in bits."""
+    """What the value of each rank in its cell adds to the entropy of ``num`` values, in bits.
+
+    More than the rank before; the first times ``num`` is the entropy of ``num`` cells.
+    """
     p = np.arange(num + 1) / num
-    return np.diff(-p * np.log2(p + np.finfo(np.float64).eps))
+    return np.diff(np.diff(-p * np.log2(p + np.finfo(np.float64).eps)), prepend=0.0)
+
+
+def _spectra_read(need: Array, num_branches: int) -> list[bool]:
+    """Of which branches A1, D1, A2 ... the spectrum is formed from coefficients.
+
+    Those of details that are wanted, and of a channel's coarsest approximation that is; finer ones
+    are sums of these and the details between. Band energy ratios want all.
+
+    Shape:
+        - need: ``[C, rows]``, descriptors wanted of each row
+    """
+    wanted: Array = need[:, num_branches : 2 * num_branches] | need[:, 2 * num_branches, None]
+    read: Array = np.any(wanted, 0)
+    levels = read[::2].nonzero()[0]  # of approximations
+    read[::2] = False
+    if len(levels):
+        read[[2 * row.nonzero()[0][-1] for row in wanted[:, ::2] if row.any()]] = True
+        read[2 * levels[0] + 3 : 2 * levels[-1] + 2 : 2] = True
+    return [bool(each) for each in read]
 
 
 def backend_of(name: BackendName) -> Literal["native", "torch"]:
@@ -729,7 +769,7 @@ def _loaded() -> ctypes.CDLL | str:
         _LOG.warning("features and simulation are made by torch, which is slower: %s", error)
         return str(error)
     pointer, number = ctypes.c_void_p, ctypes.c_int
-    library.tactslip_features.argtypes = (number, pointer, pointer, pointer)
+    library.tactslip_features.argtypes = (number, number, pointer, pointer, pointer)
     library.tactslip_bristles.argtypes = (number, pointer)
     library.tactslip_onset.argtypes = (number, pointer, pointer)
     return library

@@ -3,19 +3,20 @@
 // A vector holds one quantity of as many lanes, each with the steps of Newton that the definition
 // takes; those that are done wait for the slowest. No lane depends on its neighbours.
 
-#include <stdlib.h>
-
 #include "engine.h"
 #include "vectors.h"
 
 namespace {
+
+typedef Lanes<double>::V D;
+constexpr int DL = Lanes<double>::NUM;
 
 constexpr double FADED = 6.5;  // Stribeck speeds, beyond which exp(-r^2) is no part of 1
 constexpr double EPS = 0x1p-52, CLOSE = 0x1p-26;
 constexpr double LEAST_LOAD = 1.221338669755462e-77;  // fourth root of the smallest normal number
 
 // What a lane is given, in the order of the rows of a table, and its state.
-struct Lanes {
+struct Lane {
   D mass, k, k1, tau, c, mu_s, mu_k, stribeck, s, d0, relaxed, inertia;
 };
 struct State {
@@ -24,7 +25,7 @@ struct State {
 
 // One implicit stage of length a; x is the patch's speed, turned so that it is not negative.
 struct Stage {
-  Lanes own;
+  Lane own;
   State base;
   D arm, load, turn, offset, low, high, x, rate_v;
   D mu, mu_slope, force, slope;
@@ -134,11 +135,13 @@ struct Stage {
 
 }  // namespace
 
-extern "C" int BRISTLES_ENTRY(const BristleRun* run) {
+namespace LEVEL {
+
+size_t bristles_space(const BristleRun* run) { return (3 * run->num_bristles + 1) * sizeof(D); }
+
+void bristles(const BristleRun* run, void* space) {
   int64_t num_lanes = run->num_lanes, n = run->num_bristles;
-  char* memory = (char*)malloc((3 * n + 1) * sizeof(D));
-  if (!memory) return 1;
-  D* z = (D*)(((uintptr_t)memory + sizeof(D) - 1) / sizeof(D) * sizeof(D));
+  D* z = (D*)aligned((char*)space);
   D *bent = z + n, *rates = bent + n;
   for (int64_t first = 0; first < num_lanes; first += DL) {
     int64_t lane[DL];  // the last lane fills up the last vector
@@ -187,6 +190,6 @@ extern "C" int BRISTLES_ENTRY(const BristleRun* run) {
       for (int64_t i = 0; i < n; ++i) run->bristles[(first + b) * n + i] = z[i][b];
     }
   }
-  free(memory);
-  return 0;
 }
+
+}  // namespace LEVEL

@@ -24,7 +24,8 @@ REMEDY = (
     "(features and simulation are then several times slower)"
 )
 _HERE = Path(__file__).parent
-_SOURCES = ("engine.h", "vectors.h", "engine.cpp", "bristles.cpp", "onset.cpp", "dispatch.cpp")
+_PARTS = ("engine", "judge", "bristles", "onset")  # compiled for each instruction set
+_SOURCES = ("engine.h", "vectors.h", *(f"{part}.cpp" for part in _PARTS), "dispatch.cpp")
 _FLAGS = [
     *(
         "-O3",
@@ -78,12 +79,10 @@ def build_library(folder: Path) -> Path:
         there = Path(name)
         jobs = [(["dispatch.cpp"], "dispatch.o")]
         for level in (2, 3, 4) if _is_x86() else (1,):
-            entries = {"engine": "features", "bristles": "bristles", "onset": "onset"}
-            for source, entry in entries.items():
-                define = f"-D{entry.upper()}_ENTRY={entry}_v{level}"
-                jobs.append(
-                    ([f"{source}.cpp", define, *_march(compiler, level)], f"{source}{level}.o")
-                )
+            flags = [f"-DLEVEL=v{level}", *_march(compiler, level)]
+            for part in _PARTS:
+                own = [*flags, "-ffp-contract=fast"] if part == "engine" else flags
+                jobs.append(([f"{part}.cpp", *own], f"{part}{level}.o"))
         compile_ = [*compiler, *_FLAGS, *_target(compiler), "-I", str(_HERE), "-c"]
         _run([[*compile_, str(_HERE / source), *rest, "-o", str(there / to)]
               for (source, *rest), to in jobs])  # fmt: skip

@@ -8,17 +8,8 @@
 #define EXPORT extern "C" __attribute__((visibility("default")))
 #endif
 
-typedef int Bristles(const BristleRun*);
-typedef int Features(const Plan*, const Machine*, const Bins*);
-typedef int OnsetScores(const Onset*, OnsetHops*);
-
 #if defined(__x86_64__)
 #include <cpuid.h>
-
-extern "C" Bristles bristles_v2, bristles_v3, bristles_v4;
-extern "C" Features features_v2, features_v3, features_v4;
-extern "C" OnsetScores onset_v2, onset_v3, onset_v4;
-#define OF_LEVEL(name) (level >= 4 ? name##_v4 : level == 3 ? name##_v3 : name##_v2)
 
 static bool has(unsigned bits, unsigned wanted) { return (bits & wanted) == wanted; }
 
@@ -36,18 +27,40 @@ EXPORT int tactslip_level() {
 }
 
 #else
-extern "C" Bristles bristles_v1;
-extern "C" Features features_v1;
-extern "C" OnsetScores onset_v1;
-#define OF_LEVEL(name) (level, name##_v1)
-
 EXPORT int tactslip_level() { return 1; }
 #endif
 
-EXPORT int tactslip_features(int level, const Plan* plan, const Machine* machine, const Bins* bins) {
-  return OF_LEVEL(features)(plan, machine, bins);
+#if !defined(TACTSLIP_BARE)
+#include <stdlib.h>
+
+// With memory of the heap, for Python; not zero: there is none.
+template <class Call> static int with_space(size_t bytes, Call call) {
+  void* space = malloc(bytes);
+  if (!space) return 1;
+  call(space);
+  free(space);
+  return 0;
 }
-EXPORT int tactslip_bristles(int level, const BristleRun* run) { return OF_LEVEL(bristles)(run); }
-EXPORT int tactslip_onset(int level, const Onset* onset, OnsetHops* hops) {
-  return OF_LEVEL(onset)(onset, hops);
+
+template <class E>
+static int features(int level, const void* plan, const void* machine, const void* bins) {
+  auto p = (const Plan<E>*)plan;
+  auto m = (const Machine<E>*)machine;
+  auto b = (const Bins<E>*)bins;
+  return with_space(OF_LEVEL(level, features_space(p, m, b)),
+                    [&](void* space) { OF_LEVEL(level, features(p, m, b, space)); });
 }
+
+EXPORT int tactslip_features(
+    int level, int is_float, const void* plan, const void* machine, const void* bins) {
+  return (is_float ? features<float> : features<double>)(level, plan, machine, bins);
+}
+EXPORT int tactslip_onset(int level, const Onset<double>* onset, OnsetHops<double>* hops) {
+  return with_space(OF_LEVEL(level, onset_space(onset)),
+                    [&](void* space) { OF_LEVEL(level, onset(onset, hops, space)); });
+}
+EXPORT int tactslip_bristles(int level, const BristleRun* run) {
+  return with_space(OF_LEVEL(level, bristles_space(run)),
+                    [&](void* space) { OF_LEVEL(level, bristles(run, space)); });
+}
+#endif

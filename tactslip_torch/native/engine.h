@@ -1,5 +1,9 @@
-// What the door hands to the engine; native/__init__.py has the same fields.
+// What the engine is given; native/__init__.py has the same fields, and fills them.
+//
+// E is the number type, float or double, of all that is computed. Nothing here is written but what
+// `Bins`, `OnsetHops` and `BristleRun` are for, so that all else may lie in constant memory.
 #pragma once
+#include <stddef.h>
 #include <stdint.h>
 
 enum Descriptor {
@@ -9,87 +13,86 @@ enum Descriptor {
 constexpr int MAX_BRANCHES = 32;  // and at least NUM_DESCRIPTORS, whose place band energy ratios take
 
 // Blocks of rows, 4 or 8; of each block `width` columns from `first` on are not zero.
-struct Matrix {
-  const void* values;    // [num_blocks, width, rows of a block]
-  const int64_t* first;  // [num_blocks]
-  int64_t num_blocks, num_columns, width;
+template <class E> struct Matrix {
+  const E* values;       // [num_blocks, width, rows of a block]; null: nothing reads it
+  const int32_t* first;  // [num_blocks]
+  int32_t num_blocks, num_columns, width;
 };
 
-struct Plan {
-  int64_t is_float;  // statistics in float, of rows scaled to order one
-  int64_t num_channels, num_samples, num_lines, num_branches;
-  int64_t num_features, num_coefficients, num_slow, num_fast;
-  const int64_t *slow, *fast;  // channels that are read
+template <class E> struct Plan {
+  int32_t num_channels, num_samples, num_lines, num_branches;
+  int32_t num_features, num_coefficients, num_slow, num_fast;
+  const int32_t *slow, *fast;  // channels that are read
   // of each channel and row (branches, their spectra, band energy ratios, the bin itself): where its part of descriptor and column starts, and which bits it has
-  const int64_t *first, *descriptor, *column;
+  const int32_t *first, *descriptor, *column;
   const uint32_t* need;
   // from a bin, or an approximation's coefficients, to those one level coarser; to branches; to lines
-  const Matrix *low, *high, *out, *lines;
-  const void* ones;  // [2 num_lines] spectrum of the constant 1
-  const double *frequency_hz, *gain_time, *gain_lines;
+  const Matrix<E> *low, *high, *out, *lines;
+  const E* ones;  // [2 num_lines] spectrum of the constant 1
+  const E *frequency_hz, *gain_time, *gain_lines;  // gains: what one more value in a cell adds
 };
 
 // Weights of a channel's filter, and where the frame of a bin's first sample begins.
-struct Filter {
-  const double* weights;  // [length]
-  int64_t length, start;
+template <class E> struct Filter {
+  const E* weights;  // [length]
+  int32_t length, start;
 };
 
 // What is known of channels that work: Sensing, one number a channel.
-struct Sensing {
-  const double* inverse_span;  // one over the least span above rounding, as a part of the loudest sample
-  const double *floor, *low, *high;  // span of silence; least and largest span in range
-  const uint8_t* counted;            // whether it counts among those that must be alive
-  int64_t min_alive;
+template <class E> struct Sensing {
+  const E* inverse_span;  // one over the least span above rounding, as a part of the loudest sample
+  const E *floor, *low, *high;  // span of silence; least and largest span in range
+  const uint8_t* counted;       // whether it counts among those that must be alive
+  int32_t min_alive;
 };
 
 // Bins to be described, and where what is found is written; a null pointer: it is not wanted.
-struct Bins {
-  const void* samples;  // those of a channel lie side by side; without a plan: inputs of a machine, double
-  int64_t is_float, num_bins, bin_stride, channel_stride;  // in samples
-  const Filter* filters;  // [channels]
-  void* features;         // [M, features]
-  int64_t features_are_float;
+template <class E> struct Bins {
+  const void* samples;  // those of a channel lie side by side; without a plan: inputs of a machine, E
+  int32_t is_float, num_bins, bin_stride, channel_stride;  // in samples
+  const Filter<E>* filters;  // [channels]
+  void* features;            // [M, features]
+  int32_t features_are_float;
   uint8_t* is_odd;  // [M] a magnitude is out of range: what is found is of no meaning
   // for a machine
-  double *scaled, *score;  // [M, columns], [M]
-  const Sensing* sensing;  // null: what is missing makes a score NaN
+  E *scaled, *score;          // [M, columns], [M]
+  const Sensing<E>* sensing;  // null: what is missing makes a score NaN
   uint8_t *is_lost, *is_valid, *in_range;  // [M, C], [M], [M]; without a plan is_lost is given
-  double* span;                            // [M, C], NaN where missing
-  int64_t score_as_float;                  // so is it bounded
+  E* span;                                 // [M, C], NaN where missing
+  int32_t score_as_float;                  // so is it bounded
 };
 
 enum Statistic { POOLED_MEAN, POOLED_STD, POOLED_MIN, POOLED_MAX, POOLED_ORDER };
 
 // Arrays of families, scaled columns and rows of a head are filled up to a multiple of this, so that
 // any vector reads whole.
-constexpr int WHOLE = 8;
+constexpr int WHOLE = 16;
 
 // Descriptors of the channels of one kind, whose statistics over these channels are columns.
-struct Pool {
-  int64_t num_channels, num_families, num_statistics;
-  const int64_t *channels, *inputs;  // in the hand; [channels, families]
-  const int64_t *statistics, *columns;  // [statistics]; [statistics, families], -1: not wanted
-  const double *fractions, *scales;  // of orders among ascending values, from 0 to 1; [families]
+template <class E> struct Pool {
+  int32_t num_channels, num_families, num_statistics;
+  const int32_t *channels, *inputs;  // in the hand; [channels, families]
+  const int32_t *statistics, *columns;  // [statistics]; [statistics, families], -1: not wanted
+  const E *fractions, *scales;  // of orders among ascending values, from 0 to 1; [families]
 };
 
 // From inputs (features) to columns, to scaled columns, and to a score.
-struct Machine {
-  int64_t num_channels, num_inputs, num_columns, num_scaled, num_quadratic;
-  int64_t num_factors, num_singles, num_pools, most_channels;
-  const int64_t *single_inputs, *single_columns;  // of columns that are not pooled
-  const Pool* pools;
-  const double* fill;       // [columns], where no channel is in use; null: nothing is pooled
-  const int64_t* sources;   // [scaled], the column that each is made of
-  const double *minimum, *maximum, *compression;  // [scaled]; null: not scaled, not compressed
-  const double* imputation;  // [scaled], of a lost channel; null: they stay as they are
-  const int64_t* channels;   // [scaled], -1: of several; null without imputation
+template <class E> struct Machine {
+  int32_t num_channels, num_inputs, num_columns, num_scaled, num_quadratic;
+  int32_t num_factors, num_singles, num_pools, most_channels;
+  const int32_t *single_inputs, *single_columns;  // of columns that are not pooled
+  const Pool<E>* pools;
+  const E* fill;           // [columns], where no channel is in use; null: nothing is pooled
+  const int32_t* sources;  // [scaled], the column that each is made of
+  const E *minimum, *maximum, *compression;  // [scaled]; null: not scaled, not compressed
+  const E* imputation;      // [scaled], of a lost channel; null: they stay as they are
+  const int32_t* channels;  // [scaled], -1: of several; null without imputation
   // of the first num_quadratic scaled columns, [blocks, columns, WHOLE rows of a block]; null: none.
   // Without signs: lower triangle, off its diagonal twice. With them: factors, as many columns as a
   // multiple of WHOLE has.
-  const double* quadratic;
-  const double* signs;   // [factors], 1 or -1; null: there are no factors
-  const double* linear;  // [scaled]; null: no score
+  const E* quadratic;
+  const E* signs;   // [factors], 1 or -1; null: there are no factors
+  const E* linear;  // [scaled]; null: no score
   double constant;
 };
 
@@ -104,30 +107,60 @@ struct BristleRun {
 };
 
 // Evidence of slip, and the head on it: OnsetClassifier.
-struct Onset {
-  int64_t num_fast, num_slow, num_filters, num_windows, num_pairs, num_steps, num_lags, num_columns;
-  int64_t num_layers;  // of a network; 0: the quadratic form
-  int64_t hop, context, delay, step_length;  // samples, samples, blocks, blocks
-  int64_t blind, min_alive, most_lost;       // blocks; channels; lost blocks until all begins anew
-  const int64_t *fast, *slow, *windows;      // channels; blocks, ascending
-  const int64_t *first, *second, *lags, *widths;  // [pairs] twice; hops, ascending; [layers + 1]
-  const double *filters, *steps;  // [context + hop, filters, hop], [step_length, steps]
-  const double *rounding, *silence;  // [filters, fast]: power, half the log power
-  const double *least_step, *rates;  // [slow], [floors]
-  const double *slope, *offset;      // [columns]
-  const double *weights, *biases;    // of layers, one behind the other, [in, out] and [out]
-  const double *quadratic, *linear;  // quadratic may be null
-  const uint8_t* is_still;           // [fast]
+template <class E> struct Onset {
+  int32_t num_fast, num_slow, num_filters, num_windows, num_pairs, num_steps, num_lags, num_columns;
+  int32_t num_layers;  // of a network; 0: the quadratic form
+  int32_t hop, context, delay, step_length;  // samples, samples, blocks, blocks
+  int32_t blind, min_alive, most_lost;       // blocks; channels; lost blocks until all begins anew
+  const int32_t *fast, *slow, *windows;      // channels; blocks, ascending
+  const int32_t *first, *second, *lags, *widths;  // [pairs] twice; hops, ascending; [layers + 1]
+  const E *filters, *steps;        // [context + hop, filters, hop], [step_length, steps]
+  const E *rounding, *silence;     // [filters, fast]: power, half the log power
+  const E *least_step, *rates;     // [slow], [floors]
+  const E *slope, *offset;         // [columns]
+  const E *weights, *biases;       // of layers, one behind the other, [in, out] and [out]
+  const E *quadratic, *linear;     // quadratic may be null
+  const uint8_t* is_still;         // [fast]
   double constant;
 };
 
 // Hops to be scored, and what is kept between them: Memory.
-struct OnsetHops {
+template <class E> struct OnsetHops {
   const void* samples;  // from `context` before the first hop; those of a channel lie side by side
-  int64_t is_float, channel_stride, num_hops, num_lost;  // the last: lost blocks so far, updated
-  double* memory;
+  int32_t is_float, channel_stride, num_hops, num_lost;  // the last: lost blocks so far, updated
+  E* memory;              // zeros at first
   const uint8_t* in_use;  // [channels]
-  double* score;          // [hops], NaN without evidence
+  E* score;               // [hops], NaN without evidence
   uint8_t* is_lost;       // [hops]
-  double* columns;        // [hops, columns], NaN of lost blocks; may be null
+  E* columns;             // [hops, columns], NaN of lost blocks; may be null
 };
+
+// The engine of one instruction set. `space` is memory to work in, anywhere and of any content, of
+// as many bytes as `..._space` says, which looks at numbers alone (and at windows, lags and widths).
+#define ENGINE_OF(level)                                                                           \
+  namespace level {                                                                                \
+  template <class E> size_t features_space(const Plan<E>*, const Machine<E>*, const Bins<E>*);     \
+  template <class E> void features(const Plan<E>*, const Machine<E>*, const Bins<E>*, void* space); \
+  template <class E> size_t judge_space(const Machine<E>*, int32_t num_bins);                      \
+  template <class E>                                                                               \
+  void judge(const Machine<E>*, const Bins<E>*, const E* inputs, int32_t stride, int32_t start,    \
+             int32_t num, void* space); /* of features: what features() calls */                   \
+  template <class E> size_t onset_memory(const Onset<E>*); /* in numbers */                        \
+  template <class E> size_t onset_space(const Onset<E>*);                                          \
+  template <class E> void onset(const Onset<E>*, OnsetHops<E>*, void* space);                      \
+  size_t bristles_space(const BristleRun*);                                                        \
+  void bristles(const BristleRun*, void* space);                                                   \
+  }
+
+// OF_LEVEL(level, features(...)) calls that of level 2, 3 or 4, as in x86-64-v3; elsewhere there is one.
+#if defined(__x86_64__)
+ENGINE_OF(v2)
+ENGINE_OF(v3)
+ENGINE_OF(v4)
+#define OF_LEVEL(level, call) ((level) >= 4 ? v4::call : (level) == 3 ? v3::call : v2::call)
+#else
+ENGINE_OF(v1)
+#define OF_LEVEL(level, call) ((void)(level), v1::call)
+#endif
+
+extern "C" int tactslip_level();  // the best of this processor

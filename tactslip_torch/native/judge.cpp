@@ -1,0 +1,304 @@
+// Scores of bins from their features: pooling over channels, scaling and head.
+//
+// Lanes run across a few bins, or, of one bin alone, across its families, scaled columns and rows of
+// the head. Each number is made by the same operations in the same order, so scores are the same:
+// to be compiled without contraction of products and sums.
+
+#include "engine.h"
+#include "vectors.h"
+
+namespace {
+
+// log(1 + x) for x >= 0, as fdlibm has it: an error below 1 ulp. Of f, less than the square root of 2
+// over 1, it is a series in the squares of s = f / (2 + f).
+template <class E> struct Series;
+template <> struct Series<double> {
+  static constexpr int DIGITS = 52, BIAS = 0x3ff;
+  static constexpr uint64_t ONE = 0x3ff0000000000000, LOWEST = 0x3fe6a09e00000000;  // sqrt(1/2)
+  static constexpr double LN2_HIGH = 6.93147180369123816490e-01, LN2_LOW = 1.90821492927058770002e-10;
+  static constexpr double LN_LARGEST = 0x1.62e42fefa39efp9;
+  template <class V> INLINE V at(V z) {
+    return z * (6.666666666666735130e-01 + z * (3.999999999940941908e-01 +
+           z * (2.857142874366239149e-01 + z * (2.222219843214978396e-01 +
+           z * (1.818357216161805012e-01 + z * (1.531383769920937332e-01 +
+           z * 1.479819860511658591e-01))))));
+  }
+};
+template <> struct Series<float> {
+  static constexpr int DIGITS = 23, BIAS = 0x7f;
+  static constexpr uint32_t ONE = 0x3f800000, LOWEST = 0x3f3504f3;
+  static constexpr float LN2_HIGH = 6.9313812256e-01f, LN2_LOW = 9.0580006145e-06f;
+  static constexpr float LN_LARGEST = 0x1.62e43p6f;
+  template <class V> INLINE V at(V z) {
+    return z * (6.6666662693e-01f + z * (4.0000972152e-01f +
+           z * (2.8498786688e-01f + z * 2.4279078841e-01f)));
+  }
+};
+template <class E> INLINE typename Lanes<E>::V log1p_of(typename Lanes<E>::V x) {
+  typedef typename Lanes<E>::V V;
+  typedef typename Lanes<E>::Bits Bits;
+  typedef Series<E> Own;
+  constexpr auto digits = ((decltype(Own::ONE))1 << Own::DIGITS) - 1;
+  constexpr E whole = 3 * ((E)((decltype(Own::ONE))1 << Own::DIGITS) / 2);  // on it, a number's bits
+  V u = 1 + x, lost = x < 1 ? x - (u - 1) : 1 - (u - x);
+  Bits bits = (Bits)u + (Own::ONE - Own::LOWEST);
+  V k = (V)((bits >> Own::DIGITS) + ((Bits)(V{} + whole) - Own::BIAS)) - whole;
+  V f = (V)((bits & digits) + Own::LOWEST) - 1;
+  V s = f / (2 + f), z = s * s, half = (E)0.5 * f * f;
+  return k * Own::LN2_HIGH - ((half - (s * (half + Own::at(z)) + (k * Own::LN2_LOW + lost / u))) - f);
+}
+
+// sign(x) scale log(1 + |x| / scale)
+template <class E> INLINE typename Lanes<E>::V signed_log(typename Lanes<E>::V x, typename Lanes<E>::V scale) {
+  typedef typename Lanes<E>::V V;
+  V size = x < 0 ? -x : x, ratio = size / scale, bent = scale * log1p_of<E>(ratio);
+  auto is_far = ratio > Limits<E>::LARGEST;
+  if (any(is_far))
+    for (int k = 0; k < Lanes<E>::NUM; ++k)
+      if (is_far[k]) {
+        E far = log_of(size[k] > scale[k] ? size[k] : scale[k]) - log_of(scale[k]);
+        bent[k] = scale[k] * (far > Series<E>::LN_LARGEST ? far : Series<E>::LN_LARGEST);
+      }
+  bent = ratio < Limits<E>::SMALLEST ? size : bent;  // a denormal ratio has lost its digits
+  return x < 0 ? -bent : bent;
+}
+
+enum Across { BINS, ONE_BIN };
+
+constexpr int32_t filled_up(int32_t num) { return (num + WHOLE - 1) / WHOLE * WHOLE; }
+
+template <class E> struct Judge {
+  static constexpr int L = Lanes<E>::NUM;
+  typedef typename Lanes<E>::V V;
+  const Machine<E>& machine;
+  V *several, *y, *z;  // [inputs], [columns], [scaled]: of a few bins, or of one in as many numbers
+  V *values, *sorted, *in_use;  // [channels]
+  int32_t at;                   // the first of these bins
+  int few;
+  const uint8_t* is_lost;  // of these bins
+
+  explicit Judge(const Machine<E>& machine) : machine(machine) {}
+
+  char* place(char* at, int32_t num_bins) {
+    int32_t lanes = num_bins > 1 ? L : 1, most = machine.most_channels;
+    several = (V*)aligned(at);  // of one bin, inputs stay where they are
+    y = several + (num_bins > 1 ? machine.num_inputs : 0);
+    z = y + filled_up(machine.num_columns) * lanes / L;
+    values = z + filled_up(machine.num_scaled) * lanes / L;
+    sorted = values + most;
+    in_use = sorted + most;
+    return (char*)(in_use + most);
+  }
+
+  // Of inputs of bins from `start` on.
+  void judge(const E* inputs, int32_t stride, int32_t start, int32_t num, const Bins<E>& bins) {
+    for (int32_t b = 0; b < num; b += few) {
+      at = start + b;
+      few = (int)(num - b < L ? num - b : L);
+      if (2 * few <= L) few = 1;  // up to here it is quicker
+      is_lost = bins.is_lost ? bins.is_lost + (ptrdiff_t)at * machine.num_channels : nullptr;
+      if (few == 1)
+        judge_few<ONE_BIN>(inputs + b * stride, stride, bins);
+      else
+        judge_few<BINS>(inputs + b * stride, stride, bins);
+    }
+  }
+
+  template <Across ACROSS>
+  void judge_few(const E* inputs, int32_t stride, const Bins<E>& bins) {
+    const Machine<E>& m = machine;
+    const V* x = ACROSS == BINS ? several : (const V*)inputs;
+    for (int32_t i = 0; ACROSS == BINS && i < m.num_inputs; ++i)
+      for (int k = 0; k < L; ++k) several[i][k] = inputs[(k < few ? k : 0) * stride + i];
+    for (int32_t i = 0; i < m.num_singles; ++i)
+      for (int k = 0; k < (ACROSS == BINS ? L : 1); ++k)
+        of<ACROSS>(y, m.single_columns[i], k) = of<ACROSS>((V*)x, m.single_inputs[i], k);
+    for (int32_t p = 0; p < m.num_pools; ++p) pool<ACROSS>(m.pools[p], x);
+    for (int32_t i = 0; i < m.num_scaled; i += step<ACROSS>()) scale<ACROSS>(i);
+    for (int k = 0; m.imputation && is_lost && k < few; ++k)
+      for (int32_t i = 0; i < m.num_scaled; ++i)
+        if (m.channels[i] >= 0 && is_lost[k * m.num_channels + m.channels[i]])
+          of<ACROSS>(z, i, k) = m.imputation[i];
+    for (int k = 0; bins.scaled && k < few; ++k)
+      for (int32_t i = 0; i < m.num_scaled; ++i)
+        bins.scaled[(ptrdiff_t)(at + k) * m.num_scaled + i] = of<ACROSS>(z, i, k);
+    if (!bins.score) return;
+    V score = clamped<E>(head<ACROSS>(), bins.score_as_float ? (E)LARGEST_FLOAT : Limits<E>::LARGEST);
+    for (int k = 0; k < few; ++k)
+      bins.score[at + k] = bins.is_valid && !bins.is_valid[at + k] ? (E)NAN : score[k];
+  }
+
+  // Families, scaled columns or rows that one vector holds.
+  template <Across ACROSS> static constexpr int step() { return ACROSS == BINS ? 1 : L; }
+
+  // A number of a bin.
+  template <Across ACROSS> static E& of(V* rows, int32_t i, int k) {
+    return ((E*)rows)[ACROSS == BINS ? i * L + k : i];
+  }
+
+  // One vector of numbers that are there once for each family, scaled column or row.
+  template <Across ACROSS> static V constants(const E* from) {
+    V found = V{} + *from;
+    if (ACROSS == ONE_BIN) memcpy(&found, from, sizeof(V));
+    return found;
+  }
+
+  // One vector of inputs or columns.
+  template <Across ACROSS> static V gathered(const V* from, const int32_t* places) {
+    if (ACROSS == BINS) return from[*places];
+    V found = {};
+    for (int k = 0; k < L; ++k) found[k] = ((const E*)from)[places[k]];
+    return found;
+  }
+
+  template <Across ACROSS> void pool(const Pool<E>& p, const V* x) {
+    int32_t stride = filled_up(p.num_families);
+    V count = {};
+    for (int32_t c = 0; c < p.num_channels; ++c) {
+      in_use[c] = V{} + 1;
+      for (int k = 0; is_lost && k < few; ++k)
+        if (is_lost[k * machine.num_channels + p.channels[c]]) {
+          if (ACROSS == BINS)
+            in_use[c][k] = 0;
+          else
+            in_use[c] = V{};
+        }
+      count += in_use[c];
+    }
+    for (int32_t r = 0; r < p.num_families; r += step<ACROSS>()) {
+      V mean = {}, square = {}, low = {}, high = {}, last = {};
+      V scale = constants<ACROSS>(p.scales + r);
+      for (int32_t c = 0; c < p.num_channels; ++c) {
+        V value = signed_log<E>(gathered<ACROSS>(x, p.inputs + c * stride + r), scale);
+        values[c] = in_use[c] > 0 ? value : V{};
+        mean += values[c];
+        last = larger(last, values[c]);
+      }
+      mean /= larger(count, V{} + 1);
+      for (int32_t c = 0; c < p.num_channels; ++c) {
+        V away = (values[c] - mean) * in_use[c];  // a channel that is not in use stands at the mean
+        square += away * away;
+        low = smaller(low, away);
+        high = larger(high, away);
+      }
+      bool is_sorted = false;
+      for (int32_t s = 0; s < p.num_statistics; ++s) {
+        const int32_t* columns = p.columns + s * stride + r;
+        bool is_wanted = false;
+        for (int k = 0; k < step<ACROSS>(); ++k) is_wanted |= columns[k] >= 0;
+        if (!is_wanted) continue;
+        V found = mean;
+        if (p.statistics[s] == POOLED_STD) found = root(square / larger(count - 1, V{} + 1));
+        if (p.statistics[s] == POOLED_MIN) found = low + mean;
+        if (p.statistics[s] == POOLED_MAX) found = high + mean;
+        if (p.statistics[s] == POOLED_ORDER) {
+          if (!is_sorted)  // those not in use come last
+            for (int32_t c = 0; c < p.num_channels; ++c)
+              sorted[c] = in_use[c] > 0 ? values[c] : last;
+          if (!is_sorted) merges(sorted, p.num_channels, 1);
+          is_sorted = true;
+          found = mean - mean;  // NaN stays NaN
+          for (int32_t c = 0; c < p.num_channels; ++c) {
+            V weight = 1 - magnitude((count - 1) * p.fractions[s] - (E)c);
+            found += weight > 0 ? sorted[c] * weight : V{};  // linear interpolation
+          }
+        }
+        if (ACROSS == BINS) y[*columns] = count > 0 ? found : V{} + machine.fill[*columns];
+        for (int k = 0; ACROSS == ONE_BIN && k < L; ++k)
+          if (columns[k] >= 0)
+            of<ACROSS>(y, columns[k], 0) = count[0] > 0 ? found[k] : machine.fill[columns[k]];
+      }
+    }
+  }
+
+  template <Across ACROSS> void scale(int32_t i) {
+    const Machine<E>& m = machine;
+    V value = gathered<ACROSS>(y, m.sources + i);
+    if (m.compression) value = signed_log<E>(value, constants<ACROSS>(m.compression + i));
+    if (m.minimum) {
+      V low = constants<ACROSS>(m.minimum + i), width = constants<ACROSS>(m.maximum + i) - low;
+      V scaled = clamped<E>(2 * ((value - low) / width) - 1, 1);
+      value = width > 0 ? scaled : value - value;  // 0; NaN stays NaN
+    }
+    z[i / step<ACROSS>()] = value;
+  }
+
+  // The scores of a few bins, or that of one in lane 0.
+  template <Across ACROSS> V head() {
+    const Machine<E>& m = machine;
+    constexpr int rows = ACROSS == BINS ? 4 : WHOLE, num = rows / step<ACROSS>();
+    for (int32_t i = m.num_scaled; i < filled_up(m.num_scaled); ++i)
+      for (int k = 0; k < (ACROSS == BINS ? L : 1); ++k) of<ACROSS>(z, i, k) = 0;
+    V sums = V{} + (E)m.constant;
+    int32_t num_quadratic = m.signs ? 0 : m.num_quadratic;
+    for (int32_t i = 0; i < m.num_scaled; i += rows) {
+      V pull[num];
+      for (int v = 0; v < num; ++v) pull[v] = constants<ACROSS>(m.linear + i + v * step<ACROSS>());
+      const E* block = m.quadratic + i / WHOLE * WHOLE * num_quadratic + i % WHOLE;
+      int32_t reach = i + rows < num_quadratic ? i + rows : num_quadratic;
+      for (int32_t j = 0; i < num_quadratic && j < reach; ++j) {
+        V other = ACROSS == BINS ? z[j] : V{} + of<ACROSS>(z, j, 0);
+#pragma GCC unroll 4
+        for (int v = 0; v < num; ++v)
+          pull[v] += other * constants<ACROSS>(block + WHOLE * j + v * step<ACROSS>());
+      }
+      for (int v = 0; v < num; ++v) {
+        V terms = pull[v] * z[i / step<ACROSS>() + v];
+        if (ACROSS == BINS) sums += terms;
+        for (int k = 0; ACROSS == ONE_BIN && k < L; ++k) sums[0] += terms[k];
+      }
+    }
+    if (m.signs) factors<ACROSS>(sums);
+    return sums;
+  }
+
+  // Add the squares of the products with the factors. There are few rows and many columns, so each
+  // product is summed in PARTS, which do not wait for each other.
+  template <Across ACROSS> void factors(V& sums) {
+    const Machine<E>& m = machine;
+    constexpr int PARTS = 4, rows = ACROSS == BINS ? 4 : L, num = rows / step<ACROSS>();
+    for (int32_t i = 0; i < m.num_factors; i += rows) {
+      const E* block = m.quadratic + i / WHOLE * WHOLE * m.num_quadratic + i % WHOLE;
+      V pull[PARTS][num] = {};
+      for (int32_t j = 0; j < m.num_quadratic; j += PARTS) {
+#pragma GCC unroll 4
+        for (int p = 0; p < PARTS; ++p) {
+          V other = ACROSS == BINS ? z[j + p] : V{} + of<ACROSS>(z, j + p, 0);
+#pragma GCC unroll 4
+          for (int v = 0; v < num; ++v)
+            pull[p][v] += other * constants<ACROSS>(block + WHOLE * (j + p) + v * step<ACROSS>());
+        }
+      }
+      for (int v = 0; v < num; ++v) {
+        V whole = (pull[0][v] + pull[1][v]) + (pull[2][v] + pull[3][v]);
+        V terms = whole * whole * constants<ACROSS>(m.signs + i + v * step<ACROSS>());
+        if (ACROSS == BINS) sums += terms;
+        for (int k = 0; ACROSS == ONE_BIN && k < L; ++k) sums[0] += terms[k];
+      }
+    }
+  }
+};
+
+}  // namespace
+
+namespace LEVEL {
+
+template <class E> size_t judge_space(const Machine<E>* machine, int32_t num_bins) {
+  return (size_t)Judge<E>(*machine).place(nullptr, num_bins) + VECTOR_BYTES;
+}
+
+template <class E>
+void judge(const Machine<E>* machine, const Bins<E>* bins, const E* inputs, int32_t stride,
+           int32_t start, int32_t num, void* space) {
+  Judge<E> judge(*machine);
+  judge.place((char*)space, bins->num_bins);
+  judge.judge(inputs, stride, start, num, *bins);
+}
+
+#define MAKE(E)                                                                                    \
+  template size_t judge_space(const Machine<E>*, int32_t);                                         \
+  template void judge(const Machine<E>*, const Bins<E>*, const E*, int32_t, int32_t, int32_t, void*);
+MAKE(float)
+MAKE(double)
+
+}  // namespace LEVEL
