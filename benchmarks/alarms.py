@@ -2,32 +2,38 @@
 
 Fewer seeds or slips: ``sizes.seeds=[0] sizes.sessions=2``.
 
-Runs ``tactslip train +exp=onset`` with each seed, which fits the classifier on its mixture and sets
-the alarm within the default budget. Then slips of held-out materials, in worlds of which some lie
-at the end of what was trained on: found within 250 ms of the first release, early, and how late;
-beside it hints, and the detector of bins under the same budgets. Then false alarms of held-out
-materials by kind of recording. All data are simulated. What a seed gave is kept, so a run that was
-stopped resumes. Puts its tables into docs/onset.md.
+Fits the classifier on the mixture of each seed and sets its threshold, as ``+exp=onset`` does, for
+the detector that comes with the package. Then slips of held-out materials, in worlds of which some
+lie at the end of what was trained on: found within 250 ms of the first release, early, and how
+late; beside it hints, and with the first seed the detector of bins and the largest wavelet detail
+under the same budgets. Then false alarms of held-out materials by kind of recording. All data are
+simulated. What a seed gave is kept, so a run that was stopped resumes. Puts its tables into
+docs/onset.md.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
+from pathlib import Path
 from statistics import fmean
 from typing import Any, ClassVar
 
 import numpy as np
+from hydra.utils import instantiate
 
-from benchmarks.harness import Benchmark, Job, resumed, trained
+from benchmarks.harness import Benchmark, Job
 from benchmarks.tables import Table, by, percent
+from benchmarks.trainings import composed, resumed, say
 from tactslip_torch import AlarmSettings, SlipDetector
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
+from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.onset.events import first_releases
-from tactslip_torch.onset.rules import Budget
+from tactslip_torch.onset.rules import Budget, Cusum
 from tactslip_torch.simulation.simulate import SimulatedRecordings
+from tactslip_torch.simulation.worlds import CONFOUNDERS, SLIP
 from tactslip_torch.training.alarm import (
     OURS,
     SLIPPING_NOW,
@@ -37,9 +43,11 @@ from tactslip_torch.training.alarm import (
     score_streams,
 )
 
+SOURCES = ("tactslip_torch/pretrained/paper24-sim.pt",)
 FOUND_S, EARLY_S, HINT_S = 0.25, 0.2, 0.1
 """Of the first release: an alarm until then finds a slip, before it is early; a hint is in time."""
-HINT = "hint"
+HINT, BINS = "hint", "bins"
+DETAIL: BaselineName = "largest_detail"
 
 
 def _pulled(*speeds_mm_s: float, moves: str = "object", distance_mm: float = 16.0) -> Any:
@@ -92,25 +100,30 @@ WORLDS: Mapping[str, Mapping[str, Any]] = {
     "pulled at .1 m/s2": _PULLED | {"acceleration_m_s2": 0.1},
 }
 """Slips, by what is changed of the protocol; each recording has three."""
+OVERRIDES = (
+    "onset.hop_ms=50",
+    "onset.classifier.head=network",
+    "onset.confidence=0.5",
+    "onset.streams.slips=60",
+    "onset.streams.confounders.held=600",
+    *(f"onset.streams.confounders.{kind}=60" for kind in CONFOUNDERS if kind != "held"),
+    "onset.hours={held:1.5,slip:0.06,others:0.15}",
+    "onset.check_hours={held:2,slip:0.05,others:0.2}",
+)
+"""Of ``+exp=onset``: fewer hours than by default set the threshold, so at the point estimate."""
 QUICK = '","'.join(
     (
         "num_workers=0",
-        "baselines=false",
-        "data.cycles=2",
         "data.materials=[M1,M6,iron]",
         "split.seen=[M1,M6]",
         "split.unseen=[iron]",
-        "split.train_fraction=0.5",
-        "extra_scenes=none",
-        "~recipe.scene_weights",
-        "recipe.penalties=[0.003]",
-        "recipe.sample_bins=20",
         "onset.classifier.epochs=1",
         "onset.classifier.head=quadratic",
         "onset.worlds.slips=4",
         "~onset.worlds.confounders",
         "+onset.worlds.confounders={held:2,taps:2}",
         "onset.worlds.tail_s=4",
+        "onset.hop_ms=50",
         "onset.streams.slips=4",
         "~onset.streams.confounders",
         "+onset.streams.confounders={held:4,taps:4}",
@@ -124,11 +137,12 @@ QUICK = '","'.join(
 
 @dataclass(frozen=True)
 class Alarms(Benchmark):
-    """Every seed, trained and evaluated.
+    """Every seed, fitted and evaluated.
 
     Args:
-        seeds: of mixtures, weights and mountings.
-        overrides: of ``tactslip_torch.train +exp=onset``, which say how much is checked.
+        seeds: of mixtures, weights, mountings and recordings that set thresholds.
+        overrides: of ``tactslip_torch.train +exp=onset``, of which ``onset`` is taken: so many
+            hours set thresholds and are checked.
         worlds: names of ``WORLDS``.
         sessions: mountings of each material and world, each with three slips.
     """
@@ -139,17 +153,13 @@ class Alarms(Benchmark):
     quick = f'seeds=[0] overrides=["{QUICK}"] worlds=["pulled","pinch"] sessions=1'
     charts: ClassVar = {
         "": [
-            ("Slips found", ("found", "bins")),
+            ("Slips found", ("found", "bins", "detail")),
             ("Slips found", ("median", "p95")),
             ("False alarms", ("alarm",)),
         ]
     }
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
-    overrides: tuple[str, ...] = (
-        "baselines=false",
-        "onset.check_hours.held=2",
-        "onset.check_hours.others=0.2",
-    )
+    overrides: tuple[str, ...] = OVERRIDES
     worlds: tuple[str, ...] = tuple(WORLDS)
     sessions: int = 4
 
@@ -158,12 +168,18 @@ class Alarms(Benchmark):
         slips, budgets, heads = list[dict[str, Any]](), list[list[Any]](), list[str]()
         for seed in self.seeds:
             given = ["+exp=onset", f"seed={seed}", *self.overrides, *job.overrides]
-            folder = job.folder / f"seed-{seed}"
-            metrics = trained(given, folder, job.folder / "cache")
-            alarm = metrics["alarm"]
-            run = partial(_slips, SlipDetector.load(folder / "detector.pt"), alarm, self, seed)
-            slips += resumed(folder / "worlds.json", [*given, repr(self)], run)
+            folder, has_detail = job.folder / f"seed-{seed}", seed == self.seeds[0]
+            made_by = [*given, f"detail={has_detail}"]
+            of_worlds = [*made_by, *self.worlds, f"sessions={self.sessions}"]
+            say(f"the alarm of seed {seed}")
+            fit = partial(_fitted, given, folder / "detector.pt", has_detail)
+            alarm = resumed(folder / "alarm.json", made_by, fit)
+            say(f"{len(self.worlds)} worlds of seed {seed}")
+            detector = SlipDetector.load(folder / "detector.pt")
+            run = partial(_slips, detector, alarm, self, seed)
+            slips += resumed(folder / "worlds.json", of_worlds, run)
             budgets.append(alarm["budget"])
+            amounts = alarm["streams"]["calibrate"]
             heads.append(alarm["classifier"]["head"])
         rows = [_world_row(world, own) for (world,), own in by(slips, "world").items()]
         rows.sort(key=lambda row: float(str(row["found %"])))
@@ -174,52 +190,88 @@ class Alarms(Benchmark):
                     "Within 250 ms of the first release, in % of all seeds; *lowest*: of the seed "
                     "that found least. *Early*: an alarm that stood or was raised up to 200 ms "
                     "before it. *Hint*: within 100 ms. *Bins*: the detector of bins behind its "
-                    f"rule under the same budgets. Heads that validation chose: "
-                    f"{', '.join(heads)}.",
+                    "rule, *detail*: the largest wavelet detail of a fast channel, under the same "
+                    f"budgets; detail of seed {self.seeds[0]} alone. Heads: {', '.join(heads)}.",
                 ),
                 "False alarms": Table(
                     _alarm_rows(budgets),
                     "An hour, of materials that were held out, with 95 % intervals; all seeds "
-                    "together. *confounders*: all kinds below it.",
+                    "together. *confounders*: all kinds below it. Thresholds of each seed are "
+                    f"those of {_hours(amounts)} of other materials, at the point estimate.",
                 ),
             }
         }
+
+
+def _fitted(given: Sequence[str], path: Path, has_detail: bool) -> dict[str, Any]:
+    """What came of setting the alarm of the detector that comes with the package; kept there."""
+    config, detector = composed("train", given), SlipDetector.pretrained()
+    scorers = _scorers(detector, has_detail)
+    others = {name: scorer for name, scorer in scorers.items() if name != OURS}
+    set_alarm = instantiate(config.onset, _convert_="all")
+    roles = set_alarm.roles(detector)
+    set_alarm.streams.ids = (*roles["calibrate"], *roles["unseen"])  # none checks seen materials
+    found: dict[str, Any] = set_alarm(detector, others, num_workers=config.num_workers)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    detector.save(path)
+    return found
+
+
+def _hours(amounts: Mapping[str, Mapping[str, float]]) -> str:
+    """Of what sets thresholds."""
+    hours = {kind: own["hours"] for kind, own in amounts.items()}
+    held = hours.pop("held")
+    others = sum(h for kind, h in hours.items() if kind != SLIP)
+    return f"{held:.1f} h held and {others:.1f} h of confounders"
+
+
+def _scorers(detector: SlipDetector, has_detail: bool) -> dict[str, Scorer]:
+    if not has_detail:
+        return {OURS: detector}
+    return {
+        OURS: detector,
+        DETAIL: BaselineDetector(DETAIL, detector.pool, detector.channel_filter),
+    }
 
 
 def _slips(
     detector: SlipDetector, alarm: Mapping[str, Any], sizes: Alarms, seed: int
 ) -> list[dict[str, Any]]:
     """What became of each slip of held-out materials, by world and method."""
-    ours, rate = AlarmSettings.of(detector), detector.pool.sample_rate_hz
+    ours, pool = AlarmSettings.of(detector), detector.pool
     assert ours.onset is not None
-    names = ("hop_samples", "calibration", "rule", "threshold", "target_per_hour")
-    of_bins = alarm["methods"][ours.rule.name]
-    plain = ours.to_dict() | {name: of_bins[name] for name in names} | {"onset": None}
-    bins = AlarmSettings.from_dict(plain, detector.pool.hand, rate)
+    scorers, rate = _scorers(detector, seed == sizes.seeds[0]), pool.sample_rate_hz
     methods = {
-        SLIPPING_NOW: ours,
-        HINT: ours.at_threshold(ours.onset.hint),
-        "bins": bins,
+        SLIPPING_NOW: (OURS, ours),
+        HINT: (OURS, ours.at_threshold(ours.onset.hint)),
     }
-    hops, rows = {OURS: ours.hop_samples}, list[dict[str, Any]]()
-    held_out = alarm["held_out"]
-    timing = Timing(rate, ours.hop_samples, detector.pool.bin_samples, detector.look_ahead)
+    for name, label in {ours.rule.name: BINS, DETAIL: DETAIL}.items():
+        if made := alarm["methods"].get(name):
+            plain = {field.name: made[field.name] for field in fields(AlarmSettings)}
+            settings = AlarmSettings.from_dict(plain | {"onset": None}, pool.hand, rate)
+            methods[label] = made["scorer"], settings
+    hops = dict.fromkeys(scorers, ours.hop_samples)
+    timings = {
+        name: Timing(rate, hops[name], pool.bin_samples, scorer.look_ahead)
+        for name, scorer in scorers.items()
+    }
+    rows = list[dict[str, Any]]()
     for world in sizes.worlds:
         source = SimulatedRecordings(
             seed=1000 + seed,
             cycles=1,
             sessions=sizes.sessions,
-            materials=held_out,
+            materials=alarm["held_out"],
             scene=WORLDS[world],
         )
-        streams = score_streams(source, source.ids, {OURS: detector}, hops, ours.onset)
+        streams = score_streams(source, source.ids, scorers, hops, ours.onset)
         found = {
             name: [
                 delay
-                for stream, made in decide(streams[OURS], own, timing)
+                for stream, made in decide(streams[scorer], own, timings[scorer])
                 for delay in _delays(stream, made)
             ]
-            for name, own in methods.items()
+            for name, (scorer, own) in methods.items()
         }
         rows.append({"world": world, "seed": seed, **found})
     return rows
@@ -244,6 +296,7 @@ def _world_row(world: str, by_seed: Sequence[Mapping[str, Any]]) -> dict[str, An
         return [
             fmean(not isinstance(delay, str) and delay <= within_s for delay in of[name])
             for of in by_seed
+            if name in of
         ]
 
     every = [delay for of in by_seed for delay in of[SLIPPING_NOW]]
@@ -259,28 +312,28 @@ def _world_row(world: str, by_seed: Sequence[Mapping[str, Any]]) -> dict[str, An
         "p95 ms": f"{p95:.0f}",
         "hint %": percent(fmean(share(HINT, HINT_S))),
         "early hints %": percent(fmean(delay == "early" for delay in hints)),
-        "bins %": percent(fmean(share("bins"))),
+        "bins %": percent(fmean(share(BINS))),
+        "detail %": percent(fmean(share(DETAIL))) if share(DETAIL) else "-",
         "slips": len(every),
     }
 
 
 def _alarm_rows(by_seed: Iterable[Sequence[Any]]) -> list[dict[str, Any]]:
-    """A row for each kind: rates of the alarm and of bins, all seeds together."""
+    """A row for each kind: rates of the alarm, of bins and of detail, all seeds together."""
     every = [row for budget in by_seed for row in budget if row["role"] == "unseen"]
     rows = []
     for (scene,), own in by(every, "scene").items():
-        sums = defaultdict[str, list[float]](lambda: [0, 0.0])
-        for one in own:
-            sums[one["method"]][0] += one["alarms"]
-            sums[one["method"]][1] += one["amount"]
-        row = {"kind": scene.replace("_", " ")}
         limit = own[0]["limit"]
-        row["budget"] = "-" if limit is None else f"{limit:g} /h"
-        row["of"] = f"{sums[SLIPPING_NOW][1]:.2f} h"
-        for method, (alarms, hours) in sums.items():
-            low, high = Budget(scene, 1.0).interval(int(alarms), hours)
-            name = "alarm" if method == SLIPPING_NOW else method
-            row[name] = f"{alarms / hours:.2f} [{low:.2f}, {high:.2f}]"
+        row = {"kind": scene.replace("_", " "), "budget": "-" if limit is None else f"{limit:g} /h"}
+        for method, column in {SLIPPING_NOW: "alarm", Cusum.name: BINS, DETAIL: DETAIL}.items():
+            of = [one for one in own if one["method"] == method]
+            alarms, hours = sum(one["alarms"] for one in of), sum(one["amount"] for one in of)
+            if not of:
+                continue
+            low, high = Budget(scene, 1.0).interval(alarms, hours)
+            row |= {column: f"{alarms / hours:.2f} [{low:.2f}, {high:.2f}]"}
+            if method == SLIPPING_NOW:
+                row["of"] = f"{hours:.2f} h"
         rows.append(row)
     return rows
 

@@ -688,8 +688,7 @@ class CalibratedAlarm:
         roles = self.roles(detector)
         onset, left_out, chosen = self.classifier(self.worlds, self.worlds.ids, num_workers)
         scorers: dict[str, Scorer] = {OURS: detector, **(baselines or {})}
-        hop, rate = onset.evidence.hop_samples, self.streams.sample_rate_hz
-        hops = dict.fromkeys(scorers, hop) | {OURS: self.hop_samples}
+        hops, rate = dict.fromkeys(scorers, self.hop_samples), self.streams.sample_rate_hz
         others = {one.material: left_out.get(one.material, onset) for one in roles["calibrate"]}
         score = partial(score_streams, self.streams, scorers=scorers, hops=hops)
         scored = {
