@@ -23,6 +23,7 @@ _PACKAGES = ("tactslip_torch", "benchmarks")
 _SHOW = {ROOT / "benchmarks" / name for name in ("harness.py", "tables.py", "sources.py")}
 _BESIDE = (".cpp", ".h", ".json")
 _TARGET = re.compile(r"^\s*_target_:\s*(\S+)", re.MULTILINE)
+_COMMENT = re.compile(r"(?:^|(?<=\s))#.*", re.MULTILINE)
 _SECTION = re.compile(r"`python -m benchmarks\.(\w+)[^`]*`[^\n]*?\bcode ([0-9a-f]{16})[^\n]*")
 STALE = "*The code has changed since this was measured: numbers of the present code may differ.*"
 """Stands below the line that names command and code of such a section."""
@@ -129,8 +130,13 @@ def _file(module: str) -> Path | None:
 
 @cache
 def _content(path: Path) -> bytes:
-    """A file's bytes; of Python what it says, whatever its comments, docstrings and layout."""
-    return "".join(_said(_tree(path))).encode() if path.suffix == ".py" else path.read_bytes()
+    """A file's bytes; of Python and YAML without comments, docstrings and layout."""
+    if path.suffix == ".py":
+        return "".join(_said(_tree(path))).encode()
+    if path.suffix == ".yaml":
+        lines = _COMMENT.sub("", path.read_text(encoding="utf-8")).splitlines()
+        return "\n".join(text for line in lines if (text := line.rstrip())).encode()
+    return path.read_bytes()
 
 
 def _said(node: object) -> Iterable[str]:
