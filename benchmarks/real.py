@@ -6,6 +6,7 @@ that is fitted or chosen is so on the others. Writes docs/real_data.md.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -29,7 +30,7 @@ from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from benchmarks.deployment import host
-from benchmarks.harness import ROOT, Benchmark, Job, put_between, say
+from benchmarks.harness import ROOT, Benchmark, Job, put_between, resumed, say
 from benchmarks.peers import others
 from benchmarks.real_sets import RealSet, read_set
 from benchmarks.tables import Report, Table, mean_sd, times
@@ -98,10 +99,13 @@ class Real(Benchmark):
         paths = sorted(path for folder in folders for path in folder.glob("*.npz"))
         if not paths:
             raise ValueError("give a folder of sets: python -m benchmarks.real FOLDER")
+        found = {}
         with on_threads(1):
-            return {
-                "sets": {path.stem: _measured(read_set(path), path.stem, self) for path in paths}
-            }
+            for path in paths:
+                made_by = [hashlib.sha256(path.read_bytes()).hexdigest(), repr(self)]
+                make = partial(_measured, read_set(path), path.stem, self)
+                found[path.stem] = resumed(job.folder / f"{path.stem}.json", made_by, make)
+        return {"sets": found}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """All tables, by the heading that they stand under."""
