@@ -69,6 +69,7 @@ for (const page of pages(site).sort()) {
   for (const [look, [scheme, width]] of Object.entries(LOOKS)) {
     const fault = (text) => faults.push(`${page || "."} (${look}): ${text}`);
     heard.length = 0;
+    await call("Storage.clearDataForOrigin", { origin: home.slice(0, -1), storageTypes: "all" }); // the kept look
     await call("Emulation.setEmulatedMedia", { features: [{ name: "prefers-color-scheme", value: scheme }] });
     await call("Emulation.setDeviceMetricsOverride", { width, height: 900, deviceScaleFactor: 1, mobile: width < 500 });
     await call("Page.navigate", { url: home + (page && `${page}/`) });

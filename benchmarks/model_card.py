@@ -44,7 +44,7 @@ class ModelCard(Benchmark):
         detector = SlipDetector.pretrained(name)
         info, pool = detector.info, detector.pool
         length = detector.context_before + pool.bin_samples + detector.context_after
-        one = torch.randn(1, pool.hand.num_channels, length, dtype=torch.float64)
+        one = torch.randn(1, len(pool.hand.channels), length, dtype=torch.float64)
         timing = interleaved({name: lambda: detector.score_raw(one)}, self.rounds)[name]
         with TemporaryDirectory(prefix="tactslip-bench-") as folder:
             graphs = export_detector(detector, Path(folder), ("bin", "stream"), "float32")
@@ -60,7 +60,7 @@ class ModelCard(Benchmark):
                 "trained on": f"{'simulated' if info['simulated'] else 'real'}: "
                 + ", ".join(info.get("trained_on", info["train_materials"])),
                 "bins of training": f"{info['num_bins']:,}",
-                "channels": f"{pool.hand.num_channels}, {fast} of them fast",
+                "channels": f"{len(pool.hand.channels)}, {fast} of them fast",
                 "sample rate": f"{pool.sample_rate_hz:g} Hz",
                 "bin; look-ahead": f"{1e3 * pool.bin_samples / pool.sample_rate_hz:.0f} ms; "
                 f"{1e3 * detector.look_ahead / pool.sample_rate_hz:.1f} ms",

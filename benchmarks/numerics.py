@@ -75,7 +75,7 @@ class Numerics(Benchmark):
             }
         return {"tables": tables}
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def _backends(self, path: Path) -> Table:
         exact = loaded(path, backend="torch")
         ways = {

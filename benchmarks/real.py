@@ -29,8 +29,9 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
+from benchmarks import ROOT
 from benchmarks.deployment import host
-from benchmarks.harness import ROOT, Benchmark, Job, put_between, resumed, say
+from benchmarks.harness import Benchmark, Job, put_between, resumed, say
 from benchmarks.peers import others
 from benchmarks.real_sets import RealSet, read_set
 from benchmarks.tables import Report, Table, mean_sd, times

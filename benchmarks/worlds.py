@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any, ClassVar
 
-from benchmarks.harness import RESULTS, Benchmark, Job
+from benchmarks import RESULTS
+from benchmarks.harness import Benchmark, Job
 from benchmarks.sources import is_current
 from benchmarks.tables import Table
 

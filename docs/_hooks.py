@@ -107,7 +107,7 @@ def _keys(path: Path) -> tuple[str, list[str]]:
             continue
         indent, name, value, comment = len(found[1]), *found.groups()[1:]
         above = [(place, key) for place, key in above if place < indent] + [(indent, name)]
-        key = ".".join(key for _, key in above)
+        key = ".".join(key for _, key in above).removeprefix("defaults.")
         if key.startswith("hydra") or name in ("_target_", "_partial_") or not (value or comment):
             continue
         shown = f"`{value}`" if value else ""
