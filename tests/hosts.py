@@ -9,6 +9,7 @@ import json
 import shutil
 import subprocess
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,15 +18,15 @@ import numpy as np
 import pytest
 import torch
 from contract.names import STREAM_OUTPUTS
+from small_detector import alarms_of
 from streams import onset_of
 from test_detector import random_detector
 
 from tactslip_torch import Scene, SlipDetector, simulate
 from tactslip_torch.deploy import export
 from tactslip_torch.features.sensing import Sensing
-from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import KEY, AlarmSettings, score_stream
-from tactslip_torch.onset.rules import NOTHING_YET, Cusum
+from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.onset.streaming import StreamingDetector
 
 EXPORT = Path(__file__).parents[1] / "export"
@@ -61,18 +62,8 @@ def alarming_detector(with_onset: bool = False) -> SlipDetector:
     scores, *_, spans = score_stream(detector, samples, HOP)
     known = detector.sensing
     detector.sensing = Sensing.fit(spans, known.min_alive, known.stuck_samples)
-    rise = 2.0 / float(scores.std())
-    settings = AlarmSettings(
-        HOP,
-        Platt(rise, -rise * float(scores.mean())),
-        Cusum(0.5, 0.4, 8.0),
-        threshold=2.0,
-        target_per_hour=1.0,
-        rearm_s=0.03,
-        refractory_s=0.1,
-        lead_s=0.02,
-        onset=onset_of(samples, detector.pool.hand, 3, 0.8) if with_onset else None,
-    )
+    onset = onset_of(samples, detector.pool.hand, 3, 0.8) if with_onset else None
+    settings = replace(alarms_of(scores, HOP), lead_s=0.02, onset=onset)
     detector.info[KEY] = settings.to_dict()
     return detector
 
@@ -200,7 +191,8 @@ def truth(
         settings = settings.at_threshold(threshold)
     decisions = StreamingDetector(detector, settings, dtype=torch.float64).push(samples)
     fields = STREAM_OUTPUTS | {"in_range": "in_range", "onset_score": "onset_score"}
-    of_onset = ["onset_score"] if settings.onset else []
+    fields |= {"hint": "is_hint"}
+    of_onset = ["onset_score", "hint"] if settings.onset else []
     kinds = {alarm.alarm_s: alarm.raised_by for alarm in decisions.alarms}
     rows = []
     for i, lost in enumerate(map(decisions.names_lost, range(len(decisions.number)))):

@@ -73,9 +73,15 @@ def alarming_detector(seed: int = 0) -> SlipDetector:
     """The small detector, with settings by which the simulated slip raises alarms."""
     made = small_detector(seed, backend="auto")
     scores = score_stream(made, slip_samples(HAND), 20).score
+    made.info[KEY] = alarms_of(scores, 20).to_dict()
+    return made
+
+
+def alarms_of(scores: torch.Tensor, hop_samples: int) -> AlarmSettings:
+    """By which the highest of these scores raise alarms."""
     rise = 2.0 / float(scores.std())
-    settings = AlarmSettings(
-        20,
+    return AlarmSettings(
+        hop_samples,
         Platt(rise, -rise * float(scores.mean())),
         Cusum(0.5, 0.4, 8.0),
         threshold=2.0,
@@ -83,5 +89,3 @@ def alarming_detector(seed: int = 0) -> SlipDetector:
         rearm_s=0.03,
         refractory_s=0.1,
     )
-    made.info[KEY] = settings.to_dict()
-    return made

@@ -272,6 +272,7 @@ def test_evaluated_streams_set_nothing():
     assert of_calibrating["onset"]["threshold"] != none["onset"]["threshold"]
     assert of_calibrating["onset"]["head"] == none["onset"]["head"]
     assert of_learning["onset"]["head"] != none["onset"]["head"]
+    assert of_calibrating["levels"] != none["levels"] == of_learning["levels"]
 
 
 def test_slips_are_found_in_time_and_all_is_told_in_plain_json(calibrated, tmp_path):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from test_real_sets import write_osu
 
 from benchmarks.harness import Benchmark, between_markers
 from benchmarks.paper_tables import RIDGE, forward_order
@@ -45,6 +46,8 @@ def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path, monkeypa
     arguments = ["--quick", "--out", str(tmp_path)]
     if name == "real":
         arguments.append(str(_real_sets(tmp_path / "sets")))
+    if name == "real_onsets":
+        arguments.append(str(_trials(tmp_path / "trials")))
     subject = _subject(name)()
     assert subject.run(arguments) == 0
     assert json.loads((tmp_path / f"{name}.json").read_text())["quick"]
@@ -112,6 +115,17 @@ def test_only_what_stands_between_the_markers_is_replaced() -> None:
     assert between_markers(text, "a", "new") == text.replace("old", "new")
     with pytest.raises(ValueError, match="not both there"):
         between_markers(text, "b", "new")
+
+
+def _trials(folder: Path) -> Path:
+    """Six trials of three objects that shake while they slip, for two of twelve seconds."""
+    generator = np.random.default_rng(5)
+    folder.mkdir()
+    is_slip = (np.arange(300) >= 200) & (np.arange(300) < 250)
+    for number, name in enumerate(["bottle", "brush", "pen"] * 2):
+        rows = generator.standard_normal((300, 12)) * (1 + 20 * is_slip[:, None])
+        write_osu(folder / f"{name}_C_1_{number}.csv", rows, is_slip.astype(int))
+    return folder
 
 
 def _real_sets(folder: Path) -> Path:

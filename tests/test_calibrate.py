@@ -29,7 +29,6 @@ from tactslip_torch.training.refit import BINS, KeptBins
 TIMING = Timing(1000.0, 500, 1000, 0)
 """A decision every half second, on the second before."""
 SETTINGS = AlarmSettings(500, Platt(1.0, 0.0), KOfN(1, 1), 0.0, None, rearm_s=1.0, refractory_s=1.0)
-STRETCH_H = 0.1
 
 
 def calibrator(settings=SETTINGS, per_hour=None, **changes):

@@ -23,6 +23,7 @@ from tactslip_torch.deploy.bins import RawBin, Timing, bin_graph
 from tactslip_torch.deploy.check import _session_of, check_model, compare, runner
 from tactslip_torch.deploy.stream import stream_graph
 from tactslip_torch.deploy.value import F32, F64, Graph
+from tactslip_torch.features.sensing import Sensing
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import KEY, AlarmSettings, score_stream
@@ -257,6 +258,7 @@ def watching(
     threshold=1.0,
     onset=None,
     floors=False,
+    levels=False,
 ):
     """A detector, and settings by which about half of its decisions speak for slip."""
     detector = detector_of("all" if kind == "long" else kind, align)
@@ -270,6 +272,9 @@ def watching(
     times = {"rearm_s": 0.02, "refractory_s": 0.05, "lead_s": 0.03}
     more = {"target_per_hour": 1.0, "slip_share": 0.3, "onset": onset, "hold_s": 0.05, **times}
     settings = AlarmSettings(hop, calibration, RULES[rule], threshold, **more)
+    if levels:
+        spans = 4.0 * score_stream(detector, signal(900, 99), 20).span
+        settings = replace(settings, levels=Sensing.fit(spans, 1, 1))
     return detector, settings, spread
 
 
@@ -341,16 +346,17 @@ def with_losses(samples, losses):
     rule=st.sampled_from(list(RULES)),
     hop=st.sampled_from([7, 20, 120]),
     floors=st.booleans(),
+    levels=st.booleans(),
     onset=st.sampled_from([None, ONSET]),
     precision=st.sampled_from(list(STREAM_CLOSE)),
     losses=st.lists(LOSSES, max_size=4),
 )
 def test_any_cut_gives_what_the_detector_gives(
-    num_samples, cuts, kind, align, rule, hop, floors, onset, precision, losses
+    num_samples, cuts, kind, align, rule, hop, floors, levels, onset, precision, losses
 ):
     samples = with_losses(signal(4000, 6), losses)[:, :num_samples]
     options = {"kind": kind, "align": align, "rule": rule, "hop": hop, "onset": onset}
-    assert_same_stream(samples, cuts, precision, floors=floors, **options)
+    assert_same_stream(samples, cuts, precision, floors=floors, levels=levels, **options)
 
 
 @pytest.mark.parametrize("onset", [None, ONSET])

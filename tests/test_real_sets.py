@@ -13,6 +13,7 @@ from benchmarks.real import (
     recording_confusions,
     word,
 )
+from benchmarks.real_onsets import Trials
 from benchmarks.real_sets import RealSet, biotacsp, biotacsp_direction, main, osu, read_set
 
 
@@ -40,23 +41,43 @@ def test_a_biotac_recording_is_tared_on_half_a_second_and_cut_every_half_window(
     np.testing.assert_array_equal(directions.X, found.X)
 
 
-def test_a_row_without_a_label_and_a_window_with_a_gap_are_left_out(tmp_path):
+def write_osu(path, values, labels, step_s=0.04):
+    """A file of a trial; a value of None is a gap, a label of None is a frame without tracking."""
     names = "time,lx,rx,ly,ry,lz,rz,lgx,rgx,lgy,rgy,lgz,rgz,slip_over_cm_s"
-    values = np.tile(np.arange(45.0)[:, None], 12)
-    labels = ["0"] * 45
-    labels[19], labels[24], labels[29], labels[34] = "1", "", "0.75", "1"
-    rows = [",".join([str(i), *map(str, v), labels[i]]) for i, v in enumerate(values)]
-    rows[15] = rows[15].replace(",15.0", ",", 1)  # windows up to row 34 hold it
-    (tmp_path / "soup_can_C_3_1.csv").write_text("\n".join([names, *rows]))
+    rows = [
+        ",".join("" if x is None else str(x) for x in (i * step_s, *row, label))
+        for i, (row, label) in enumerate(zip(values, labels, strict=True))
+    ]
+    path.write_text("\n".join([names, *rows]))
+
+
+def test_a_row_without_a_label_and_a_window_with_a_gap_are_left_out(tmp_path):
+    values = [[float(i)] * 12 for i in range(45)]
+    labels = [0] * 45
+    labels[19], labels[24], labels[29], labels[34] = 1, None, 0.75, 1
+    values[15][0] = None  # windows up to row 34 hold it
+    write_osu(tmp_path / "soup_can_C_3_1.csv", values, labels)
     found = osu(tmp_path)
     assert found.X[:, 0, -1].tolist() == [39 - 7.0, 44 - 7.0]
     assert found.y.tolist() == [False, False]
     assert set(found.group) == {"soup_can"}
     assert found.layout.channels[6].kind == "gyro"
     assert found.layout.channels[7].finger == "right"
-    rows[15] = rows[15].replace("15,,", "15,15.0,")
-    (tmp_path / "soup_can_C_3_1.csv").write_text("\n".join([names, *rows]))
+    values[15][0] = 15.0
+    write_osu(tmp_path / "soup_can_C_3_1.csv", values, labels)
     assert osu(tmp_path).y.tolist() == [True, False, True, False, False]
+
+
+def test_frames_of_slip_near_each_other_are_one_slip_and_what_is_not_tracked_is_cut(tmp_path):
+    labels = np.repeat([0, 0, 1, 1, 0.75, 1, 0, 0, 0, 1, 0, None], 5).tolist()  # frames of .2 s
+    write_osu(tmp_path / "soup_can_C_3_1.csv", [[i / 2] * 12 for i in range(60)], labels)
+    trials = Trials(tmp_path)
+    (name,) = trials.ids
+    times = trials.timeline(name)
+    assert name.material == "soup_can"
+    np.testing.assert_allclose(times.sliding_s, [(0.4, 1.2), (1.8, 2.0)], atol=1e-9)
+    assert times.duration_s == pytest.approx(2.2, abs=0.05)
+    np.testing.assert_allclose(trials.load(name).samples[3, :3], [0.0, 0.5, 1.0], atol=1e-9)
 
 
 @pytest.fixture

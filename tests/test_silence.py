@@ -17,13 +17,14 @@ from tactslip_torch import (
     sample_recording,
 )
 from tactslip_torch.features.sensing import (
+    Sensing,
     StuckChannels,
     least_alive,
     longest_runs,
     most_stuck_samples,
 )
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.onset.decisions import AlarmSettings, joined_decisions
+from tactslip_torch.onset.decisions import AlarmSettings, joined_decisions, score_stream
 from tactslip_torch.onset.evidence import OnsetStream
 from tactslip_torch.onset.rules import Cusum, KOfN
 
@@ -179,6 +180,23 @@ def test_half_of_the_fast_channels_and_a_third_of_the_gain_are_valid(detector, v
         assert (made.channels_lost.sum(-1) == num_lost).all()
     half[:, 19] = 0.0  # four of ten are left
     assert not decided(detector, rules["debounced"], half)[0].is_valid.any()
+
+
+def test_gains_that_set_the_threshold_are_in_range_and_others_are_not(detector, volts, rules):
+    quiet = volts[:2000]
+    spans = score_stream(detector, quiet.T, 50).span
+    levels = Sensing.fit(torch.cat([300 * spans, 3000 * spans]), 1, 1)
+    for rule in ("debounced", "onset"):
+        of_training, settings = rules[rule], replace(rules[rule], levels=levels)
+        for gain, by_training, by_levels in ((1, True, False), (1000, False, True)):
+            for own, is_in in ((of_training, by_training), (settings, by_levels)):
+                made = decided(detector, own, gain * quiet)[0]
+                known = made.in_range[made.available_s > 0.3]
+                assert known.any() == known.all() == is_in, (rule, gain)
+    again = AlarmSettings.from_dict(
+        settings.to_dict(), detector.pool.hand, detector.pool.sample_rate_hz
+    )
+    assert again.levels == levels
 
 
 def test_one_dead_channel_leaves_a_decision_valid_and_is_named(detector, volts, rules):

@@ -147,7 +147,10 @@ static void print_decision(const struct slip_decision *decision, const struct sl
         print_flag(", ", "on", decision->on);
     }
     if (facts->has_onset) {
-        if (is_whole) print_number(", ", "onset_score", decision->onset_score, false);
+        if (is_whole) {
+            print_number(", ", "onset_score", decision->onset_score, false);
+            print_flag(", ", "hint", decision->hint);
+        }
         const char *by = decision->by_onset ? "\"onset\"" : "\"status\"";
         printf(", \"raised_by\": %s", decision->alarm ? by : "null");
     }

@@ -17,10 +17,11 @@ static const char *const INPUTS[NUM_INPUTS] = {"samples", "tail", "state", "thre
 
 enum { NEXT_TAIL, NEXT_STATE, FIRST_COLUMN };
 enum { SCORE, PROBABILITY, STATISTIC, TIME, ONSET, VALID, IN_RANGE, ALARM, ON, LOST };
-enum { ONSET_SCORE = LOST + 1, BY_ONSET, NUM_COLUMNS, NUM_BIN_COLUMNS = ONSET_SCORE };
+enum { ONSET_SCORE = LOST + 1, BY_ONSET, HINT, NUM_COLUMNS, NUM_BIN_COLUMNS = ONSET_SCORE };
 static const char *const OUTPUTS[FIRST_COLUMN + NUM_COLUMNS] = {
     "next_tail", "next_state", "score", "probability", "statistic",     "time_s",      "onset_s",
-    "valid",     "in_range",   "alarm", "on",          "channels_lost", "onset_score", "by_onset"};
+    "valid",     "in_range",   "alarm", "on",          "channels_lost", "onset_score", "by_onset",
+    "hint"};
 static const double NO_EVIDENCE = -1e30; /* onset score of the graph */
 
 enum { NOTHING, ONE, OTHER, NUM_HELD }; /* what is remembered: nothing yet, or one of two copies */
@@ -248,6 +249,7 @@ static int run(struct slip *slip, size_t n, struct slip_decision *out) {
             .on = *flags(slip, ON, i),
             .onset_score = onset_score(slip, i),
             .by_onset = *flags(slip, BY_ONSET, i),
+            .hint = *flags(slip, HINT, i),
         };
     }
     return (int)k;

@@ -35,6 +35,7 @@ struct slip_decision {
     bool on;                   /* stands after it */
     double onset_score; /* of fast evidence; NaN: none, or no onset classifier */
     bool by_onset;      /* it reaches its threshold: then it raised the alarm, else the statistic */
+    bool hint;          /* it reaches a lower one: a controller may tighten a little */
 };
 
 /* Opens an exported stream graph with its sidecar beside it.

@@ -122,8 +122,8 @@ export class StreamGraph {
    *   of the alarm, `valid` (enough channels are alive; else these three are NaN, and there is no
    *   alarm), `in_range` (the living ones move about as much as in training), `channels_lost` (names
    *   of those that are silent or missing), `alarm`, `on` (an alarm stands); with an onset
-   *   classifier `onset_score`, NaN without evidence, and `raised_by`, "onset" or "status", null
-   *   without alarm
+   *   classifier `onset_score`, NaN without evidence, `hint` (the score reaches a threshold below
+   *   that of alarms) and `raised_by`, "onset" or "status", null without alarm
    * @throws {Error} if samples are no volts or no whole rows; nothing is changed then
    */
   push(samples) {
@@ -204,6 +204,7 @@ function onsetPart(made, i) {
   const score = made.onset_score.data[i];
   return {
     onset_score: score > NO_EVIDENCE ? score : NaN,
+    hint: made.hint.data[i] !== 0,
     raised_by: made.alarm.data[i] ? by : null,
   };
 }

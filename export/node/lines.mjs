@@ -8,7 +8,7 @@ const DIGITS = { float32: 9, float64: 17 }; // read back as the same number
  *
  * @param {object} decision as `StreamGraph.push` gives it
  * @param {string} precision of the model
- * @param {boolean} isWhole with statistic, alarm and on
+ * @param {boolean} isWhole with statistic, alarm and on, and of a classifier its score and hint
  */
 export function decisionLine(decision, precision, isWhole) {
   const shown = (value) => (value > NONE ? Number(value.toPrecision(DIGITS[precision])) : null);
@@ -23,8 +23,8 @@ export function decisionLine(decision, precision, isWhole) {
     in_range,
     channels_lost,
   };
-  const { onset_score, raised_by } = decision; // undefined, and left out, without a classifier
-  const whole = isWhole && { statistic: shown(statistic), alarm, on, onset_score };
+  const { onset_score, hint, raised_by } = decision; // undefined, left out, without a classifier
+  const whole = isWhole && { statistic: shown(statistic), alarm, on, onset_score, hint };
   return JSON.stringify({ ...line, ...whole, raised_by });
 }
 

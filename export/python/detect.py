@@ -13,7 +13,7 @@ from command import json_line, run, say
 from files import load_recording
 from stream import Stream
 
-OF_EVERY = ("statistic", "alarm", "on", "onset_score")  # not printed of alarms alone
+OF_EVERY = ("statistic", "alarm", "on", "onset_score", "hint")  # not printed of alarms alone
 
 
 def main(options):

@@ -8,7 +8,7 @@ from files import load_model
 
 KEYS = ("time_s", "onset_s", "score", "probability", "valid", "in_range", "channels_lost")
 KEYS += ("statistic", "alarm", "on")
-ONSET_KEYS = ("onset_score", "by_onset")  # of a model with an onset classifier
+ONSET_KEYS = ("onset_score", "hint", "by_onset")  # of a model with an onset classifier
 NO_EVIDENCE = -1e30  # onset score of the graph
 
 
@@ -42,7 +42,7 @@ class Stream:
 
         With an onset classifier an alarm's ``raised_by`` is ``"onset"``, its score, or
         ``"status"``, the statistic of bins; of other decisions it is None. Without evidence
-        ``onset_score`` is NaN.
+        ``onset_score`` is NaN. ``hint`` says whether it reaches a threshold below that of alarms.
 
         Memory grows with the decisions of a push, so push some 2000 samples at most.
         """

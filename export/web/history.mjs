@@ -58,7 +58,7 @@ export class History {
     const names = ["time_s", "onset_s", "score", "probability", "statistic"];
     if (this.hasOnset) names.push("onset_score");
     this.columns = Object.fromEntries(names.map((name) => [name, new Float64Array(capacity)]));
-    this.flags = new Uint8Array(capacity); // 1 valid, 2 alarm, 4 on, 8 raised by onset, 16 in range
+    this.flags = new Uint8Array(capacity); // 1 valid, 2 alarm, 4 on, 8 by onset, 16 in range, 32 hint
     this.channels = facts.channels;
     this.lost = new Uint8Array(capacity * facts.channels.length);
   }
@@ -71,6 +71,7 @@ export class History {
       for (const name in this.columns) this.columns[name][place] = decision[name] ?? NaN;
       this.flags[place] = decision.valid + 2 * decision.alarm + 4 * decision.on;
       this.flags[place] += 8 * (decision.raised_by === "onset") + 16 * decision.in_range;
+      this.flags[place] += 32 * (decision.hint ?? false);
       const names = decision.channels_lost;
       const width = this.channels.length;
       this.channels.forEach((name, c) => (this.lost[place * width + c] = names.includes(name)));
@@ -127,7 +128,7 @@ export class History {
     for (const name in this.columns) decision[name] = this.get(name, i);
     if (!this.hasOnset) return decision;
     const by = this.#has(i, 8) ? "onset" : "status";
-    return { ...decision, raised_by: decision.alarm ? by : null };
+    return { ...decision, hint: this.#has(i, 32), raised_by: decision.alarm ? by : null };
   }
 
   #has(i, flag) {

@@ -20,6 +20,7 @@ from tactslip_torch.features.pooling import over_channels
 from tactslip_torch.features.sensing import (
     FEWEST_SAMPLES,
     LARGEST_SAMPLE,
+    Sensing,
     is_enough,
 )
 from tactslip_torch.model.calibration import probability
@@ -212,12 +213,13 @@ def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph
     return graph
 
 
-def score_bins(windows: Value, detector: SlipDetector) -> Scored:
+def score_bins(windows: Value, detector: SlipDetector, sensing: Sensing | None = None) -> Scored:
     """Score raw bins.
 
     Args:
         windows: raw samples in volts of the channels in use, in the dtype that scores shall have.
         detector: that scores them.
+        sensing: by whose spans they are in range; default: the detector's.
 
     Shape:
         - windows: ``[B, channels in use, RawBin.length]``, at least one bin
@@ -226,7 +228,7 @@ def score_bins(windows: Value, detector: SlipDetector) -> Scored:
     channels, graph = RawBin.of(detector).channels, windows.graph
     score = _scored(features, ~alive, detector, windows.dtype)
     counted = detector.counted[list(channels)]
-    valid, in_range = is_enough(alive, span, counted, detector.sensing, channels)
+    valid, in_range = is_enough(alive, span, counted, sensing or detector.sensing, channels)
     valid = valid & score.isfinite()
     of_hand = np.equal.outer(np.array(channels), np.arange(len(detector.pool.hand)))
     lost = (~alive).cast(F32) @ of_hand.astype(np.float32) > 0.0

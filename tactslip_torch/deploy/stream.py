@@ -131,7 +131,7 @@ def stream_graph(
         places = _count_up((decided - made).cast(I64))
         number = places.cast(F64) + made
         windows = _windows(held, seen, made * float(timing.hop), places, detector, timing)
-        scored = score_bins(windows.cast(dtype), detector)
+        scored = score_bins(windows.cast(dtype), detector, settings.sensing(detector.sensing))
         known: Any = graph.where(scored.is_valid, scored.score, 0.0)
         llr: Any = settings.calibration.llr(known)
         return number, scored, llr.clamp(-LARGEST, LARGEST)

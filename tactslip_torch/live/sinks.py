@@ -183,7 +183,7 @@ def decision_columns(decisions: Decisions, *, has_onset: bool) -> dict[str, list
     Args:
         decisions: of one stream, ``[m]``.
         has_onset: whether the detector has an onset classifier: only then are there
-            ``onset_score`` and ``raised_by``.
+            ``onset_score``, ``hint`` and ``raised_by``.
 
     Returns:
         ``time_s``, ``onset_s``, ``score``, ``probability``, ``valid``, ``in_range``,
@@ -199,6 +199,7 @@ def decision_columns(decisions: Decisions, *, has_onset: bool) -> dict[str, list
     }
     if has_onset:
         plain["onset_score"] = _known(decisions.onset_score.tolist())
+        plain["hint"] = decisions.is_hint.tolist()
         by = zip(plain["alarm"], decisions.by_onset.tolist(), strict=True)
         plain["raised_by"] = [("onset" if o else "status") if alarm else None for alarm, o in by]
     return plain

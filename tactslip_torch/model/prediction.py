@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.sensing import Sensing, is_enough
 from tactslip_torch.runtime import full_precision, is_concrete, thread_map
 
 ChannelMask = Sequence[str] | Tensor
@@ -34,6 +35,17 @@ class Prediction(NamedTuple):
     in_range: Tensor
     channels_lost: Tensor
     span: Tensor
+
+    def in_range_of(self, sensing: Sensing, counted: Tensor) -> Prediction:
+        """The same, in range or not by the spans of other recordings than those of training.
+
+        Shape:
+            - counted: ``[C]``, 1 for channels that count, else 0
+        """
+        _, in_range = is_enough(
+            ~self.channels_lost, self.span, counted, sensing, range(len(counted))
+        )
+        return self._replace(in_range=in_range & self.is_valid)
 
     def __repr__(self) -> str:
         num, slip = self.score.numel(), int((self.score >= 0).sum())

@@ -66,6 +66,8 @@ class AlarmSettings:
         metadata: on what the threshold was set, JSON-able: recordings, hours, achieved rate.
         onset: classifier of slipping now; with it alarms come from it alone, and decisions are
             its hop apart.
+        levels: spans of bins in the recordings that the threshold was set on, by which decisions
+            are in range or not; ``None``: by those of the detector's training.
 
     Raises:
         ValueError: if a time or the hop is negative, the share lies outside 0 to 1, or the
@@ -84,6 +86,7 @@ class AlarmSettings:
     hold_s: float = HOLD_S
     metadata: Mapping[str, Any] = field(default_factory=dict)
     onset: OnsetClassifier | None = None
+    levels: Sensing | None = None
 
     def __post_init__(self) -> None:
         check_number("hop_samples", self.hop_samples, whole=True)
@@ -117,6 +120,12 @@ class AlarmSettings:
         """The one that a user sets: of the onset classifier, if there is one; bins keep theirs."""
         return (self.onset or self).threshold
 
+    def sensing(self, of_training: Sensing) -> Sensing:
+        """With the spans by which decisions are in range or not."""
+        if (levels := self.levels) is None:
+            return of_training
+        return replace(of_training, rest_span=levels.rest_span, most_span=levels.most_span)
+
     def at_threshold(self, value: float) -> AlarmSettings:
         """The same with another ``alarm_threshold``."""
         if self.onset is None:
@@ -141,6 +150,7 @@ class AlarmSettings:
         plain["metadata"] = dict(self.metadata)
         plain["threshold"] = self.threshold if self.threshold < math.inf else None
         plain["onset"] = self.onset and self.onset.to_dict()
+        plain["levels"] = self.levels and self.levels.to_dict()
         return plain
 
     @classmethod
@@ -160,6 +170,8 @@ class AlarmSettings:
                 values["threshold"] = math.inf
             if (onset := values.get("onset")) is not None:
                 values["onset"] = OnsetClassifier.from_dict(onset, hand, sample_rate_hz)
+            if (levels := values.get("levels")) is not None:
+                values["levels"] = Sensing.from_dict(levels)
             return cls(**values)
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"no alarm settings of this version: {error}") from error
@@ -307,7 +319,8 @@ class Decisions(NamedTuple):
         probability: of slip, by the bin alone, NaN likewise, ``[m]``.
         statistic: of the rule, NaN likewise, ``[m]``.
         is_valid: whether the decision counts, ``[m]``; one that does not raises no alarm.
-        in_range: whether the channels move about as much as in training, ``[m]``.
+        in_range: whether the channels move about as much as in training, or as in the recordings
+            that the threshold was set on (``AlarmSettings.levels``), ``[m]``.
         channels_lost: channels in use that were left out, ``[m, C]``.
         is_alarm: whether it raises an alarm, ``[m]``.
         is_on: whether an alarm stands after it: the contact's status, ``[m]``.

@@ -107,6 +107,7 @@ class StreamingDetector:
         self._before = detector.context_before
         self._whole = self._before + pool.bin_samples + detector.context_after
         self._first = pool.bin_samples + detector.look_ahead
+        self._sensing = self.settings.sensing(detector.sensing)
         reaches = detector.channel_filter.reaches
         self._decider = Decider(
             self.settings,
@@ -327,6 +328,8 @@ class StreamingDetector:
             found = detector.predict_raw(
                 windows, given=self.dtype, masked_channels=self._masked_channels or None
             )
+            if self.settings.levels is not None:
+                found = found.in_range_of(self._sensing, detector.counted)
             decisions = self._decider.decide(*found[:-1])
             self._hand_events.take(found, decisions)
         self._number += count

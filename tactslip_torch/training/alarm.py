@@ -27,6 +27,7 @@ from torch import Tensor
 from tactslip_torch.data.labels import whole_samples
 from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
 from tactslip_torch.features.cache import cache_key
+from tactslip_torch.features.sensing import REST_QUANTILE, Sensing
 from tactslip_torch.model.calibration import (
     Platt,
     fit_platt,
@@ -94,6 +95,7 @@ _FULL_S = 2.0  # of stream, until memories are full
 _HELD_OF_HINTS = 0.05  # of the rate of hints, what recordings without slip may have
 _SETTLE_S = 0.05  # behind what a decision rests on, as EventRules.settle_s
 _LEVEL = 0.95  # of intervals
+_USUAL = torch.tensor([REST_QUANTILE, 1 - REST_QUANTILE], dtype=torch.float64)  # spans
 _OTHERS = "others"  # scenes without hours of their own
 
 
@@ -109,6 +111,7 @@ class Stream(NamedTuple):
         score: ``[N]``, float32, NaN where not valid.
         is_valid: which decisions count, ``[N]``.
         onset_score: of every hop of the onset classifier, ``[k]``; of others than the detector [0].
+        spans: smallest and largest usual span of a bin of each channel, ``[2, C]``; or ``[0, C]``.
     """
 
     recording: RecordingId
@@ -116,6 +119,7 @@ class Stream(NamedTuple):
     score: Tensor
     is_valid: Tensor
     onset_score: Tensor
+    spans: Tensor = torch.empty(0, 0)
 
 
 class Timing(NamedTuple):
@@ -185,7 +189,8 @@ def _scored(
         found = score_stream(scorer, samples, hops[name])
         is_ours = onset is not None and name == OURS
         hopwise = onset.score_recording(samples) if is_ours and onset else torch.empty(0).double()
-        entries = (found.score.float(), found.is_valid, hopwise)
+        spans = found.span.nanquantile(_USUAL, 0) if len(found.span) else found.span
+        entries = (found.score.float(), found.is_valid, hopwise, spans)
         streams[name] = [x.numpy() for x in entries]
     return streams
 
@@ -714,7 +719,10 @@ class CalibratedAlarm:
             "streams": amounts["calibrate"],
             "threshold_curve": curve,
         }
-        settings = replace(settings, metadata=metadata)
+        spans = torch.cat([stream.spans for stream in scored["calibrate"][OURS]])
+        known = detector.sensing
+        levels = Sensing.fit(spans, known.min_alive, known.stuck_samples)
+        settings = replace(settings, metadata=metadata, levels=levels)
         detector.info[KEY] = settings.to_dict()
         del scored["calibrate"]
         return {
