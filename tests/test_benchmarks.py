@@ -11,6 +11,7 @@ import torch
 from test_real_sets import write_osu
 
 from benchmarks.harness import Benchmark, between_markers
+from benchmarks.native_c import missing_tools
 from benchmarks.paper_tables import RIDGE, forward_order
 from benchmarks.real_sets import RealSet
 from benchmarks.tables import Table
@@ -43,6 +44,8 @@ def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path, monkeypa
     monkeypatch.chdir(ROOT)
     if name == "closed_loop":
         pytest.importorskip("mujoco")
+    if name == "native_c" and (missing := missing_tools()):
+        pytest.skip(f"not installed: {', '.join(missing)}; run .ci/boards")
     arguments = ["--quick", "--out", str(tmp_path)]
     if name == "real":
         arguments.append(str(_real_sets(tmp_path / "sets")))

@@ -139,7 +139,7 @@ def test_spectra_that_nothing_reads_are_no_part_of_the_plan(wanted, read, num):
     some = pool.select([names.index(name) for name in wanted])
     bins = noise(num, pool.hand)
     torch.testing.assert_close(some(bins), made(some, backend="torch")(bins))
-    plan = some.engine(torch.float64)._plan
+    plan = some.engine(torch.float64).plan
     lines = (native._Matrix * plan.num_branches).from_address(plan.lines)
     kept = {f"{'AD'[b % 2]}{b // 2 + 1}" for b, matrix in enumerate(lines) if matrix.values}
     assert kept == set(read.split())

@@ -1,18 +1,22 @@
-"""Write a detector as ONNX: ``tactslip export model=detector.pt``."""
+"""Write a detector as ONNX, or for the C library: ``tactslip export model=detector.pt``."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.deploy.export import export_detector, summary, wanted_graphs
+from tactslip_torch.deploy.native import NativeFile
 from tactslip_torch.model.detector import SlipDetector
 
 
 def export(config: DictConfig, results: Path) -> None:
     """Write the graphs of ``config.model``, each with its sidecar, and print a line on each.
+
+    ``graph=native`` writes the file of the C library in their place.
 
     They go where ``output`` or ``hydra.run.dir`` says, else beside the detector.
     """
@@ -22,6 +26,11 @@ def export(config: DictConfig, results: Path) -> None:
     folder = Path(config.output or (source.parent if is_here else results))
     if folder.suffix == ".onnx" or folder.is_file():
         raise ValueError(f"output must be a folder, got {folder}; the files have their names")
+    if config.graph == "native":
+        given: Any = OmegaConf.to_container(config.native)
+        for path in NativeFile.export(detector, folder, config.precision, **given):
+            print(f"{path}: {path.stat().st_size / 1000:.0f} kB, {config.precision}")
+        return
     graphs = wanted_graphs(config.graph, detector)
     for path in export_detector(detector, folder, graphs, config.precision, source=source):
         print(summary(path))

@@ -6,9 +6,10 @@ import shutil
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-_SHARED = {"web": ("web", "node")}
-"""Hosts of several folders: the page shares the reader and the stream of ``node``."""
-_LEFT_OUT = shutil.ignore_patterns("node_modules", "__pycache__", "*.o")
+_SHARED = {"web": ("web", "node"), "native": ("native", "c")}
+"""Hosts of several folders: the page shares the reader and the stream of ``node``, the C library
+the command line of ``c``."""
+_LEFT_OUT = shutil.ignore_patterns("node_modules", "__pycache__", "build", "*.o")
 
 
 def packaged_folder(name: str, hint: str) -> Path:
@@ -44,4 +45,10 @@ def copy_host(name: str, folder: Path) -> Path:
             raise FileExistsError(f"{folder / part} is there already; give another folder")
     for part in parts:
         shutil.copytree(hosts_dir() / part, folder / part, ignore=_LEFT_OUT)
+    if name == "native":
+        sources = folder / name / "src"
+        sources.mkdir()
+        for path in (_PACKAGE / "native").iterdir():
+            if path.suffix in (".cpp", ".h"):
+                shutil.copy(path, sources)
     return folder / name

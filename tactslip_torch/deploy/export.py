@@ -141,5 +141,5 @@ def wanted_graphs(graph: str | None, detector: SlipDetector) -> tuple[GraphKind,
         None: ("bin", "stream") if KEY in detector.info else ("bin",),
     }
     if graph not in choices:
-        raise ValueError(f"graph must be bin, stream or both, got {graph!r}")
+        raise ValueError(f"graph must be bin, stream, both or native, got {graph!r}")
     return choices[graph]

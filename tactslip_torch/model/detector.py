@@ -5,6 +5,7 @@ A file is a plain table of tensors and JSON text; loading it executes nothing.
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -36,7 +37,14 @@ from tactslip_torch.model.prediction import (
     without,
 )
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.native import BackendName, Channels, Filters, Machine, backend_of
+from tactslip_torch.native import (
+    BackendName,
+    Channels,
+    Filters,
+    Machine,
+    backend_of,
+    reason_unavailable,
+)
 from tactslip_torch.package_files import DETECTOR as FORMAT
 from tactslip_torch.package_files import load_table, reading, save_table
 from tactslip_torch.runtime import (
@@ -419,6 +427,20 @@ class SlipDetector(nn.Module):
                 engine = self._engine = _Engine(self, modules, tensors)
         return engine
 
+    def engine_tables(self) -> tuple[ctypes.Structure, ctypes.Structure]:
+        """What the native engine reads of features and of all behind them, in float64.
+
+        They are valid as long as the detector is there and no part of it changes.
+
+        Raises:
+            ValueError: if there is no native engine, or none for the parts of this detector.
+        """
+        engine = self._engine_of(torch.empty(0, dtype=torch.float64))
+        if engine is None or not engine.machines[np.float64].has_head:
+            reason = reason_unavailable() or "a part of it is none that the engine knows"
+            raise ValueError(f"no tables of the native engine for this detector: {reason}")
+        return engine.features[torch.float64].plan, engine.machines[np.float64].of
+
     def __getstate__(self) -> dict[str, Any]:
         """Without the engine, which holds addresses."""
         return self.__dict__ | {"_engine": None}
@@ -609,9 +631,9 @@ class _Engine:
         self._unused = ~detector._is_used.numpy()
 
         # by dtypes of bins, of the engine, and of samples that bins were filtered from
-        self._engines = {dtype: detector.extractor.engine(dtype) for dtype in _DTYPES}
-        numbers = {engine.dtype for engine in self._engines.values()}
-        self._machines = {number: make(**more, dtype=number) for number in numbers}
+        self.features = {dtype: detector.extractor.engine(dtype) for dtype in _DTYPES}
+        numbers = {engine.dtype for engine in self.features.values()}
+        self.machines = {number: make(**more, dtype=number) for number in numbers}
         self._filters = {number: Filters(kernels, starts, number) for number in numbers}
         self._channels = {
             (number, dtype, is_raw): Channels(
@@ -632,11 +654,11 @@ class _Engine:
         flat = x.detach().numpy().reshape(-1, *x.shape[-2:])
         if flat.strides[-1] != flat.itemsize:
             flat = np.ascontiguousarray(flat)
-        engine = self._engines[x.dtype]
+        engine = self.features[x.dtype]
         number = engine.dtype
         filters = self._filters[number] if is_raw else None
         channels = self._channels[number, given, is_raw]
-        found = engine.score(self._machines[number], flat, filters, _DTYPES[given], channels)
+        found = engine.score(self.machines[number], flat, filters, _DTYPES[given], channels)
         is_valid, score = found.is_valid, found.score
         if score is None:
             made = self._of.head(torch.from_numpy(found.scaled).to(self._of.imputation))

@@ -275,7 +275,7 @@ class FeatureEngine(_Kept):
         ]
         self.num_channels, self.num_features = num_channels, len(wanted)
         self._none = Filters([np.ones(1)] * num_channels, [0] * num_channels, dtype)
-        self._plan = _Plan(
+        self.plan = _Plan(
             num_channels,
             spectrum.shape[1],
             len(frequency_hz),
@@ -310,7 +310,7 @@ class FeatureEngine(_Kept):
         is_odd = np.zeros(len(bins), np.bool_)
         _check_floats(out)
         to = (out.ctypes.data, out.dtype == np.float32, is_odd.ctypes.data)
-        self._run(self._plan, None, _Bins(*_samples_of(bins), self._none.address, *to))
+        self._run(self.plan, None, _Bins(*_samples_of(bins), self._none.address, *to))
         return is_odd
 
     def score(
@@ -346,7 +346,7 @@ class FeatureEngine(_Kept):
             channels.address, start + ends[5], start + ends[3], start + ends[4], start + ends[0],
             given == np.float32,
         )  # fmt: skip
-        self._run(self._plan, machine.of, call)
+        self._run(self.plan, machine.of, call)
         flags = memory[ends[2] :].view(np.bool_)
         return Scores(
             flags[:num],
@@ -613,7 +613,7 @@ class OnsetEngine(_Kept):
             filters, steps, rounding, silence, least_step, rates, *scaling, weights, biases,
             quadratic, linear,
         )  # fmt: skip
-        self._of = _Onset(
+        self.of = _Onset(
             len(fast), len(slow), num_filters, len(windows), pairs.shape[1], num_steps, len(lags),
             num_columns, len(layers), hop, context, delay, len(steps), blind, min_alive, most_lost,
             *(self._array(each, np.int32) for each in whole),
@@ -638,15 +638,15 @@ class OnsetEngine(_Kept):
             - output: ``[k]``, NaN without evidence; ``[k]``; ``[k, K]``, or ``[0, K]``
         """
         address, is_float, _, stride, _ = _samples_of(samples[:, None])
-        num = (samples.shape[1] - self._of.context) // self._of.hop
+        num = (samples.shape[1] - self.of.context) // self.of.hop
         score, is_lost = np.empty(num), np.zeros(num, np.bool_)
-        columns = np.empty((num * self._with_columns, self._of.num_columns))
+        columns = np.empty((num * self._with_columns, self.of.num_columns))
         call = _OnsetHops(
             address, is_float, stride, num, self._num_lost, self.memory.ctypes.data,
             in_use.ctypes.data, score.ctypes.data, is_lost.ctypes.data,
             columns.ctypes.data if self._with_columns else None,
         )  # fmt: skip
-        if self._library.tactslip_onset(self._level, ctypes.byref(self._of), ctypes.byref(call)):
+        if self._library.tactslip_onset(self._level, ctypes.byref(self.of), ctypes.byref(call)):
             raise MemoryError("the native engine found no memory to work in")
         self._num_lost = call.num_lost
         return score, is_lost, columns
@@ -685,14 +685,14 @@ def carry_bristles(
           arm, load: ``[2 steps, L]``
         - output: friction, inertia and slip, ``[3, steps / every, L]``
     """
-    library, num_steps = _library(), len(arm) // 2
+    loaded, num_steps = _library(), len(arm) // 2
     out = np.empty((3, num_steps // every, len(bristles)))
     arrays = (table, pressure, states, bristles, arm, load, out)
     run = _BristleRun(
         *bristles.shape, num_steps, every, patience, step_s, gamma,
         *(array.ctypes.data for array in arrays),
     )  # fmt: skip
-    if library.tactslip_bristles(_level(library), ctypes.byref(run)):
+    if loaded.tactslip_bristles(_level(loaded), ctypes.byref(run)):
         raise MemoryError("the native engine found no memory to work in")
     return out
 
@@ -776,6 +776,11 @@ def _loaded() -> ctypes.CDLL | str:
 
 
 def _library() -> ctypes.CDLL:
+    """The library that holds the engine and the C interface ``tactslip.h``.
+
+    Raises:
+        OSError: if it is not available.
+    """
     loaded = _loaded()
     if isinstance(loaded, str):
         raise OSError(loaded)

@@ -25,7 +25,9 @@ REMEDY = (
 )
 _HERE = Path(__file__).parent
 _PARTS = ("engine", "judge", "bristles", "onset")  # compiled for each instruction set
-_SOURCES = ("engine.h", "vectors.h", *(f"{part}.cpp" for part in _PARTS), "dispatch.cpp")
+_ONCE = ("dispatch", "stream")  # and these for the oldest
+_HEADERS = ("engine.h", "vectors.h", "file.h", "tactslip.h")
+_SOURCES = (*_HEADERS, *(f"{part}.cpp" for part in (*_PARTS, *_ONCE)))
 _FLAGS = [
     *(
         "-O3",
@@ -77,7 +79,7 @@ def build_library(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as name:
         there = Path(name)
-        jobs = [(["dispatch.cpp"], "dispatch.o")]
+        jobs = [([f"{part}.cpp", "-O2"], f"{part}.o") for part in _ONCE]
         for level in (2, 3, 4) if _is_x86() else (1,):
             flags = [f"-DLEVEL=v{level}", *_march(compiler, level)]
             for part in _PARTS:

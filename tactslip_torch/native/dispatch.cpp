@@ -8,7 +8,7 @@
 #define EXPORT extern "C" __attribute__((visibility("default")))
 #endif
 
-#if defined(__x86_64__)
+#if defined(__x86_64__) && !defined(TACTSLIP_PORTABLE)
 #include <cpuid.h>
 
 static bool has(unsigned bits, unsigned wanted) { return (bits & wanted) == wanted; }

@@ -153,7 +153,7 @@ template <class E> struct OnsetHops {
   }
 
 // OF_LEVEL(level, features(...)) calls that of level 2, 3 or 4, as in x86-64-v3; elsewhere there is one.
-#if defined(__x86_64__)
+#if defined(__x86_64__) && !defined(TACTSLIP_PORTABLE)
 ENGINE_OF(v2)
 ENGINE_OF(v3)
 ENGINE_OF(v4)

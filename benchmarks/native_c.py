@@ -1,0 +1,290 @@
+"""The C library on this machine and on emulated boards: ``python -m benchmarks.native_c``.
+
+The detector that comes with the package as a ``.tslip`` file, run by C programs that are built
+here: time and memory of a decision beside onnxruntime and the package, and the stream of the sample
+recording on two boards that QEMU emulates, in instructions. Needs what ``.ci/boards`` installs.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from benchmarks import ROOT
+from benchmarks.harness import Benchmark, Job, say
+from benchmarks.subjects import Array, loaded
+from benchmarks.tables import Table
+from benchmarks.timing import interleaved, on_threads
+from benchmarks.trainings import trained
+from tactslip_torch import SlipDetector, StreamingDetector, sample_recording
+from tactslip_torch.deploy.export import export_detector
+from tactslip_torch.deploy.native import FILE, SOURCE, NativeFile
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.onset.decisions import KEY, AlarmSettings
+from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence, Perceptron
+from tactslip_torch.pretrained import NAME
+
+HOST = ROOT / "export" / "native"
+SOURCES = ("export/native/*", "export/native/board/*", "export/c/*.c", "export/c/*.h")
+TOOLS = ("make", "arm-none-eabi-g++", "qemu-system-arm", "aarch64-linux-gnu-g++", "qemu-aarch64")
+BOARDS = {"m7": "Cortex-M7 (mps2-an500)", "m4": "Cortex-M4F (mps2-an386)"}
+_FULL_SCALE = 32000  # counts of the largest sample
+
+
+def missing_tools() -> list[str]:
+    """Of those that the boards and the other machine need."""
+    return [name for name in TOOLS if shutil.which(name) is None]
+
+
+def make(folder: Path, target: str, *words: str, where: Path = HOST) -> str:
+    """Build a target of ``export/native`` into a folder; what is printed on both streams."""
+    command = ["make", "-s", "-C", str(where), f"BUILD={folder}", target, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)} failed: {done.stderr.strip()[-500:]}")
+    return done.stdout + done.stderr  # where semihosting writes
+
+
+def on_board(board: str, folder: Path, counts: Array) -> dict[str, Any]:
+    """The stream of counts ``[T, C]`` on an emulated board, by ``detector.c`` in the folder.
+
+    Returns:
+        ``alarms``, the numbers that the program prints, and bytes of ``flash`` and ``ram``.
+    """
+    recording = folder / "recording.c"
+    words = ",\n".join(",".join(map(str, row)) for row in counts.tolist())
+    recording.write_text(
+        "#include <stddef.h>\n#include <stdint.h>\nextern const int16_t recording[];\n"
+        "extern const size_t recording_samples;\n"
+        f'__attribute__((section(".recording"))) const int16_t recording[] = {{{words}}};\n'
+        f"const size_t recording_samples = {len(counts)};\n"
+    )
+    given = f"DETECTOR={folder / SOURCE}", f"RECORDING={recording}"
+    said = make(folder, "run", f"BOARD={board}", *given, where=HOST / "board")
+    lines = [json.loads(line) for line in said.splitlines() if line.startswith("{")]
+    sizes = {w[0]: int(w[1]) for w in map(str.split, said.splitlines()) if w[:1] and w[0][0] == "."}
+    found = lines.pop()
+    kept = sizes[".data"]
+    return {
+        **found,
+        "alarms": [(line["alarm_us"] / 1e6, line["onset_us"] / 1e6) for line in lines],
+        "flash": sizes[".text"] + sizes.get(".ARM.exidx", 0) + kept,
+        "ram": kept + found["state_bytes"] + found["stack_bytes"],
+    }
+
+
+def sample_counts() -> tuple[Array, float]:
+    """The sample recording as a converter of 16 bits gives it, ``[T, C]``, and volts of a count."""
+    samples = sample_recording().samples.T.numpy()
+    scale = float(np.float32(np.abs(samples).max() / _FULL_SCALE))
+    return np.rint(samples / scale).astype(np.int16), scale
+
+
+@dataclass(frozen=True)
+class NativeC(Benchmark):
+    """The C library here, by an emulated processor of another kind, and on emulated boards.
+
+    Args:
+        columns: of a second, smaller detector, which is trained; 0: there is none.
+        rounds: of the sample recording, for each way in turn.
+    """
+
+    title = "The C library"
+    about = (
+        "the detector that comes with the package, made by the default recipe, as `detector.tslip` "
+        "in C programs, on 1 thread; boards are emulated by QEMU, which counts instructions and "
+        "says nothing of time"
+    )
+    page = "docs/deploy.md"
+    charts: ClassVar = {"": (("A decision on this machine", "us a decision"),)}
+    quick = "rounds=2"
+    libraries = ("onnxruntime",)
+    columns: int = 0
+    rounds: int = 20
+
+    @torch.inference_mode()
+    def measure(self, job: Job) -> dict[str, Any]:
+        """Programs on this machine, aarch64 in QEMU, boards."""
+        if missing := missing_tools():
+            raise ValueError(f"not installed: {', '.join(missing)}; run .ci/boards")
+        detectors = {NAME: SlipDetector.pretrained()}
+        if self.columns:
+            words = ["+exp=unseen4", "baselines=false", "recipe.views=[pooled]"]
+            words += [f"recipe.num_features={self.columns}"]
+            small = job.folder.parent / f"{self.columns} columns"
+            trained(words, small, small / "cache")
+            detectors[f"{self.columns} columns"] = loaded(small / "detector.pt")
+        with TemporaryDirectory(prefix="tactslip-bench-") as folder, on_threads(1):
+            tables = {
+                "A decision on this machine": _here(detectors, Path(folder), self.rounds),
+                "The same file on aarch64": _on_aarch64(detectors[NAME], Path(folder)),
+                "Error of float32": _float32(detectors[NAME]),
+                "Emulated boards": _boards(detectors, Path(folder)),
+            }
+            return {"tables": tables}
+
+
+def _here(detectors: Mapping[str, SlipDetector], folder: Path, rounds: int) -> Table:
+    say("native_c: programs on this machine")
+    make(folder, "timing")
+    samples = sample_recording().samples.T.contiguous().numpy()
+    np.save(folder / "recording.npy", samples)
+    rows = []
+    for name, detector in detectors.items():
+        for precision in ("float64", "float32"):
+            place = folder / name / precision
+            place.mkdir(parents=True)
+            NativeFile.export(detector, place, precision)
+            words = [folder / "timing", place / FILE, folder / "recording.npy", str(rounds)]
+            done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=True)
+            found = json.loads(done.stdout)
+            row = {"way": f"C, {name}, {precision}", "us a decision": f"{found['p50_us']:.1f}"}
+            row["us from start to a score"] = f"{found['first_us']:.0f}"
+            row["MB resident"] = f"{found['resident_kb'] / 1e3:.1f}"
+            row["kB of the file"] = f"{(place / FILE).stat().st_size / 1e3:.0f}"
+            rows.append(row)
+    detector = detectors[NAME]
+    for way, us in _others(detector, folder, samples, rounds).items():
+        rows.append({"way": way, "us a decision": f"{us:.1f}"})
+    return Table(rows, "CPU time of a decision, the median; from start to a score: of the process.")
+
+
+def _others(detector: SlipDetector, folder: Path, samples: Array, rounds: int) -> dict[str, float]:
+    """Microseconds of a push of one hop by the package and by onnxruntime."""
+    hop = int(detector.info["alarm"]["hop_samples"])
+    pieces = [samples[at : at + hop] for at in range(0, len(samples), hop)]
+    stream = StreamingDetector(detector)
+    export_detector(detector, folder, ("stream",))
+    sys.path.append(str(ROOT / "export" / "python"))
+    from files import load_model  # type: ignore[import-not-found]  # of the host
+
+    session, _ = load_model(folder / "stream.onnx", "stream")
+    names = [output.name for output in session.get_outputs()]
+    feeds: dict[str, Any] = {"tail": samples[:0], "state": np.zeros(0), "threshold": np.zeros(0)}
+    turn = {"package": 0, "graph": 0}
+
+    def push() -> None:
+        turn["package"] += 1
+        stream.push(pieces[turn["package"] % len(pieces)])
+
+    def run() -> None:
+        turn["graph"] += 1
+        given = {"samples": pieces[turn["graph"] % len(pieces)], **feeds}
+        found = dict(zip(names, session.run(None, given), strict=True))
+        feeds["tail"], feeds["state"] = found["next_tail"], found["next_state"]
+
+    timed = interleaved({"package, a push": push, "onnxruntime, a push": run}, rounds)
+    return {name: 1e6 * of["p50_s"] for name, of in timed.items()}
+
+
+def _on_aarch64(detector: SlipDetector, folder: Path) -> Table:
+    say("native_c: aarch64 in QEMU")
+    cross = [f"{name}=aarch64-linux-gnu-{tool}" for name, tool in (("CC", "gcc"), ("CXX", "g++"))]
+    make(folder / "aarch64", str(folder / "aarch64" / "detect"), *cross, "LINK=-static")
+    rows = []
+    for precision in ("float64", "float32"):
+        samples = np.load(folder / "recording.npy").astype(precision)
+        np.save(folder / "given.npy", samples)
+        file = folder / NAME / precision / FILE
+        words = ["qemu-aarch64", folder / "aarch64" / "detect", file, folder / "given.npy"]
+        command = [*map(str, words), "--decisions"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        *lines, summary = map(json.loads, done.stdout.splitlines())
+        wanted = StreamingDetector(detector, dtype=getattr(torch, precision)).push(samples)
+        score = np.array([line["score"] for line in lines])
+        off = np.abs(score - wanted.score.numpy()).max() / float(wanted.score.std())
+        same = [line["alarm"] for line in lines] == wanted.is_alarm.tolist()
+        rows.append(
+            {
+                "file": f"{FILE}, {precision}",
+                "decisions": str(summary["decisions"]),
+                "alarms": f"{summary['alarms']}, {'as' if same else 'NOT as'} the package",
+                "largest difference of a score, sd": f"{off:.1e}",
+            }
+        )
+    return Table(rows, "The program for aarch64, run by qemu-aarch64 (user mode).")
+
+
+def _float32(detector: SlipDetector) -> Table:
+    """Scores of a float32 file on the sample recording, and with other gains and offsets."""
+    samples = sample_recording().samples.T.numpy()
+    streams = {"as it is": samples}
+    streams |= {f"times {gain:g}": samples * np.float32(gain) for gain in (0.3, 1000.0)}
+    streams |= {f"plus {by:g} V": samples + np.float32(by) for by in (1.0, 10.0, 100.0, 1000.0)}
+    rows = []
+    for name, given in streams.items():
+        found = NativeFile.of(detector, "float32").stream().push(given)
+        wanted = StreamingDetector(detector).push(given)
+        score = wanted.score.double().numpy()
+        off = np.abs(found["score"] - score).max() / score.std()
+        changed = int((found["on"] != wanted.is_on.numpy()).sum())
+        rows.append(
+            {
+                "sample recording": name,
+                "largest difference of a score, sd": f"{off:.1e}",
+                "decisions with another status": f"{changed} of {len(score)}",
+            }
+        )
+    return Table(rows, "Against the package, which computes in float64.")
+
+
+def _boards(detectors: Mapping[str, SlipDetector], folder: Path) -> Table:
+    counts, scale = sample_counts()
+    rows = []
+    detectors = {**detectors, f"{NAME}, with a network": _with_network(detectors[NAME])}
+    for name, detector in detectors.items():
+        place = folder / "board"  # where the library is built once
+        place.mkdir(exist_ok=True)
+        NativeFile.export(detector, place, "float32", scale=scale, source=True)
+        decided = StreamingDetector(detector).push(counts.astype(np.float32) * np.float32(scale))
+        wanted = [(alarm.alarm_s, alarm.onset_s) for alarm in decided.alarms]
+        for board, title in BOARDS.items():
+            say(f"native_c: {title}, {name}")
+            found = on_board(board, place, counts)
+            same = np.allclose(found["alarms"], wanted, atol=2e-6)
+            of_hop = found["instructions_of_sample"] * found["hop_samples"]
+            rows.append(
+                {
+                    "board": title,
+                    "detector": name,
+                    "M instructions a decision": f"{found['instructions'] / 1e6:.2f}",
+                    "at most": f"{found['most_instructions'] / 1e6:.2f}",
+                    "of the hop's samples": f"{of_hop / 1e6:.2f}",
+                    "kB of RAM": f"{found['ram'] / 1e3:.1f}",
+                    "kB of flash": f"{found['flash'] / 1e3:.0f}",
+                    "alarms": f"{len(wanted)}, {'as' if same else 'NOT as'} the package",
+                }
+            )
+    return Table(
+        rows,
+        "float32; flash with the detector, RAM with stack, both without the recording. The "
+        "network's weights are drawn at random: costs alone.",
+    )
+
+
+def _with_network(detector: SlipDetector) -> SlipDetector:
+    """The detector with an onset classifier whose weights are drawn: it costs what any does."""
+    made = copy.deepcopy(detector)
+    evidence = OnsetEvidence(made.pool.hand, made.pool.sample_rate_hz)
+    num = evidence.num_columns
+    scaler = FeatureScaler(-torch.ones(num).double(), torch.ones(num).double())
+    torch.manual_seed(0)
+    network = Perceptron.drawn(num * (1 + len(evidence.lags))).double().requires_grad_(False)
+    onset = OnsetClassifier(evidence, scaler, network, threshold=1e6)
+    made.info[KEY] = replace(AlarmSettings.of(made), onset=onset).to_dict()
+    return made
+
+
+if __name__ == "__main__":
+    sys.exit(NativeC().run())
