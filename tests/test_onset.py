@@ -32,7 +32,7 @@ from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence, OnsetStream, Perceptron
 from tactslip_torch.onset.rules import NOTHING_YET, KOfN
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.onset import OnsetTraining, _columns_of, _labels_of
+from tactslip_torch.training.onset import OnsetTraining, _columns_of, _labels_of, _weights
 
 RATE = 2000.0
 STEP = 1e-3
@@ -729,6 +729,17 @@ def test_training_reads_the_columns_that_a_stream_has(kinds):
     columns, usable, _ = evidence.columns(known)
     np.testing.assert_allclose(found[~lost], columns, rtol=0, atol=1e-9)
     assert is_usable[~lost].tolist() == usable.tolist()
+
+
+def test_kinds_without_slip_weigh_as_they_are_told_to():
+    kinds = np.array(["arm"] * 10 + ["taps"] * 40 + ["slip"] * 5 + ["slip"] * 5)
+    is_slip = np.arange(60) >= 55
+    weights = _weights(kinds, is_slip, {"arm": 4.0}).astype(float)
+    of_kind = {name: weights[(kinds == name) & ~is_slip].sum() for name in ("arm", "taps", "slip")}
+    assert of_kind["arm"] == pytest.approx(4 * of_kind["taps"])
+    assert of_kind["taps"] == pytest.approx(of_kind["slip"])
+    assert weights[is_slip].sum() == pytest.approx(sum(of_kind.values()) / 2)
+    assert weights.mean() == pytest.approx(1)
 
 
 NOTHING_TO_LEARN = [

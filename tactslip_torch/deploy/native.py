@@ -131,7 +131,7 @@ class NativeFile:
                     f"channels, got {values}"
                 )
             out.table(np.broadcast_to(numbers, num_channels))
-        _write_filters(out, detector, given)
+        _write_filters(out, detector, given, settings)
         features, machine = detector.engine_tables()
         _write_plan(out, features)
         _write_machine(out, machine)
@@ -222,7 +222,9 @@ def _write_stream(out: _Writer, detector: SlipDetector, settings: AlarmSettings)
     out.content += text
 
 
-def _write_filters(out: _Writer, detector: SlipDetector, given: torch.dtype) -> None:
+def _write_filters(
+    out: _Writer, detector: SlipDetector, given: torch.dtype, settings: AlarmSettings
+) -> None:
     layer, used = detector.channel_filter, RawBin.of(detector).channels
     first = {layer.window_lengths[channel]: channel for channel in used}  # a channel of each frame
     out.numbers(len(first))
@@ -239,7 +241,7 @@ def _write_filters(out: _Writer, detector: SlipDetector, given: torch.dtype) -> 
     out.table(1.0)
     sensing, largest = detector.sensing, float(np.finfo(out.dtype).max)
     out.table(detector.pool.inverse_span(given, is_raw=True))
-    for spans in (sensing.floor, *sensing.bounds):
+    for spans in (sensing.floor, *settings.sensing(sensing).bounds):
         out.table(np.minimum(spans, largest))
     out.table(detector.counted, np.uint8)
     out.numbers(sensing.min_alive)

@@ -2,8 +2,8 @@
 
 A hop is positive from the release of half of the load to 0.3 s behind it, or to the end of the
 slide. Left out are those from the first release to that of half, and the rest of the slide with
-0.25 s behind it. All others are negative; every kind of recordings weighs alike. Heads are fitted
-by the logistic loss on all hops; that which finds more slips of materials left out is taken.
+0.25 s behind it. All others are negative; kinds of recordings weigh alike, or as is said. Heads are
+fitted by the logistic loss on all hops; that which finds more slips of materials left out is taken.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from __future__ import annotations
 import logging
 import math
 import warnings
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -72,7 +72,8 @@ class OnsetTraining:
             fitted without it.
         comb_periods: of the mains, over which the comb takes the mean.
         mains_hz: nominal.
-        seed: of weights and batches.
+        weights: of kinds of recordings without slip, in place of 1.
+        seed: of a network's weights and batches.
 
     Raises:
         ValueError: for an unknown head, or a number out of range.
@@ -84,6 +85,7 @@ class OnsetTraining:
     folds: int = 3
     comb_periods: int = 1
     mains_hz: float = 50.0
+    weights: Mapping[str, float] = field(default_factory=dict)
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -94,6 +96,8 @@ class OnsetTraining:
             )
         for name in ("epochs", "folds"):
             check_number(f"onset.classifier.{name}", getattr(self, name), whole=True)
+        for kind, weight in self.weights.items():
+            check_number(f"onset.classifier.weights.{kind}", weight)
 
     def evidence(self, hand: HandLayout, sample_rate_hz: float) -> OnsetEvidence:
         """What decisions are made of, before anything is learned.
@@ -195,7 +199,7 @@ class OnsetTraining:
                 if name == "network"
                 else _Form(num)
             )
-            batches = _Batches(hops, known, scaler, lags, self.seed)
+            batches = _Batches(hops, known, scaler, lags, self.weights, self.seed)
             _train(module, batches, self.epochs)
         if isinstance(module, Perceptron):
             head = module.double().requires_grad_(False)
@@ -370,6 +374,7 @@ class _Batches(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
         known: Array,
         scaler: FeatureScaler,
         lags: Sequence[int],
+        weights: Mapping[str, float],
         seed: int,
     ) -> None:
         super().__init__()
@@ -379,7 +384,8 @@ class _Batches(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
         self._hops, self._known, self._lags = hops, known, lags
         self._scaler = FeatureScaler(scaler.minimum.float(), scaler.maximum.float())
         self._target = torch.from_numpy((label > 0).astype(np.float32))
-        self._weight = torch.from_numpy(_weights(hops.kind[hops.recording[known]], label > 0))
+        kinds = hops.kind[hops.recording[known]]
+        self._weight = torch.from_numpy(_weights(kinds, label > 0, weights))
         self._rng = np.random.default_rng(seed)
 
     @property
@@ -395,13 +401,16 @@ class _Batches(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
             yield inputs, self._target[own], self._weight[own]
 
 
-def _weights(kinds: Array, is_slip: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Of each hop: kinds without slip alike, 1 in the mean."""
-    _, kind = np.unique(kinds, return_inverse=True)
-    each = np.zeros(len(kinds))
+def _weights(
+    kinds: Array, is_slip: NDArray[np.bool_], given: Mapping[str, float]
+) -> NDArray[np.float32]:
+    """Of each hop, 1 in the mean: kinds without slip alike, or as given."""
+    names, kind = np.unique(kinds, return_inverse=True)
     others = ~is_slip
-    counts = np.bincount(kind[others], minlength=kind.max() + 1)
-    each[others] = 1.0 / (counts[kind[others]] * max(1, (counts > 0).sum()))
+    counts = np.bincount(kind[others], minlength=len(names))
+    shares = np.array([given.get(name, 1.0) for name in names.tolist()]) * (counts > 0)
+    each = np.zeros(len(kinds))
+    each[others] = (shares / (shares.sum() or 1.0) / np.maximum(counts, 1))[kind[others]]
     each[is_slip] = _POSITIVE_WEIGHT / max(1, is_slip.sum())
     weights: NDArray[np.float32] = (each / each.mean()).astype(np.float32)
     return weights
