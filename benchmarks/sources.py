@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 _PACKAGES = ("tactslip_torch", "benchmarks")
 _SHOW = {ROOT / "benchmarks" / name for name in ("harness.py", "tables.py", "sources.py")}
-_BESIDE = (".cpp", ".h", ".json")
+_BESIDE = (".c", ".cpp", ".h", ".json")
 _TARGET = re.compile(r"^\s*_target_:\s*(\S+)", re.MULTILINE)
 _COMMENT = re.compile(r"(?:^|(?<=\s))#.*", re.MULTILINE)
 _SECTION = re.compile(r"`python -m benchmarks\.(\w+)[^`]*`[^\n]*?\bcode ([0-9a-f]{16})[^\n]*")
