@@ -54,20 +54,30 @@ def host(module: str) -> Any:
     return import_module(module)
 
 
-def bin_scores(path: Path) -> Callable[[torch.Tensor], Array]:
-    """What scores raw bins with all context ``[N, C, n + 2 * context]`` by a bin graph."""
+def bin_outputs(path: Path) -> Callable[[torch.Tensor], tuple[Array, Array]]:
+    """What gives scores and validity of raw bins with all context by a bin graph.
+
+    Shape:
+        - bins: ``[N, C, n + 2 * context]``
+    """
     session, metadata = host("files").load_model(path, "bin")
     context = ChannelFilter(WINDOW_LENGTHS).context
     first = context - metadata["context_before_samples"]  # the file takes no more than it needs
     unused = context - metadata["context_after_samples"]
 
-    def scores(samples: torch.Tensor) -> Array:
+    def outputs(samples: torch.Tensor) -> tuple[Array, Array]:
         cut = samples[..., first : samples.shape[-1] - unused].numpy()
         x = np.ascontiguousarray(cut, metadata["precision"])
-        found: Array = session.run(["score", "valid"], {"samples": x})[0]
-        return found
+        score, valid = session.run(["score", "valid"], {"samples": x})
+        return score, valid
 
-    return scores
+    return outputs
+
+
+def bin_scores(path: Path) -> Callable[[torch.Tensor], Array]:
+    """The scores of ``bin_outputs`` alone."""
+    outputs = bin_outputs(path)
+    return lambda samples: outputs(samples)[0]
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ def _here(detectors: Mapping[str, SlipDetector], folder: Path, rounds: int) -> T
             rows.append(row)
     detector = detectors[NAME]
     for way, us in _others(detector, folder, samples, rounds).items():
-        rows.append({"way": way, "us a decision": f"{us:.1f}"})
+        rows.append({**dict.fromkeys(rows[0], "-"), "way": way, "us a decision": f"{us:.1f}"})
     return Table(rows, "CPU time of a decision, the median; from start to a score: of the process.")
 
 

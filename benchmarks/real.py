@@ -29,8 +29,9 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
+from benchmarks import ROOT
 from benchmarks.deployment import host
-from benchmarks.harness import Benchmark, Job, resumed, say
+from benchmarks.harness import Benchmark, Job, put_between, resumed, say
 from benchmarks.peers import others
 from benchmarks.real_sets import RealSet, read_set
 from benchmarks.tables import Report, Table, mean_sd, times
@@ -115,6 +116,30 @@ class Real(Benchmark):
             "Scores": _scores(sets),
             "Cost": _costs(sets),
         }
+
+    def publish_more(self, report: Report) -> None:
+        """README's table: ours beside the best of the other methods."""
+        rows = []
+        for name, of in report["numbers"]["sets"].items():
+            methods = dict(of["methods"])
+            ours = methods.pop(OURS)
+            best = max(methods, key=lambda method: mean(methods[method]["balanced_accuracy"]))
+            other = methods[best]
+            rows.append(
+                {
+                    "set": name,
+                    "`SlipClassifier`, balanced accuracy % [95 %]": style.interval(
+                        ours["interval"], 1, scale=100
+                    ),
+                    "best baseline": best,
+                    "its %": style.interval(other["interval"], 1, scale=100),
+                    "ours ahead by, points": style.interval(
+                        other["lead"]["recordings"], 1, scale=100
+                    ),
+                }
+            )
+        text = f"**Real** (`python -m benchmarks.real FOLDER`, code {report['code']}):\n\n"
+        put_between(ROOT / "README.md", "real sets", text + Table(rows).markdown())
 
     def draw(self, numbers: Report, drawing: Figure, ending: str) -> None:
         """Balanced accuracy of every method with its interval, a panel for each set."""

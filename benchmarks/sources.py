@@ -21,8 +21,9 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 _PACKAGES = ("tactslip_torch", "benchmarks")
 _SHOW = {ROOT / "benchmarks" / name for name in ("harness.py", "tables.py", "sources.py")}
-_BESIDE = (".cpp", ".h", ".json")
+_BESIDE = (".c", ".cpp", ".h", ".json")
 _TARGET = re.compile(r"^\s*_target_:\s*(\S+)", re.MULTILINE)
+_COMMENT = re.compile(r"(?:^|(?<=\s))#.*", re.MULTILINE)
 _SECTION = re.compile(r"`python -m benchmarks\.(\w+)[^`]*`[^\n]*?\bcode ([0-9a-f]{16})[^\n]*")
 STALE = "*The code has changed since this was measured: numbers of the present code may differ.*"
 """Stands below the line that names command and code of such a section."""
@@ -38,9 +39,11 @@ def digest(name: str) -> str:
 
 
 def is_current(name: str) -> bool:
-    """Whether the kept numbers of a benchmark are of its present sources."""
+    """Whether the kept numbers of a benchmark, and those it takes, are of the present sources."""
     path = RESULTS / f"{name}.json"
-    return path.exists() and json.loads(path.read_text(encoding="utf-8"))["code"] == digest(name)
+    if not path.exists() or json.loads(path.read_text(encoding="utf-8"))["code"] != digest(name):
+        return False
+    return all(is_current(of.stem) for of in sources(name) if of.parent == RESULTS)
 
 
 def sections(page: str) -> list[tuple[str, str]]:
@@ -77,6 +80,8 @@ def _followed(path: Path) -> list[Path]:
     tree = _tree(path)
     needed = [of for module, name in _imports(tree) if (of := _defined(module, name))]
     needed += [of for of in path.parent.iterdir() if of.suffix in _BESIDE]
+    if path == ROOT / "tactslip_torch" / "commands" / "configuration.py":
+        needed += ROOT.glob("conf/**/*.yaml")
     for node in tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "SOURCES":
             for pattern in ast.literal_eval(node.value):
@@ -125,8 +130,13 @@ def _file(module: str) -> Path | None:
 
 @cache
 def _content(path: Path) -> bytes:
-    """A file's bytes; of Python what it says, whatever its comments, docstrings and layout."""
-    return "".join(_said(_tree(path))).encode() if path.suffix == ".py" else path.read_bytes()
+    """A file's bytes; of Python and YAML without comments, docstrings and layout."""
+    if path.suffix == ".py":
+        return "".join(_said(_tree(path))).encode()
+    if path.suffix == ".yaml":
+        lines = _COMMENT.sub("", path.read_text(encoding="utf-8")).splitlines()
+        return "\n".join(text for line in lines if (text := line.rstrip())).encode()
+    return path.read_bytes()
 
 
 def _said(node: object) -> Iterable[str]:

@@ -12,6 +12,7 @@ import json
 import posixpath
 import re
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,10 @@ LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)")
 def on_files(files: Any, config: Any) -> Any:
     """Add what the pages link to, and what is linked to from there."""
     paths = [f"docs/{file.src_uri}" for file in files.documentation_pages()]
-    paths += [*OUTSIDE, *(f"examples/{path.name}" for path in ROOT.glob("examples/*.ipynb"))]
+    paths += [
+        *(f"{name}.md" for name in OUTSIDE),
+        *(f"examples/{path.name}" for path in ROOT.glob("examples/*.ipynb")),
+    ]
     for path in paths:  # which grows
         is_page = path.endswith((".md", ".ipynb"))
         if not path.startswith("docs/"):
@@ -41,7 +45,8 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-OUTSIDE = ("README.md", "CHANGELOG.md")  # pages of the navigation
+OUTSIDE = ("README", "CHANGELOG", "CONTRIBUTING", "SECURITY", "CODE_OF_CONDUCT")
+"""Pages beside the folder of pages."""
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
@@ -55,7 +60,60 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         is_there = files.get_file_from_path(new) is not None
         return posixpath.relpath(new, folder or ".") if is_there else found[0]
 
+    if uri == "configuration.md":
+        begin, end = "<!-- configuration -->", "<!-- /configuration -->"
+        markdown = f"{markdown.split(begin)[0]}{_configuration()}{markdown.split(end)[1]}"
     return LINK.sub(moved, sources.marked(markdown))
+
+
+def on_config(config: Any) -> Any:
+    """The repository's address, where it has one."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    config.repo_url = project["tool"]["tactslip_torch"]["repository"] or None
+    return config
+
+
+KEY = re.compile(r"^( *)(?:- )?([\w@/]+): *(.*?)(?:(?:^| +)# (.*))?$")
+"""Indent, name, value and comment of a line of our YAML files."""
+
+
+def _configuration() -> str:
+    """Tables of the keys of all commands, then of the choices of each group."""
+    parts, conf = list[str](), ROOT / "conf"
+    tables = {"Commands": [path for path in sorted(conf.glob("*.yaml")) if path.stem != "scenes"]}
+    for folder in sorted(path for path in conf.iterdir() if path.is_dir()):
+        plus = "+" if folder.name == "exp" else ""
+        title = f"{folder.name.capitalize()}: `{plus}{folder.name}=NAME`"
+        tables[title] = sorted(folder.glob("*.yaml"))
+    for title, paths in tables.items():
+        parts.append(f"## {title}")
+        for path in paths:
+            about, rows = _keys(path)
+            parts.append(f"### `{path.relative_to(conf).with_suffix('').as_posix()}`\n\n{about}")
+            if rows:
+                parts.append("\n".join(["| key | default | meaning |", "|---|---|---|", *rows]))
+    return "\n\n".join(parts)
+
+
+def _keys(path: Path) -> tuple[str, list[str]]:
+    """What the comment at the top of a file says, and a row of a table for each of its keys."""
+    about, rows, above = [], [], list[tuple[int, str]]()
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if line.startswith("# ") and not rows:
+            text = line[2:]
+            about.append(f"`{text}`" if text.startswith("tactslip") else text)
+        found = KEY.match(line)
+        if not found or line.lstrip().startswith("#"):
+            continue
+        indent, name, value, comment = len(found[1]), *found.groups()[1:]
+        above = [(place, key) for place, key in above if place < indent] + [(indent, name)]
+        key = ".".join(key for _, key in above).removeprefix("defaults.")
+        if key.startswith("hydra") or name in ("_target_", "_partial_") or not (value or comment):
+            continue
+        shown = f"`{value}`" if value else ""
+        cells = [f"`{key}`", shown.replace("|", "\\|"), (comment or "").replace("|", "\\|")]
+        rows.append(f"| {' | '.join(cells)} |")
+    return "  \n".join(about), rows
 
 
 def _target(path: str, link: str) -> str:

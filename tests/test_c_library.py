@@ -1,5 +1,8 @@
 """libtactslip, run by ctypes, decides what the package and the exported graph decide."""
 
+import copy
+from dataclasses import replace
+
 import hosts
 import numpy as np
 import pytest
@@ -12,7 +15,8 @@ from tactslip_torch.deploy.bins import Precision
 from tactslip_torch.deploy.check import _session_of, runner
 from tactslip_torch.deploy.native import FILE, SOURCE, NativeFile, _NativeStream
 from tactslip_torch.deploy.stream import stream_graph
-from tactslip_torch.onset.decisions import HOST_COLUMNS, AlarmSettings
+from tactslip_torch.features.sensing import Sensing
+from tactslip_torch.onset.decisions import HOST_COLUMNS, KEY, AlarmSettings, score_stream
 from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.pretrained import NAME, REAL_NAME, sample_recording
 
@@ -261,6 +265,17 @@ def test_a_slow_hand_of_96_channels_decides_alike():
     samples = 1e4 + 300 * np.random.default_rng(3).standard_normal((900, 96))
     samples[400:600, 10:20] = np.nan
     assert_same(stream_of(detector).push(samples), by_package(detector, samples))
+
+
+def test_decisions_are_in_range_by_what_set_the_threshold():
+    detector = copy.deepcopy(alarming_detector())
+    samples = kind_of("as it is")
+    settings = AlarmSettings.of(detector)
+    levels = Sensing.fit(8.0 * score_stream(detector, torch.from_numpy(samples.T), 20).span, 1, 1)
+    detector.info[KEY] = replace(settings, levels=levels).to_dict()
+    wanted = by_package(detector, samples)
+    assert (wanted["in_range"] != by_package(alarming_detector(), samples)["in_range"]).any()
+    assert_same(stream_of(detector).push(samples), wanted)
 
 
 # Counts, files ------------------------------------------------------------------------------------

@@ -69,15 +69,20 @@ def test_the_demo_says_when_the_slip_began_and_leaves_all_it_names(typed, tmp_pa
     assert "is there and not empty; give another one, --out DIR" in err
 
 
-@pytest.mark.parametrize("name", ["c", "node", "python", "web"])
+@pytest.mark.parametrize("name", ["c", "native", "node", "python", "web"])
 def test_hosts_are_copied_whole(typed, tmp_path, name):
     assert str(tmp_path / name / "README.md") in typed(hosts, name, tmp_path)[1]
     for path in (ROOT / "export" / name).glob("*.*"):
         if path.is_file():
             assert (tmp_path / name / path.name).read_bytes() == path.read_bytes()
+    if name == "native":  # with the library's sources
+        assert {"stream.cpp", "tactslip.h"} <= {p.name for p in (tmp_path / "native/src").iterdir()}
     if name == "web":  # what it plays when it is started without arguments
         assert all((tmp_path / "web" / own).is_file() for own in ("stream.onnx", "recording.npz"))
-    for wrong, words in ((name, "is there already"), ("rust", "no host 'rust'; there are c, node")):
+    for wrong, words in (
+        (name, "is there already"),
+        ("rust", "no host 'rust'; there are c, native, node"),
+    ):
         status, _, err = typed(hosts, wrong, tmp_path)
         assert status == 2
         assert words in err

@@ -1,6 +1,7 @@
 """What README.md, the pages and the notebooks show is there and runs."""
 
 import ast
+import importlib.util
 import io
 import json
 import os
@@ -123,7 +124,7 @@ def test_every_part_of_the_package_is_in_the_table():
     package = ROOT / "tactslip_torch"
     parts = {path.name + "/" for path in package.iterdir() if (path / "__init__.py").exists()}
     parts |= {path.name for path in package.glob("*.py")} - {"__init__.py"}
-    assert {part for part in parts if f"`{part}`" not in PAGES["docs/contributing.md"]} == set()
+    assert {part for part in parts if f"`{part}`" not in PAGES["CONTRIBUTING.md"]} == set()
 
 
 def test_every_public_name_is_in_the_reference():
@@ -135,7 +136,7 @@ def test_every_dependency_and_its_licence_is_named():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     needed = sum((extras[of] for of in ("formats", "live")), project["dependencies"])
-    licences = PAGES["README.md"].split("## Licence")[1]
+    licences = PAGES["README.md"].split("## Citation")[1]
     names = [re.match(r"[\w-]+", one)[0] for one in needed]
     assert [name for name in names if not re.search(rf"\b{name}\b", licences)] == []
     bounded = [one for one in needed if "<" in one]
@@ -149,7 +150,7 @@ def test_lines_of_code_are_counted():
 
 
 def test_readme_is_short():
-    assert len(PAGES["README.md"].encode()) <= 10_000
+    assert len(PAGES["README.md"].encode()) <= 8_000
 
 
 def strings(path):
@@ -229,3 +230,24 @@ def test_it_takes_few_lines_of_public_names() -> None:
     for module, names in imported:
         assert module == "tactslip_torch"
         assert set(names.split(", ")) <= set(tactslip_torch.__all__)
+
+
+def test_a_citation_is_of_this_version() -> None:
+    version = tactslip_torch.__version__.partition(".dev")[0]
+    cited = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {version}\n" in cited
+    assert f"version = {{{version}}}" in PAGES["README.md"]
+
+
+def test_links_of_the_index_lead_into_the_repository() -> None:
+    """Pictures to their bytes, pages to what shows them; other links are left alone."""
+    pytest.importorskip("hatchling")
+    spec = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    text = "![a](docs/a.png) [b](docs/b.md#c) [d](#e) [f](https://g.h)"
+    at = "https://host/us"
+    assert module.absolute(text, at) == (
+        f"![a]({at}/raw/HEAD/docs/a.png) [b]({at}/blob/HEAD/docs/b.md#c) [d](#e) [f](https://g.h)"
+    )
+    assert module.absolute(text, "") == text

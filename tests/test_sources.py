@@ -67,6 +67,7 @@ def test_a_change_of_what_a_benchmark_rests_on_changes_its_digest(
 def test_comments_docstrings_and_other_modules_do_not_change_a_digest(digest_of) -> None:
     changed = _replaced("tactslip_torch/b.py", '"""Twice."""', '"""Two times."""  # so')
     changed["tactslip_torch/unused.py"] = "x = 2\n"
+    changed |= _replaced("conf/a.yaml", "source:", "# so\n\nsource:   # as it is")
     assert digest_of(changed) == digest_of({})
 
 

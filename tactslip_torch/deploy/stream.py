@@ -262,6 +262,9 @@ def stream_graph(
             )
             statistic, time_s = statistic.cast(dtype), samples / rate_hz
             is_known = onset_score > NOTHING_YET
+            hinted = onset_score >= onset.hint
+            if math.isfinite(onset.hint):
+                hinted |= by_onset  # as a threshold that is given may be below it
             is_high = by_onset.cast(F64)
             one = graph.constant([1.0], F64)
             alarm, on, of_alarm, now_lost = raised(
@@ -280,7 +283,7 @@ def stream_graph(
                 at_hop.slice(len(OF_LAST_BIN), END, 1).cast(BOOL),
                 onset_score,
                 by_onset,
-                onset_score >= onset.hint,
+                hinted,
                 next_state(of_alarm, now_lost, after),
             ]
 

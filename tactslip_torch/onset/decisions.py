@@ -130,7 +130,8 @@ class AlarmSettings:
         """The same with another ``alarm_threshold``."""
         if self.onset is None:
             return replace(self, threshold=value)
-        hint = min(self.onset.hint, value)  # which is never the higher one
+        hint = self.onset.hint  # infinite for none; otherwise never above the threshold
+        hint = min(hint, value) if math.isfinite(hint) else hint
         return replace(self, onset=replace(self.onset, threshold=value, hint=hint))
 
     def latch_times(self, sample_rate_hz: float) -> dict[str, int]:
