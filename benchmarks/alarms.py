@@ -25,7 +25,7 @@ import numpy as np
 from hydra.utils import instantiate
 
 from benchmarks.harness import Benchmark, Job
-from benchmarks.tables import Table, by, percent
+from benchmarks.tables import Report, Table, by, percent
 from benchmarks.trainings import composed, resumed, say
 from tactslip_torch import AlarmSettings, SlipDetector
 from tactslip_torch.hand import HandLayout
@@ -202,6 +202,11 @@ class Alarms(Benchmark):
                 ),
             }
         }
+
+    def section(self, report: Report) -> str:
+        """The tables, and their figure."""
+        figure = "![Slips found, delays and false alarms](../benchmarks/results/alarms.png)"
+        return f"{super().section(report)}\n\n{figure}"
 
 
 def _fitted(given: Sequence[str], path: Path, has_detail: bool) -> dict[str, Any]:
