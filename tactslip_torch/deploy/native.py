@@ -37,7 +37,6 @@ FILE, SOURCE = "detector.tslip", "detector.c"
 FORMAT = 1
 _MAGIC = b"tactslip"
 _HEAD = struct.Struct("<8sIIII")  # magic, version, bytes, checksum of the rest, bytes of a number
-_WHOLE = 16  # engine.h
 
 Array = NDArray[Any]
 
@@ -256,24 +255,24 @@ def _write_plan(out: _Writer, plan: ctypes.Structure) -> None:
     out.arrays(plan, np.int32, descriptor=num_features, column=num_features)
     out.arrays(plan, np.uint32, need=places)
     for level in range(num_levels):
-        _write_matrix(out, plan.low, level, 4)
-        _write_matrix(out, plan.high, level, 4)
+        _write_matrix(out, plan.low, level)
+        _write_matrix(out, plan.high, level)
         for branch in (2 * level, 2 * level + 1):
-            _write_matrix(out, plan.out, branch, 4)
-            _write_matrix(out, plan.lines, branch, 8)
+            _write_matrix(out, plan.out, branch)
+            _write_matrix(out, plan.lines, branch)
     num_lines = plan.num_lines
     out.arrays(plan, ones=2 * num_lines, frequency_hz=num_lines)
     out.arrays(plan, gain_time=plan.num_samples, gain_lines=num_lines)
 
 
-def _write_matrix(out: _Writer, address: int, place: int, rows: int) -> None:
-    """The matrix of a place, in blocks of so many rows; none where nobody reads it."""
+def _write_matrix(out: _Writer, address: int, place: int) -> None:
+    """The matrix of a place; none where nobody reads it."""
     matrix = (native._Matrix * (place + 1)).from_address(address)[place]
     num_blocks = matrix.num_blocks if matrix.values else 0
     shape = (num_blocks, matrix.num_columns, matrix.width) if num_blocks else (0, 0, 0)
     out.numbers(*shape)
     out.arrays(matrix, np.int32, first=num_blocks)
-    out.arrays(matrix, values=num_blocks * shape[2] * rows)
+    out.arrays(matrix, values=num_blocks * shape[2] * native._ROWS)
 
 
 def _write_machine(out: _Writer, machine: ctypes.Structure) -> None:
@@ -310,7 +309,7 @@ def _write_machine(out: _Writer, machine: ctypes.Structure) -> None:
 
 
 def _filled(num: int) -> int:
-    return -(-num // _WHOLE) * _WHOLE
+    return -(-num // native._WHOLE) * native._WHOLE
 
 
 def _write_onset(out: _Writer, classifier: OnsetClassifier, most_lost: int) -> None:

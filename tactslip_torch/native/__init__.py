@@ -32,6 +32,7 @@ Number = type[np.float64] | type[np.float32]
 BackendName = Literal["auto", "native", "torch"]
 _LOG = logging.getLogger(__name__)
 MAX_BRANCHES = 32
+_ROWS = 8  # of a block of a matrix
 _WHOLE = 16  # numbers to a multiple of which arrays of the machine are filled up
 
 
@@ -261,7 +262,7 @@ class FeatureEngine(_Kept):
                 '; use backend="torch"'
             )
         self._num_rows = 2 * num_branches + 2
-        bands = [self._matrices(group, 4) for group in (low, high, out)]
+        bands = [self._matrices(group) for group in (low, high, out)]
         wanted = sorted(wanted)
         place = np.array([w[0] * self._num_rows + w[1] for w in wanted], np.int32)
         first = np.searchsorted(place, np.arange(num_channels * self._num_rows + 1))
@@ -290,7 +291,7 @@ class FeatureEngine(_Kept):
             self._array([w[3] for w in wanted], np.int32),
             self._array(need, np.uint32),
             *bands,
-            self._matrices(lines, 8),
+            self._matrices(lines),
             self._array(spectrum.sum(-1)),
             self._array(frequency_hz),
             self._array(_entropy_growth(spectrum.shape[1])),
@@ -358,16 +359,16 @@ class FeatureEngine(_Kept):
             memory[ends[0] : ends[1]].view(own).reshape(num, each),
         )
 
-    def _matrices(self, matrices: Sequence[Array], rows: int) -> int:
+    def _matrices(self, matrices: Sequence[Array]) -> int:
         """Matrices in blocks of rows, each with the columns that are not zero in it."""
         made = (_Matrix * max(1, len(matrices)))()
         for to, matrix in zip(made, matrices, strict=False):
             if not len(matrix):
                 continue
-            num = -(-len(matrix) // rows)
-            blocks = np.zeros((num * rows, matrix.shape[1]))
+            num = -(-len(matrix) // _ROWS)
+            blocks = np.zeros((num * _ROWS, matrix.shape[1]))
             blocks[: len(matrix)] = matrix
-            blocks = blocks.reshape(num, rows, -1)
+            blocks = blocks.reshape(num, _ROWS, -1)
             used = (np.abs(blocks) > 1e-15 * np.abs(matrix).max()).any(1)
             start = used.argmax(1)
             width = int((matrix.shape[1] - used[:, ::-1].argmax(1) - start).max())

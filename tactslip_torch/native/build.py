@@ -24,7 +24,7 @@ REMEDY = (
     "(features and simulation are then several times slower)"
 )
 _HERE = Path(__file__).parent
-_PARTS = ("engine", "judge", "bristles", "onset")  # compiled for each instruction set
+_PARTS = ("engine", "scoring", "bristles", "onset")  # compiled for each instruction set
 _ONCE = ("dispatch", "stream")  # and these for the oldest
 _HEADERS = ("engine.h", "vectors.h", "file.h", "tactslip.h")
 _SOURCES = (*_HEADERS, *(f"{part}.cpp" for part in (*_PARTS, *_ONCE)))

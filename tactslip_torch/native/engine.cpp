@@ -28,31 +28,41 @@ typedef uint8_t Bytes __attribute__((vector_size(VECTOR_BYTES)));
 
 // -- Products ------------------------------------------------------------------------------------
 
-// out = matrix * x, R rows at a time, of which each block has its own columns that are not zero.
-template <int R, class E, class V> INLINE void product(const Matrix<E>& matrix, const V* x, V* out) {
+// out = matrix * x, a block of rows at a time, which has its own columns that are not zero.
+template <class E, class V> INLINE void product(const Matrix<E>& matrix, const V* x, V* out) {
   const E* values = matrix.values;
   for (int32_t block = 0; block < matrix.num_blocks; ++block) {
-    V sums[R] = {};
+    V sums[ROWS] = {};
     const V* from = x + matrix.first[block];
-    for (int32_t k = 0; k < matrix.width; ++k, values += R)
+    for (int32_t k = 0; k < matrix.width; ++k, values += ROWS)
 #pragma GCC unroll 8
-      for (int r = 0; r < R; ++r) sums[r] += from[k] * values[r];
+      for (int r = 0; r < ROWS; ++r) sums[r] += from[k] * values[r];
 #pragma GCC unroll 8
-    for (int r = 0; r < R; ++r) out[block * R + r] = sums[r];
+    for (int r = 0; r < ROWS; ++r) out[block * ROWS + r] = sums[r];
   }
 }
 
 template <class V> struct Extent {
   V low, high, mean;
 };
+// In parts that do not wait for each other.
 template <class V> INLINE Extent<V> extent(const V* row, int32_t n) {
-  V low = row[0], high = low, total = low;
-  for (int32_t i = 1; i < n; ++i) {
-    low = smaller(low, row[i]);
-    high = larger(high, row[i]);
-    total += row[i];
-  }
-  return {low, high, total / (decltype(row[0][0] + 0))n};
+  constexpr int PARTS = 4;
+  V low[PARTS], high[PARTS], total[PARTS] = {};
+  for (int p = 0; p < PARTS; ++p) low[p] = high[p] = row[0];
+  auto take = [&](int p, V x) {
+    low[p] = smaller(low[p], x);
+    high[p] = larger(high[p], x);
+    total[p] += x;
+  };
+  int32_t i = 0;
+  for (; i + PARTS <= n; i += PARTS)
+#pragma GCC unroll 4
+    for (int p = 0; p < PARTS; ++p) take(p, row[i + p]);
+  for (; i < n; ++i) take(0, row[i]);
+  V mean = ((total[0] + total[1]) + (total[2] + total[3])) / (decltype(row[0][0] + 0))n;
+  return {smaller(smaller(low[0], low[1]), smaller(low[2], low[3])),
+          larger(larger(high[0], high[1]), larger(high[2], high[3])), mean};
 }
 
 // -- Descriptors of W rows at once ------------------------------------------------------------------
@@ -70,10 +80,12 @@ template <class E> struct Describe {
     E n;
   };
 
-  INLINE void sum(Row& row, const V* d, const V* other, int32_t n) {
+  // Makes d = (x - mean) * factor, and the sums; x may be d.
+  INLINE void sum(Row& row, const V* x, V mean, V factor, V* d, const V* other, int32_t n) {
     V first = {}, second = {}, third = {}, fourth = {}, both = {};
     for (int32_t i = 0; i < n; ++i) {
-      V v = d[i], w = v * v;
+      V v = (x[i] - mean) * factor, w = v * v;
+      d[i] = v;
       first += magnitude(v);
       second += w;
       third += w * v;
@@ -324,13 +336,13 @@ template <class E> struct Group : Describe<E> {
   }
 
   void convolve(int32_t taps) {
-    for (int32_t i = 0; i < n; i += 4) {  // memory is there for some samples more
-      V sums[4] = {};
+    for (int32_t i = 0; i < n; i += 8) {  // memory is there for some samples more
+      V sums[8] = {};
       for (int32_t k = 0; k < taps; ++k)
-#pragma GCC unroll 4
-        for (int r = 0; r < 4; ++r) sums[r] += window[i + k + r] * weights[k];
-#pragma GCC unroll 4
-      for (int r = 0; r < 4; ++r) y[i + r] = sums[r];
+#pragma GCC unroll 8
+        for (int r = 0; r < 8; ++r) sums[r] += window[i + k + r] * weights[k];
+#pragma GCC unroll 8
+      for (int r = 0; r < 8; ++r) y[i + r] = sums[r];
     }
   }
 
@@ -371,9 +383,8 @@ template <class E> struct Group : Describe<E> {
     }
   }
 
-  // All that is wanted of the rows centre + span * d; sorts d.
-  void describe(uint32_t wanted, int32_t count, Row& s, const V* with, const E* gain, bool in_time) {
-    Base::sum(s, d, with, count);
+  // All that is wanted of the rows centre + span * d, summed before; sorts d.
+  void describe(uint32_t wanted, int32_t count, Row& s, const E* gain, bool in_time) {
     s.other = other;
     if (in_time) s.energy = s.span * s.span * s.second + s.n * s.centre * s.centre;
     if (wanted & 1u << MEAN) values[MEAN] = Base::mean(s);
@@ -438,8 +449,8 @@ template <class E> struct Group : Describe<E> {
     if (wanted) {
       V factor = 1 / s.span;
       factor = s.span > 0 ? factor : V{};
-      for (int32_t i = 0; i < n; ++i) d[i] = (row[i] - e.mean) * factor;
-      describe(wanted, n, s, with, plan.gain_time, true);
+      Base::sum(s, row, e.mean, factor, d, with, n);
+      describe(wanted, n, s, plan.gain_time, true);
       write(row_number);
     }
     centre = middle;
@@ -463,7 +474,7 @@ template <class E> struct Group : Describe<E> {
     V inverse = 1 / most, low = V{} + 1, high = {}, sum = {}, moment = {};
     inverse = most > 0 ? inverse : V{};
     for (int32_t i = 0; i < count; ++i) {
-      V amplitude = root(d[i] * inverse);
+      V amplitude = root_of_part(d[i] * inverse);
       d[i] = amplitude;
       sum += amplitude;
       moment += amplitude * plan.frequency_hz[i];
@@ -479,13 +490,13 @@ template <class E> struct Group : Describe<E> {
     }
     V mean = sum / (E)count, spread = high - low, factor = 1 / spread;
     factor = spread > 0 ? factor : V{};
-    for (int32_t i = 0; i < count; ++i) d[i] = (d[i] - mean) * factor;
     Row s;
+    Base::sum(s, d, mean, factor, d, nullptr, count);
     s.top = scale * root(most);
     s.centre = s.top * mean;
     s.span = s.top * spread;
     s.energy = scale * scale * energy;
-    describe(wanted, count, s, nullptr, plan.gain_lines, false);
+    describe(wanted, count, s, plan.gain_lines, false);
     write(row_number);
     return energy;
   }
@@ -518,9 +529,9 @@ template <class E> struct Group : Describe<E> {
     int32_t starts[MAX_BRANCHES / 2 + 1] = {0};
     for (int32_t m = 0; m < levels_wanted; ++m) {
       const V* from = m ? approximation + starts[m - 1] : y;
-      product<4>(plan.low[m], from, approximation + starts[m]);
-      product<4>(plan.high[m], from, coefficients + starts[m]);
-      starts[m + 1] = starts[m] + 4 * plan.low[m].num_blocks;
+      product(plan.low[m], from, approximation + starts[m]);
+      product(plan.high[m], from, coefficients + starts[m]);
+      starts[m + 1] = starts[m] + ROWS * plan.low[m].num_blocks;
     }
     V energies[MAX_BRANCHES];
     bool has_total = false;  // the spectrum of the approximation last formed
@@ -548,13 +559,13 @@ template <class E> struct Group : Describe<E> {
   }
 
   void form(int32_t branch, const V* from, uint32_t wanted) {
-    product<4>(plan.out[branch], from, row);
+    product(plan.out[branch], from, row);
     describe_time(wanted, branch % 2 == 0, raw, branch);
   }
 
   void spectrum_of(int32_t branch, const V* from, V* to) {
     for (int32_t k = 0; k < plan.lines[branch].num_columns; ++k) few[k] = from[k] * unit;
-    product<8>(plan.lines[branch], few, to);
+    product(plan.lines[branch], few, to);
   }
 
   // Each branch's share of the energy of all spectra; 0 if all are zero.
@@ -579,7 +590,7 @@ template <class E> struct Group : Describe<E> {
 
 // Which bins are valid, and which in range (features/sensing.py: is_enough).
 template <class E>
-void judge_channels(const Plan<E>& plan, const Bins<E>& bins, int32_t start, int32_t num_bins) {
+void count_channels(const Plan<E>& plan, const Bins<E>& bins, int32_t start, int32_t num_bins) {
   const Sensing<E>& sensing = *bins.sensing;
   for (int32_t b = start; b < start + num_bins; ++b) {
     int32_t num_alive = 0, num_fit = 0;
@@ -601,7 +612,7 @@ template <class E> struct Run {
   const Bins<E>& bins;
   alignas(VECTOR_BYTES) Group<E> group;
   E* features;
-  void* for_judge;
+  void* for_scores;
 
   Run(const Plan<E>* plan, const Machine<E>* machine, const Bins<E>& bins)
       : machine(machine), bins(bins), group(plan ? *plan : no_plan, bins) {}
@@ -611,8 +622,8 @@ template <class E> struct Run {
     features = (E*)group.place(space);
     if (!machine) return (char*)features;
     int32_t num = bins.num_bins < CHUNK ? bins.num_bins : CHUNK;
-    for_judge = features + (size_t)num * group.plan.num_features;
-    return (char*)for_judge + LEVEL::judge_space(machine, bins.num_bins);
+    for_scores = features + (size_t)num * group.plan.num_features;
+    return (char*)for_scores + LEVEL::scores_space(machine, bins.num_bins);
   }
 
   void go() {
@@ -624,12 +635,12 @@ template <class E> struct Run {
       group.first_bin = machine ? start : 0;
       group.out = machine ? features : bins.features;
       describe(plan, start, num);
-      if (bins.sensing) judge_channels(plan, bins, start, num);
+      if (bins.sensing) count_channels(plan, bins, start, num);
       if (!machine) continue;
       int32_t stride = plan.num_features ? plan.num_features : bins.bin_stride;
       const E* given = (const E*)bins.samples + (ptrdiff_t)start * stride;
       const E* inputs = plan.num_features ? features : given;
-      LEVEL::judge(machine, &bins, inputs, stride, start, num, for_judge);
+      LEVEL::scores(machine, &bins, inputs, stride, start, num, for_scores);
     }
   }
 

@@ -12,9 +12,11 @@ enum Descriptor {
 };
 constexpr int MAX_BRANCHES = 32;  // and at least NUM_DESCRIPTORS, whose place band energy ratios take
 
-// Blocks of rows, 4 or 8; of each block `width` columns from `first` on are not zero.
+constexpr int ROWS = 8;  // of a block of a matrix
+
+// Blocks of rows, of each of which `width` columns from `first` on are not zero.
 template <class E> struct Matrix {
-  const E* values;       // [num_blocks, width, rows of a block]; null: nothing reads it
+  const E* values;       // [num_blocks, width, ROWS]; null: nothing reads it
   const int32_t* first;  // [num_blocks]
   int32_t num_blocks, num_columns, width;
 };
@@ -141,9 +143,9 @@ template <class E> struct OnsetHops {
   namespace level {                                                                                \
   template <class E> size_t features_space(const Plan<E>*, const Machine<E>*, const Bins<E>*);     \
   template <class E> void features(const Plan<E>*, const Machine<E>*, const Bins<E>*, void* space); \
-  template <class E> size_t judge_space(const Machine<E>*, int32_t num_bins);                      \
+  template <class E> size_t scores_space(const Machine<E>*, int32_t num_bins);                     \
   template <class E>                                                                               \
-  void judge(const Machine<E>*, const Bins<E>*, const E* inputs, int32_t stride, int32_t start,    \
+  void scores(const Machine<E>*, const Bins<E>*, const E* inputs, int32_t stride, int32_t start,   \
              int32_t num, void* space); /* of features: what features() calls */                   \
   template <class E> size_t onset_memory(const Onset<E>*); /* in numbers */                        \
   template <class E> size_t onset_space(const Onset<E>*);                                          \

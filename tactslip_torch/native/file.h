@@ -206,15 +206,14 @@ template <class E> struct Model {
     return true;
   }
 
-  // R rows a block; 0 blocks where `may_lack` it.
-  template <int R> Matrix<E> matrix(Reader<E>& in, int32_t num_rows, int32_t most_columns,
-                                    bool may_lack) {
+  // 0 blocks where `may_lack` it.
+  Matrix<E> matrix(Reader<E>& in, int32_t num_rows, int32_t most_columns, bool may_lack) {
     Matrix<E> own = {};
-    own.num_blocks = in.number(may_lack ? 0 : 1, (num_rows + R - 1) / R);
+    own.num_blocks = in.number(may_lack ? 0 : 1, (num_rows + ROWS - 1) / ROWS);
     own.num_columns = in.number(own.num_blocks ? 1 : 0, most_columns);
     own.width = in.number(own.num_blocks ? 1 : 0, own.num_columns);
     in.all({{&own.first, own.num_blocks, 0, own.num_columns - own.width}});
-    in.all({{&own.values, (int64_t)own.num_blocks * own.width * R}});
+    in.all({{&own.values, (int64_t)own.num_blocks * own.width * ROWS}});
     if (!own.num_blocks) own.values = nullptr;
     return own;
   }
@@ -254,15 +253,15 @@ template <class E> struct Model {
     p.low = low, p.high = high, p.out = out, p.lines = lines;
     p.num_coefficients = 16;
     for (int32_t m = 0, num = bin; m < num_levels && !in.is_wrong; ++m) {
-      Matrix<E> of_low = matrix<4>(in, bin + 64, num, false);
-      num = 4 * of_low.num_blocks;
+      Matrix<E> of_low = matrix(in, bin + 64, num, false);
+      num = ROWS * of_low.num_blocks;
       p.num_coefficients += num + 8;
       put(low, m, of_low);
-      put(high, m, matrix<4>(in, num, of_low.num_columns, false));
+      put(high, m, matrix(in, num, of_low.num_columns, false));
       for (int32_t b = 2 * m; b < 2 * m + 2; ++b) {
-        put(out, b, matrix<4>(in, bin, num, false));
+        put(out, b, matrix(in, bin, num, false));
         int32_t most = num < bin ? num : bin;
-        put(lines, b, matrix<8>(in, 2 * p.num_lines, most, true));
+        put(lines, b, matrix(in, 2 * p.num_lines, most, true));
       }
     }
     in.all({{&p.ones, 2 * p.num_lines}, {&p.frequency_hz, p.num_lines}, {&p.gain_time, bin},

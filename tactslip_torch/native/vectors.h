@@ -43,11 +43,30 @@ template <class E> INLINE E size_of(E x) { return x < 0 ? -x : x; }
 
 template <class V> INLINE V smaller(V a, V b) { return a < b ? a : b; }
 template <class V> INLINE V larger(V a, V b) { return a > b ? a : b; }
-template <class V> INLINE V magnitude(V a) { return larger(a, -a); }
+INLINE Lanes<double>::V magnitude(Lanes<double>::V a) {
+  return (Lanes<double>::V)((Lanes<double>::Bits)a & (~0ull >> 1));
+}
+INLINE Lanes<float>::V magnitude(Lanes<float>::V a) {
+  return (Lanes<float>::V)((Lanes<float>::Bits)a & (~0u >> 1));
+}
 template <class V> INLINE V root(V a) {
   constexpr int num = sizeof(V) / sizeof(a[0]);
   for (int k = 0; k < num; ++k) a[k] = root_of(a[k]);
   return a;
+}
+// Of a number from 0 to 1; in double by that of float, and two steps of Newton's, as it is slow.
+INLINE Lanes<float>::V root_of_part(Lanes<float>::V x) { return root(x); }
+INLINE Lanes<double>::V root_of_part(Lanes<double>::V x) {
+#if VECTOR_BYTES >= 16
+  typedef Lanes<double>::V V;
+  typedef float Half __attribute__((vector_size(VECTOR_BYTES / 2)));
+  Half least = __builtin_convertvector(larger(x, V{} + 1e-36), Half);
+  V inverse = __builtin_convertvector(1 / root(least), V), half = 0.5 * inverse, found = x * inverse;
+  found += (x - found * found) * half;
+  return found + (x - found * found) * half;
+#else
+  return root(x);
+#endif
 }
 template <class M> INLINE bool any(M mask) {
   uint32_t words[sizeof(M) / 4], all = 0;

@@ -17,6 +17,7 @@ template <> struct Series<double> {
   static constexpr uint64_t ONE = 0x3ff0000000000000, LOWEST = 0x3fe6a09e00000000;  // sqrt(1/2)
   static constexpr double LN2_HIGH = 6.93147180369123816490e-01, LN2_LOW = 1.90821492927058770002e-10;
   static constexpr double LN_LARGEST = 0x1.62e42fefa39efp9;
+  static constexpr uint64_t INVERSE = 0x7fde623822fc16e6;  // less a number's bits: about 1 over it
   template <class V> INLINE V at(V z) {
     return z * (6.666666666666735130e-01 + z * (3.999999999940941908e-01 +
            z * (2.857142874366239149e-01 + z * (2.222219843214978396e-01 +
@@ -29,6 +30,7 @@ template <> struct Series<float> {
   static constexpr uint32_t ONE = 0x3f800000, LOWEST = 0x3f3504f3;
   static constexpr float LN2_HIGH = 6.9313812256e-01f, LN2_LOW = 9.0580006145e-06f;
   static constexpr float LN_LARGEST = 0x1.62e43p6f;
+  static constexpr uint32_t INVERSE = 0x7ef311c7;
   template <class V> INLINE V at(V z) {
     return z * (6.6666662693e-01f + z * (4.0000972152e-01f +
            z * (2.8498786688e-01f + z * 2.4279078841e-01f)));
@@ -45,13 +47,18 @@ template <class E> INLINE typename Lanes<E>::V log1p_of(typename Lanes<E>::V x) 
   V k = (V)((bits >> Own::DIGITS) + ((Bits)(V{} + whole) - Own::BIAS)) - whole;
   V f = (V)((bits & digits) + Own::LOWEST) - 1;
   V s = f / (2 + f), z = s * s, half = (E)0.5 * f * f;
-  return k * Own::LN2_HIGH - ((half - (s * (half + Own::at(z)) + (k * Own::LN2_LOW + lost / u))) - f);
+  V about = (V)(Own::INVERSE - (Bits)smaller(u, V{} + (E)0x1p60));  // to an eighth: enough
+  return k * Own::LN2_HIGH - ((half - (s * (half + Own::at(z)) + (k * Own::LN2_LOW + lost * about))) - f);
+}
+
+template <class V> INLINE V inverse_of(V scale) {
+  typedef decltype(scale[0] + 0) E;
+  return smaller(1 / scale, V{} + Limits<E>::LARGEST);
 }
 
 // sign(x) scale log(1 + |x| / scale)
-template <class E> INLINE typename Lanes<E>::V signed_log(typename Lanes<E>::V x, typename Lanes<E>::V scale) {
-  typedef typename Lanes<E>::V V;
-  V size = x < 0 ? -x : x, ratio = size / scale, bent = scale * log1p_of<E>(ratio);
+template <class E, class V> INLINE V signed_log(V x, V scale, V inverse) {
+  V size = magnitude(x), ratio = size * inverse, bent = scale * log1p_of<E>(ratio);
   auto is_far = ratio > Limits<E>::LARGEST;
   if (any(is_far))
     for (int k = 0; k < Lanes<E>::NUM; ++k)
@@ -67,7 +74,7 @@ enum Across { BINS, ONE_BIN };
 
 constexpr int32_t filled_up(int32_t num) { return (num + WHOLE - 1) / WHOLE * WHOLE; }
 
-template <class E> struct Judge {
+template <class E> struct Scorer {
   static constexpr int L = Lanes<E>::NUM;
   typedef typename Lanes<E>::V V;
   const Machine<E>& machine;
@@ -77,7 +84,7 @@ template <class E> struct Judge {
   int few;
   const uint8_t* is_lost;  // of these bins
 
-  explicit Judge(const Machine<E>& machine) : machine(machine) {}
+  explicit Scorer(const Machine<E>& machine) : machine(machine) {}
 
   char* place(char* at, int32_t num_bins) {
     int32_t lanes = num_bins > 1 ? L : 1, most = machine.most_channels;
@@ -91,21 +98,21 @@ template <class E> struct Judge {
   }
 
   // Of inputs of bins from `start` on.
-  void judge(const E* inputs, int32_t stride, int32_t start, int32_t num, const Bins<E>& bins) {
+  void run(const E* inputs, int32_t stride, int32_t start, int32_t num, const Bins<E>& bins) {
     for (int32_t b = 0; b < num; b += few) {
       at = start + b;
       few = (int)(num - b < L ? num - b : L);
       if (2 * few <= L) few = 1;  // up to here it is quicker
       is_lost = bins.is_lost ? bins.is_lost + (ptrdiff_t)at * machine.num_channels : nullptr;
       if (few == 1)
-        judge_few<ONE_BIN>(inputs + b * stride, stride, bins);
+        score_few<ONE_BIN>(inputs + b * stride, stride, bins);
       else
-        judge_few<BINS>(inputs + b * stride, stride, bins);
+        score_few<BINS>(inputs + b * stride, stride, bins);
     }
   }
 
   template <Across ACROSS>
-  void judge_few(const E* inputs, int32_t stride, const Bins<E>& bins) {
+  void score_few(const E* inputs, int32_t stride, const Bins<E>& bins) {
     const Machine<E>& m = machine;
     const V* x = ACROSS == BINS ? several : (const V*)inputs;
     for (int32_t i = 0; ACROSS == BINS && i < m.num_inputs; ++i)
@@ -167,9 +174,9 @@ template <class E> struct Judge {
     }
     for (int32_t r = 0; r < p.num_families; r += step<ACROSS>()) {
       V mean = {}, square = {}, low = {}, high = {}, last = {};
-      V scale = constants<ACROSS>(p.scales + r);
+      V scale = constants<ACROSS>(p.scales + r), inverse = inverse_of(scale);
       for (int32_t c = 0; c < p.num_channels; ++c) {
-        V value = signed_log<E>(gathered<ACROSS>(x, p.inputs + c * stride + r), scale);
+        V value = signed_log<E>(gathered<ACROSS>(x, p.inputs + c * stride + r), scale, inverse);
         values[c] = in_use[c] > 0 ? value : V{};
         mean += values[c];
         last = larger(last, values[c]);
@@ -214,7 +221,10 @@ template <class E> struct Judge {
   template <Across ACROSS> void scale(int32_t i) {
     const Machine<E>& m = machine;
     V value = gathered<ACROSS>(y, m.sources + i);
-    if (m.compression) value = signed_log<E>(value, constants<ACROSS>(m.compression + i));
+    if (m.compression) {
+      V scale = constants<ACROSS>(m.compression + i);
+      value = signed_log<E>(value, scale, inverse_of(scale));
+    }
     if (m.minimum) {
       V low = constants<ACROSS>(m.minimum + i), width = constants<ACROSS>(m.maximum + i) - low;
       V scaled = clamped<E>(2 * ((value - low) / width) - 1, 1);
@@ -283,21 +293,21 @@ template <class E> struct Judge {
 
 namespace LEVEL {
 
-template <class E> size_t judge_space(const Machine<E>* machine, int32_t num_bins) {
-  return (size_t)Judge<E>(*machine).place(nullptr, num_bins) + VECTOR_BYTES;
+template <class E> size_t scores_space(const Machine<E>* machine, int32_t num_bins) {
+  return (size_t)Scorer<E>(*machine).place(nullptr, num_bins) + VECTOR_BYTES;
 }
 
 template <class E>
-void judge(const Machine<E>* machine, const Bins<E>* bins, const E* inputs, int32_t stride,
+void scores(const Machine<E>* machine, const Bins<E>* bins, const E* inputs, int32_t stride,
            int32_t start, int32_t num, void* space) {
-  Judge<E> judge(*machine);
-  judge.place((char*)space, bins->num_bins);
-  judge.judge(inputs, stride, start, num, *bins);
+  Scorer<E> scorer(*machine);
+  scorer.place((char*)space, bins->num_bins);
+  scorer.run(inputs, stride, start, num, *bins);
 }
 
 #define MAKE(E)                                                                                    \
-  template size_t judge_space(const Machine<E>*, int32_t);                                         \
-  template void judge(const Machine<E>*, const Bins<E>*, const E*, int32_t, int32_t, int32_t, void*);
+  template size_t scores_space(const Machine<E>*, int32_t);                                        \
+  template void scores(const Machine<E>*, const Bins<E>*, const E*, int32_t, int32_t, int32_t, void*);
 MAKE(float)
 MAKE(double)
 
