@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 from typing import Any, ClassVar
@@ -24,7 +25,7 @@ import numpy as np
 from hydra.utils import instantiate
 
 from benchmarks.harness import Benchmark, Job
-from benchmarks.tables import Table, by, percent
+from benchmarks.tables import Report, Table, by, percent
 from benchmarks.trainings import composed, resumed, say
 from tactslip_torch import AlarmSettings, SlipDetector
 from tactslip_torch.hand import HandLayout
@@ -182,7 +183,7 @@ class Alarms(Benchmark):
             amounts = alarm["streams"]["calibrate"]
             heads.append(alarm["classifier"]["head"])
         rows = [_world_row(world, own) for (world,), own in by(slips, "world").items()]
-        rows.sort(key=lambda row: float(str(row["found %"])))
+        rows.sort(key=itemgetter("found %"))
         return {
             "tables": {
                 "Slips found": Table(
@@ -201,6 +202,11 @@ class Alarms(Benchmark):
                 ),
             }
         }
+
+    def section(self, report: Report) -> str:
+        """The tables, and their figure."""
+        figure = "![Slips found, delays and false alarms](../benchmarks/results/alarms.png)"
+        return f"{super().section(report)}\n\n{figure}"
 
 
 def _fitted(given: Sequence[str], path: Path, has_detail: bool) -> dict[str, Any]:
@@ -305,8 +311,8 @@ def _world_row(world: str, by_seed: Sequence[Mapping[str, Any]]) -> dict[str, An
     hints = [delay for of in by_seed for delay in of[HINT]]
     return {
         "world": world,
-        "found %": percent(fmean(share(SLIPPING_NOW))),
-        "lowest %": percent(min(share(SLIPPING_NOW))),
+        "found %": round(100 * fmean(share(SLIPPING_NOW)), 1),
+        "lowest %": round(100 * min(share(SLIPPING_NOW)), 1),
         "early %": percent(fmean(delay == "early" for delay in every)),
         "median ms": f"{median:.0f}",
         "p95 ms": f"{p95:.0f}",
@@ -324,8 +330,8 @@ def _alarm_rows(by_seed: Iterable[Sequence[Any]]) -> list[dict[str, Any]]:
     rows = []
     for (scene,), own in by(every, "scene").items():
         limit = own[0]["limit"]
-        row = {"kind": scene.replace("_", " "), "budget": "-" if limit is None else f"{limit:g} /h"}
-        for method, column in {SLIPPING_NOW: "alarm", Cusum.name: BINS, DETAIL: DETAIL}.items():
+        row = {"kind": scene.replace("_", " ")}
+        for method, column in {SLIPPING_NOW: "alarm", Cusum.name: BINS, DETAIL: "detail"}.items():
             of = [one for one in own if one["method"] == method]
             alarms, hours = sum(one["alarms"] for one in of), sum(one["amount"] for one in of)
             if not of:
@@ -333,7 +339,7 @@ def _alarm_rows(by_seed: Iterable[Sequence[Any]]) -> list[dict[str, Any]]:
             low, high = Budget(scene, 1.0).interval(alarms, hours)
             row |= {column: f"{alarms / hours:.2f} [{low:.2f}, {high:.2f}]"}
             if method == SLIPPING_NOW:
-                row["of"] = f"{hours:.2f} h"
+                row |= {"budget": "-" if limit is None else f"{limit:g} /h", "of": f"{hours:.2f} h"}
         rows.append(row)
     return rows
 
