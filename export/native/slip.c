@@ -81,7 +81,7 @@ static int take(struct slip *slip, struct slip_decision *out, int num) {
             .probability = made.probability, .statistic = made.statistic,
             .valid = made.is_valid, .in_range = made.in_range, .channels_lost = lost,
             .alarm = made.is_alarm, .on = made.is_on, .onset_score = made.onset_score,
-            .by_onset = made.by_onset,
+            .by_onset = made.by_onset, .hint = made.is_hint,
         };
     }
     return num;
