@@ -1,6 +1,7 @@
 """libtactslip, run by ctypes, decides what the package and the exported graph decide."""
 
 import copy
+import math
 from dataclasses import replace
 
 import hosts
@@ -215,6 +216,18 @@ def test_another_threshold_counts_at_once(detector):
         assert_same(found, by_package(detector, samples, threshold=value))
         changes |= (found["on"] != by_package(detector, samples)["on"]).any()
     assert changes
+
+
+@pytest.mark.parametrize("hint", [-0.5, math.inf])
+def test_a_hint_is_never_above_the_threshold_and_comes_only_where_there_is_one(hint):
+    detector, samples = copy.deepcopy(alarming_detector(True)), kind_of("as it is")
+    settings = AlarmSettings.of(detector)
+    detector.info[KEY] = replace(settings, onset=replace(settings.onset, hint=hint)).to_dict()
+    stream = stream_of(detector)
+    stream.set_threshold(-0.8)
+    found = stream.push(samples)
+    assert_same(found, by_package(detector, samples, threshold=-0.8))
+    assert found["hint"].any() == math.isfinite(hint)
 
 
 def test_samples_that_repeat_are_counted_over_pushes(detector):

@@ -123,10 +123,10 @@ template <class E> struct Stream : tactslip {
     memset(memory, 0, OF_LEVEL(level, onset_memory<E>(&m.onset)) * sizeof(E));
   }
 
-  // Of the alarm, whose hint is never the higher one.
+  // Of the alarm, whose hint, if there is one, is never the higher one.
   void set_threshold(double value) {
     (model.has_onset ? model.onset_threshold : model.threshold) = value;
-    hint = value < model.onset_hint ? value : model.onset_hint;
+    hint = isfinite(model.onset_hint) && value < model.onset_hint ? value : model.onset_hint;
   }
 
   // What the rule gathered.
