@@ -65,7 +65,7 @@ def rules(detector, volts):
     return {
         "debounced": usual,
         "k of n below 0": replace(usual, threshold=-0.5),
-        "one of one": replace(usual, rule=KOfN(1, 1), threshold=-1.0),
+        "one of one": replace(usual, rule=KOfN(1, 1), threshold=-0.25),
         "cusum": replace(usual, rule=Cusum(0.5, 0.5, 9.0), threshold=3.0),
         "onset": replace(usual, rule=Cusum(3.0, 0.5, 30.0), threshold=15.0, onset=onset),
     }
