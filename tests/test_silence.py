@@ -31,6 +31,8 @@ from tactslip_torch.onset.rules import Cusum, KOfN
 RATE = 2000.0
 REACH = 150  # samples that a decision of the shipped detector rests on
 SLIP_S = 1.2934
+QUIET = slice(200, 2000)
+"""Nothing slips; in the first .1 s and behind 1 s scores are close to 0."""
 N = 6000  # samples of a hand that senses nothing
 
 
@@ -150,7 +152,7 @@ DEAD = (
 def test_a_hand_that_senses_nothing_has_no_probability_and_no_alarm(
     detector, volts, rules, kind, is_behind
 ):
-    quiet = volts[:2000]
+    quiet = volts[QUIET]
     samples = hand_of(kind, quiet)
     begins = len(quiet) if is_behind else 0
     whole = torch.cat([quiet[:begins], samples, quiet])
@@ -170,7 +172,7 @@ def test_a_hand_that_senses_nothing_has_no_probability_and_no_alarm(
 
 
 def test_half_of_the_fast_channels_and_a_third_of_the_gain_are_valid(detector, volts, rules):
-    half, quiet = volts[:2000].clone(), volts[:2000]
+    half, quiet = volts[QUIET].clone(), volts[QUIET]
     half[:, 14:19] = 0.0
     for samples, num_lost in ((half, 5), (0.3 * quiet, 0)):
         made, alarms, _ = decided(detector, rules["debounced"], samples)
@@ -183,7 +185,7 @@ def test_half_of_the_fast_channels_and_a_third_of_the_gain_are_valid(detector, v
 
 
 def test_gains_that_set_the_threshold_are_in_range_and_others_are_not(detector, volts, rules):
-    quiet = volts[:2000]
+    quiet = volts[QUIET]
     spans = score_stream(detector, quiet.T, 50).span
     levels = Sensing.fit(torch.cat([300 * spans, 3000 * spans]), 1, 1)
     for rule in ("debounced", "onset"):
@@ -221,7 +223,7 @@ def test_an_alarm_stands_over_a_short_loss_and_ends_in_a_long_one(detector, volt
 
 
 def test_a_hand_whose_unit_is_another_is_told_once(detector, volts, rules):
-    quiet = volts[:2000].repeat(4, 1)
+    quiet = volts[QUIET].repeat(4, 1)
     for factor, said in (
         (1e-3, "a thousandth"),
         (40.0, "times"),

@@ -89,7 +89,7 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
 
 def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> None:
     """Print the tables of a run."""
-    texts = [splits_table(metrics), *_comparison_lines(metrics), *_trained_on_lines(metrics)]
+    texts = [_splits_table(metrics), *_comparison_lines(metrics), *_trained_on_lines(metrics)]
     texts.append(_materials_table(metrics))
     for key, tables in (
         ("events", (_events_table,)),
@@ -119,7 +119,7 @@ def _score_cells(scores: Mapping[str, Any]) -> _Row:
     return _percents(scores, _SCORES) | {"bins": scores.get("num_bins")}
 
 
-def splits_table(metrics: _Metrics) -> str:
+def _splits_table(metrics: _Metrics) -> str:
     """Accuracy, balanced accuracy, both recalls and bins of each split; baselines and paper below.
 
     The paper's row is left out where hand or scenes are not its own.

@@ -182,7 +182,7 @@ def table_of(path: Path) -> Path:
     return table
 
 
-def _read_episode(path: Path, how: Reading, stack: ExitStack) -> Opened:
+def read_episode(path: Path, how: Reading, stack: ExitStack) -> Opened:
     """The tactile columns of an episode, by ``timestamp`` and at the rate ``fps``.
 
     The features are those that ``reading.samples`` names, with ``*`` for any text, by default the
