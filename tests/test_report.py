@@ -150,8 +150,8 @@ def test_the_papers_numbers_stand_beside_its_own_scenes_alone(drawn, tmp_path, s
     own, other = (figure.axes[0].get_xlabel() for figure in drawn)
     assert ("paper: non-slip 93.8" in own) == is_papers
     assert other == "prediction\n\n"
-    assert any(row[0] == "paper" for row in rows_of(results.splits_table(metrics))) == is_papers
-    assert results.PAPER_LINE not in results.splits_table(elsewhere)
+    assert any(row[0] == "paper" for row in rows_of(results._splits_table(metrics))) == is_papers
+    assert results.PAPER_LINE not in results._splits_table(elsewhere)
     lines = results._materials_table(metrics).splitlines()
     expected = ["acrylic", "ABS", "20 mm/s", "40 mm/s", "60 mm/s"]
     if len(scenes) > 1:
