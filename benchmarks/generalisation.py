@@ -21,6 +21,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from hydra.utils import instantiate
 from matplotlib.figure import Figure
+from omegaconf import DictConfig
 from torch import Tensor
 
 from benchmarks import ROOT
@@ -227,6 +228,20 @@ def _calibration_error(parts: Sequence[_Scored], num_cells: int = 15) -> float:
     return 100 * float(gaps.abs().sum()) / len(truth)
 
 
+def _having(config: DictConfig, **most: int) -> Callable[[RecordingSource], list[RecordingId]]:
+    """The first recordings of each material with a role in the split, by role how many."""
+
+    def keep(source: RecordingSource) -> list[RecordingId]:
+        (split,) = instantiate(config.split, _convert_="all")(source.ids)
+        by_material: dict[str, list[RecordingId]] = {}
+        for role in most:  # a material has training and test recordings, or held-out ones
+            for recording in split.having(role):
+                by_material.setdefault(recording.material, []).append(recording)
+        return [one for own in by_material.values() for one in own[: most[split.roles[own[0]]]]]
+
+    return keep
+
+
 def _measured(name: str, given: Sequence[str], job: Job, sizes: Generalisation) -> dict[str, Any]:
     """All measures of an experiment with the overrides that give its seed and size."""
     folder, cache = job.folder / f"{name}-{given[0]}".replace("=", "-"), job.folder / "cache"
@@ -255,18 +270,7 @@ def _measured(name: str, given: Sequence[str], job: Job, sizes: Generalisation) 
         made = features_of_some(config, cache, keep)
         return [_scored(detector, each, half=half) for each in made]
 
-    def having(**most: int) -> Callable[[RecordingSource], list[RecordingId]]:
-        """The first recordings of each material with a role in ``unseen4``, by role how many."""
-
-        def keep(source: RecordingSource) -> list[RecordingId]:
-            (split,) = instantiate(whole.split, _convert_="all")(source.ids)
-            by_material: dict[str, list[RecordingId]] = {}
-            for role in most:  # a material has training and test recordings, or held-out ones
-                for recording in split.having(role):
-                    by_material.setdefault(recording.material, []).append(recording)
-            return [one for own in by_material.values() for one in own[: most[split.roles[own[0]]]]]
-
-        return keep
+    having = partial(_having, whole)
 
     def later(first: int) -> Callable[[RecordingSource], list[RecordingId]]:
         return lambda source: [r for r in source.ids if r.cycle >= first]
@@ -332,13 +336,8 @@ def _with_few(num: int, given: Sequence[str], job: Job) -> dict[str, float]:
     whole = composed("train", ["+exp=unseen4", *given])
     found = {"numbers in all": float(len(metrics["selected"]))}
     for role, label in (("test", "test"), ("unseen", "held-out materials")):
-
-        def keep(source: RecordingSource, role: str = role) -> list[RecordingId]:
-            (split,) = instantiate(whole.split, _convert_="all")(source.ids)
-            return list(split.having(role))
-
         for half, words in ((False, ""), (True, ", half of the channels missing")):
-            made = features_of_some(whole, cache, keep)
+            made = features_of_some(whole, cache, _having(whole, **{role: 99}))
             found[label + words] = _balanced([_scored(detector, one, half=half) for one in made])
     return found
 

@@ -32,9 +32,7 @@ from threadpoolctl import threadpool_info  # type: ignore[import-untyped]
 from benchmarks import RESULTS, ROOT
 from benchmarks.sources import digest
 from benchmarks.tables import Report, Table, chart, is_barred, lines
-from benchmarks.trainings import resumed as resumed
 from benchmarks.trainings import say as say
-from benchmarks.trainings import trained as trained
 from benchmarks.trainings import write_text
 from tactslip_torch.commands.stopping import errors_in_one_line, stopping
 from tactslip_torch.report import style

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 from benchmarks import ROOT
+from benchmarks.deployment import host
 from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import Array, loaded
 from benchmarks.tables import Table
@@ -166,10 +167,7 @@ def _others(detector: SlipDetector, folder: Path, samples: Array, rounds: int) -
     pieces = [samples[at : at + hop] for at in range(0, len(samples), hop)]
     stream = StreamingDetector(detector)
     export_detector(detector, folder, ("stream",))
-    sys.path.append(str(ROOT / "export" / "python"))
-    from files import load_model  # type: ignore[import-not-found]  # of the host
-
-    session, _ = load_model(folder / "stream.onnx", "stream")
+    session, _ = host("files").load_model(folder / "stream.onnx", "stream")
     names = [output.name for output in session.get_outputs()]
     feeds: dict[str, Any] = {"tail": samples[:0], "state": np.zeros(0), "threshold": np.zeros(0)}
     turn = {"package": 0, "graph": 0}

@@ -6,7 +6,7 @@ moves scores most, found by gradients; and the solver beside a solution of 80 di
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -120,7 +120,8 @@ class Numerics(Benchmark):
         nearest = scores.abs().argsort()[: self.attacked]
         start, before = samples[nearest], scores[nearest]
         digit = torch.from_numpy(np.spacing(np.abs(start.float().numpy()))).double()
-        ways = {"in any direction": torch.sign(torch.randn_like(start))}
+        drawn = torch.from_numpy(np.random.default_rng(0).choice((-1.0, 1.0), start.shape))
+        ways = {"in any direction": drawn}
         moved = torch.zeros_like(start)
         for _ in range(self.steps):  # each sample by one digit, where the gradient says
             x = (start + moved).requires_grad_()
@@ -185,20 +186,18 @@ def _scores_of(
     return scores
 
 
-def _draw(seed: int) -> Iterator[Array]:
-    rng = np.random.default_rng(seed)
-    while True:
-        yield rng.uniform(-1, 1, (14, 4))
+def _draw(seed: int) -> Array:
+    return np.random.default_rng(seed).uniform(-1, 1, (14, 4))
 
 
 def _duplicates(seed: int) -> tuple[Array, Array]:
-    z = next(_draw(seed))
+    z = _draw(seed)
     z[:, 1] = z[:, 0] * (1 + 1e-9)
     return z, np.where(z[:, 2] > 0, 1.0, -1.0)
 
 
 def _plain(seed: int) -> tuple[Array, Array]:
-    z = next(_draw(seed))
+    z = _draw(seed)
     return z, np.where(z[:, 0] * z[:, 1] > 0, 1.0, -1.0)
 
 

@@ -31,11 +31,12 @@ from torch import Tensor
 
 from benchmarks import ROOT
 from benchmarks.deployment import host
-from benchmarks.harness import Benchmark, Job, put_between, resumed, say
+from benchmarks.harness import Benchmark, Job, put_between, say
 from benchmarks.peers import others
 from benchmarks.real_sets import RealSet, read_set
 from benchmarks.tables import Report, Table, mean_sd, times
 from benchmarks.timing import interleaved, on_threads
+from benchmarks.trainings import resumed
 from tactslip_torch import SlipClassifier
 from tactslip_torch.onset.events import Bootstrap
 from tactslip_torch.report import style

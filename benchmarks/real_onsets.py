@@ -9,7 +9,6 @@ that gives the same rate of false alarms on these. Puts its table into docs/real
 from __future__ import annotations
 
 import csv
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.harness import Benchmark, Job, say
+from benchmarks.real_sets import HAND_COLUMNS, osu_object, osu_rows
 from benchmarks.tables import Table
 from tactslip_torch import HandLayout, Recording
 from tactslip_torch.data.recording import RecordingId, Stretch, Timeline
@@ -43,14 +43,7 @@ _RULES = EventRules(found_within_s=0.5, early_s=0.2, settle_s=0.5)
 _LATENCY = LatencyParts(look_ahead_s=0.0, bin_s=1 / _RATE_HZ)
 _CHANNELS = ("lx", "rx", "ly", "ry", "lz", "rz", "lgx", "rgx", "lgy", "rgy", "lgz", "rgz")
 _HAND = HandLayout.from_rows(
-    {
-        "name": name,
-        "kind": "gyro" if "g" in name else "acc",
-        "finger": {"l": "left", "r": "right"}[name[0]],
-        "segment": "distal",
-        "adapting": "fast",
-    }
-    for name in _CHANNELS
+    dict(zip(HAND_COLUMNS, row, strict=True)) for row in osu_rows(_CHANNELS)
 )
 Array = NDArray[Any]
 
@@ -87,7 +80,7 @@ class Trials:
         for place, path in enumerate(sorted(self.folder.glob("*_[CD]_*.csv"))):
             trial = _read(path)
             if trial.samples.shape[1] > 2 * _RATE_HZ:
-                made[RecordingId(re.sub(r"_[CD]_.*", "", path.stem), place)] = trial
+                made[RecordingId(osu_object(path), place)] = trial
         if not made:
             raise ValueError(
                 f"{self.folder} has no trials OBJECT_[CD]_*.csv of over two seconds: "

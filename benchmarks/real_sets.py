@@ -175,6 +175,17 @@ def biotacsp_direction(root: Path) -> RealSet:
     return found._replace(y=np.array([name.split("/")[0] for name in found.recording]))
 
 
+def osu_rows(names: Iterable[str]) -> list[tuple[str, ...]]:
+    """The channels of the set ``osu``, by ``HAND_COLUMNS``: fingertips left and right."""
+    fingers = {"l": "left", "r": "right"}
+    return [(n, "gyro" if "g" in n else "acc", fingers[n[0]], "distal", "fast") for n in names]
+
+
+def osu_object(path: Path) -> str:
+    """The object of a trial of the set ``osu``, by its file's name."""
+    return re.sub(r"_[CD]_.*", "", path.stem)
+
+
 def osu(root: Path) -> RealSet:
     """Acceleration and angular rate of two fingertips at about 25 Hz, slip over 1 cm/s."""
     windows = []
@@ -183,15 +194,12 @@ def osu(root: Path) -> RealSet:
             names, *rows = csv.reader(file)
         values = np.array([[float(value or "nan") for value in row[1:13]] for row in rows])
         samples = (values - np.nanmean(values[:15], 0)).T  # [12, T], tared on three frames
-        group = re.sub(r"_[CD]_.*", "", path.stem)
+        group = osu_object(path)
         for end in range(20, samples.shape[1] + 1, 5):
             window, label = samples[:, end - 20 : end], rows[end - 1][13]
             if label and np.isfinite(window).all():
                 windows.append((window, label == "1", group, path.stem))
-    hand = [
-        (n, "gyro" if "g" in n else "acc", {"l": "left", "r": "right"}[n[0]], "distal", "fast")
-        for n in names[1:13]
-    ]
+    hand = osu_rows(names[1:13])
     source = "fingertip IMUs, github.com/OSUrobotics/SimpleSlipDetection, GPL-2.0"
     return made(windows, 25.0, hand, source)
 

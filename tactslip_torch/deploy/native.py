@@ -169,7 +169,8 @@ class NativeFile:
                 _runner(made), detector, "stream", precision, exact_onsets=precision == "float64"
             )
         except ValueError as error:
-            raise ValueError(f"{FILE} was not written: {error}") from error
+            advice = "; give precision=float64" if precision == "float32" else ""
+            raise ValueError(f"{FILE} was not written: {error}{advice}") from error
         contents = {FILE: made.content} | ({SOURCE: made.as_constants()} if source else {})
         for name, each in contents.items():
             with whole_file(Path(folder) / name) as temporary:

@@ -73,7 +73,7 @@ POOLING = ("mean", "std", "min", "max")
 """Statistics over channels of the default."""
 
 
-class _Fitted:
+class _Fitted(ABC):
     """What the fits of two classes and of several share."""
 
     selection: FeatureSelection
