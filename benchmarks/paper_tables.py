@@ -44,11 +44,11 @@ from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.report import style
+from tactslip_torch.report.metrics import balanced_accuracy
 from tactslip_torch.signals.filtering import bins_at
 from tactslip_torch.simulation.scene import SEEN_MATERIALS
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.bins import BinSample, SampledBins
-from tactslip_torch.training.choice import balanced_accuracy
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import feature_cache, feature_maker
 from tactslip_torch.training.recipe import Paper

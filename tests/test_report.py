@@ -1,7 +1,7 @@
 """Tables and figures: what they say, of what, and that files are written whole."""
 
-import csv
 import itertools
+import csv
 import json
 import math
 
@@ -12,6 +12,7 @@ from drawing import assert_png, rows_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 
+from tactslip_torch.commands.entry import compare_runs
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.events import (
@@ -36,7 +37,6 @@ from tactslip_torch.report.recordings import (
     signals_figure,
 )
 from tactslip_torch.report.style import ALARM, table
-from tactslip_torch.report.sweep import sweep_table, write_sweep
 
 REASON = "nobody looked"
 
@@ -545,20 +545,18 @@ def test_the_table_says_what_is_simulated_what_is_wrong_and_what_it_leaves_out()
     assert onsets_of(simulated=False) == ["no alarm, and no slip missed"]
 
 
-RUNS = [
-    ("seed=0", {"test/accuracy": 0.9, "test/balanced_accuracy": 0.8}),
-    ("seed=1", {"test/accuracy": 0.7, "test/balanced_accuracy": 0.6}),
-]
-
-
-def test_runs_stand_beside_each_other_with_mean_and_deviation(tmp_path):
-    lines = sweep_table(RUNS, simulated=True).splitlines()
+def test_runs_stand_beside_each_other_with_mean_and_deviation(tmp_path, capsys):
+    runs = [
+        {"words": ["x=1", f"seed={seed}"], "place": tmp_path, "simulated": True}
+        | {"scores": {"test/accuracy": accuracy, "test/balanced_accuracy": balanced}}
+        for seed, (accuracy, balanced) in enumerate([(0.9, 0.8), (0.7, 0.6)])
+    ]
+    compare_runs(runs)
+    lines = capsys.readouterr().out.strip().splitlines()
     assert "SIMULATED" in lines[0]
     assert lines[2].split() == ["seed=0", "90.00", "80.00"]
     assert lines[4].split() == ["mean", "80.00", "70.00"]
     assert lines[5].split() == ["standard", "deviation", "10.00", "10.00"]
-    write_sweep(RUNS, tmp_path, simulated=True)
-    assert (tmp_path / "runs.png").read_bytes().startswith(b"\x89PNG")
     with (tmp_path / "runs.csv").open() as file:
         assert list(csv.reader(file))[2] == ["seed=1", "0.7", "0.6"]
 
