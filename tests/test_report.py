@@ -1,7 +1,7 @@
 """Tables and figures: what they say, of what, and that files are written whole."""
 
-import itertools
 import csv
+import itertools
 import json
 import math
 
@@ -222,16 +222,6 @@ def test_choices_show_what_each_view_was_given_and_what_would_have_been_best(cap
     assert line.endswith(": 81.25 % (M1 87.50, M2 75.00)")
 
 
-def test_the_figure_of_choices_has_a_line_a_view_and_a_star_for_each_that_is_kept(drawn, tmp_path):
-    results._validation_figure(metrics_of(validation=VIEW_CHOICES), tmp_path / "validation.png")
-    *of_views, stars = drawn[0].axes[0].get_lines()
-    labels = [line.get_label() for line in of_views]
-    assert [label.split(",")[0] for label in labels] == ["simple", "channel", "pooled"]
-    assert ["dropped" in label for label in labels] == [False, True, False]
-    assert of_views[0].get_xydata().tolist() == pytest.approx(np.array([[0.1, 80], [1, 81]]))
-    assert stars.get_xydata().tolist() == pytest.approx(np.array([[0.1, 80], [1, 75]]))
-
-
 def test_reliability_has_a_row_for_each_role():
     lines = results._reliability_table(metrics_of(alarm={"reliability": BY_ROLE})).splitlines()
     rows = [line.split() for line in lines[2:]]
@@ -320,8 +310,6 @@ def features_of(metrics, path):
 FIGURES = [
     (results._confusion_figure, {}),
     (results._confusion_figure, {"splits": ABSENT}),
-    (results._validation_figure, {"validation": CHOICES}),
-    (results._validation_figure, {"validation": VIEW_CHOICES}),
     (results._reliability_figure, {"alarm": {"reliability": BY_ROLE}}),
     (results._events_figure, {"events": EVENTS}),
     (features_of, {}),
@@ -359,7 +347,6 @@ def test_results_have_a_table_and_a_figure_of_all_there_is(drawn, tmp_path, caps
         assert words in out
     assert {path.name for path in (tmp_path / "all").iterdir()} == {
         *("metrics.json", "confusion.png", "selected_features.png", "events.png"),
-        "validation.png",
     }
     kept = json.loads((tmp_path / "all" / "metrics.json").read_text())
     assert kept["splits"] == everything["splits"]
