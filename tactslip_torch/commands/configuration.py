@@ -281,7 +281,7 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
         ValueError: if it cannot be composed.
     """
     typed = list(arguments)
-    arguments = with_folder(command, arguments)
+    arguments = _with_folder(command, arguments)
     has_hand = list(arguments) != typed
     if "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("RANK", "0") != "0":
         nowhere = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
@@ -439,7 +439,7 @@ def with_lists(command: str, config: DictConfig, hydra: Any) -> None:
 # A folder of recordings as the first argument -----------------------------------------------------
 
 
-def with_folder(command: str, arguments: Sequence[str]) -> list[str]:
+def _with_folder(command: str, arguments: Sequence[str]) -> list[str]:
     """The arguments of a command, a folder or file as the first of them made overrides.
 
     Args:
