@@ -4,7 +4,6 @@ import csv
 import itertools
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,10 +33,7 @@ from tactslip_torch.report.onset import (
     view_of,
 )
 from tactslip_torch.report.recordings import (
-    dataset_figure,
-    ranges_table,
     signals_figure,
-    trials_table,
 )
 from tactslip_torch.report.style import ALARM, table
 from tactslip_torch.report.sweep import sweep_table, write_sweep
@@ -603,39 +599,3 @@ def test_onsets_are_marked_and_slides_and_handling_shaded_as_far_as_in_view(
     words = [text.get_text() for text in figure.legends[0].get_texts()]
     assert words[:5] == ["little", "ring", "middle", "index", "thumb"]
     assert words[-3:] == ["onset of slip", "slip", "non-slip"]
-
-
-KNOWN = ("material", "scene", "duration_s", "slip_s", "non_slip_s", "num_onsets")
-TRIALS = [
-    dict(zip(KNOWN, known, strict=True))
-    for known in (("wood", "paper", 8.0, 3.5, 0.75, 2), ("iron", "paper", 9.0, 10.0, 0.0, 1))
-]
-
-
-@pytest.mark.parametrize("level", [1.0, np.nan])
-def test_a_set_is_drawn_by_material_above_the_traces_of_a_recording(drawn, tmp_path, level):
-    recording = recording_of()
-    recording.samples[:] *= level
-    wide = replace(recording, samples=recording.samples.tile(2, 1)[:40])
-    for example, names in ((recording, HAND.names), (wide, [f"E{i}" for i in range(40)])):
-        dataset_figure(TRIALS, ("w/0", example), names, tmp_path / "a.png", title="a set")
-    bars, traces = drawn[0].axes
-    assert [label.get_text() for label in bars.get_yticklabels()] == ["wood", "iron"]
-    widths = [patch.get_width() for patch in bars.patches]
-    assert widths == pytest.approx([3.5, 0.75, 3.75, 10.0, 0.0, 0.0])  # labelled more than there is
-    assert len(traces.get_yticklabels()) == 24
-    assert "24 of 40 channels" in drawn[1].axes[1].get_title("left")
-
-
-def test_tables_of_a_set():
-    taps = ("wood", "taps", 4.0, 0.0, 0.0, 0)
-    both = trials_table([*TRIALS, dict(zip(KNOWN, taps, strict=True))], simulated=True)
-    assert both.startswith("SIMULATED")
-    rows = [line.split() for line in both.splitlines()]
-    assert ["wood", "2", "4.00", "8.00", "12.0", "2", "3.5", "0.8"] in rows
-    assert ["taps", "1", "4.00", "4.00", "4.0", "0", "0.0", "0.0"] in rows
-    assert len(trials_table(TRIALS[:1], simulated=False).splitlines()) == 2  # no sum of one row
-    ranges = np.stack([np.full(24, -1.5), np.arange(24.0)], 1)
-    ranges[14:] = np.nan
-    rows = [line.split() for line in ranges_table(CHANNELS, ranges, "V").splitlines()]
-    assert rows[1:] == [["SG", "14", "-1.5", "13"], ["PVDF", "10", "nan", "nan"]]
