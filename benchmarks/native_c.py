@@ -31,6 +31,7 @@ from benchmarks.tables import Table
 from benchmarks.timing import interleaved, on_threads
 from benchmarks.trainings import composed, trained
 from tactslip_torch import SlipDetector, StreamingDetector, sample_recording
+from tactslip_torch.deploy.bins import Precision
 from tactslip_torch.deploy.check import Run, _session_of, runner
 from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.deploy.native import FILE, SOURCE, NativeFile
@@ -44,7 +45,7 @@ HOST = ROOT / "export" / "native"
 SOURCES = ("export/native/*", "export/native/board/*", "export/c/*.c", "export/c/*.h")
 TOOLS = ("make", "arm-none-eabi-g++", "qemu-system-arm", "aarch64-linux-gnu-g++", "qemu-aarch64")
 BOARDS = {"m7": "Cortex-M7 (mps2-an500)", "m4": "Cortex-M4F (mps2-an386)"}
-MARGIN_SD = {"float64": 1e-9, "float32": 1e-3}  # that an export may be off, deploy/check.py
+MARGIN_SD: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-3}  # as deploy/check.py allows
 _FULL_SCALE = 32000  # counts of the largest sample
 
 
@@ -251,12 +252,12 @@ def _test_set(detector: SlipDetector, every: int) -> Table:
     source = instantiate(config.data, _convert_="all")
     (fold,) = instantiate(config.split, _convert_="all")(source.ids)
     chosen = [each for each in source.ids if fold.roles.get(each) in ("test", "unseen")][::every]
-    ways: dict[tuple[str, str], Callable[[Array], Mapping[str, Array]]] = {}
+    ways: dict[tuple[str, Precision], Callable[[Array], Mapping[str, Array]]] = {}
     for precision in MARGIN_SD:
         ways["C", precision] = partial(_by_library, NativeFile.of(detector, precision))
         model = stream_graph(detector, AlarmSettings.of(detector), precision).model()
         ways["graph", precision] = partial(_by_graph, runner(_session_of(model)))
-    found: dict[tuple[str, str], list[Array]] = {way: [] for way in ways}
+    found: dict[tuple[str, Precision], list[Array]] = {way: [] for way in ways}
     for number, each in enumerate(chosen):
         say(f"native_c: recording {number + 1} of {len(chosen)} of the test set")
         given = source.load(each).samples.T.contiguous()
@@ -271,7 +272,8 @@ def _test_set(detector: SlipDetector, every: int) -> Table:
                 found[way, precision].append(np.stack([*columns, *expected]))
     rows = []
     for (way, precision), parts in found.items():
-        score, on, alarm, valid, *expected = np.concatenate(parts, 1)
+        both = np.concatenate(parts, 1)
+        (score, on, alarm, valid), expected = both[:4], both[4:]
         off, spread = np.abs(score - expected[0]), np.nanstd(expected[0])
         is_other = (score >= 0) != (expected[0] >= 0)
         is_outside = is_other & (np.abs(expected[0]) > MARGIN_SD[precision] * spread)

@@ -8,6 +8,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.deploy.bins import Precision
 from tactslip_torch.deploy.export import export_detector, summary, wanted_graphs
 from tactslip_torch.deploy.native import NativeFile
 from tactslip_torch.model.detector import SlipDetector
@@ -35,7 +36,7 @@ def export(config: DictConfig, results: Path) -> None:
             print(f"{path}: {path.stat().st_size / 1000:.0f} kB, {made.precision}{reason}")
         return
     graphs = wanted_graphs(config.graph, detector)
-    precision = "float32" if config.precision == "auto" else config.precision
+    precision: Precision = "float32" if config.precision == "auto" else config.precision
     for path in export_detector(detector, folder, graphs, precision, source=source):
         print(summary(path))
 

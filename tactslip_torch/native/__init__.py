@@ -463,7 +463,7 @@ class Machine(_Kept):
         self.of.sources = self._filled_up(sources, 0, np.int32)
         if fill is not None:
             self.of.fill = self._array(fill)
-        if minimum is not None:
+        if minimum is not None and maximum is not None:
             if dtype is np.float32:
                 centre, minimum, maximum = _centred(minimum, maximum, compression)
                 self.of.centre = self._filled_up(centre, 0.0)
