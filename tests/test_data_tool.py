@@ -173,28 +173,6 @@ def test_a_file_that_is_damaged_in_its_samples_is_a_problem(root, capsys, monkey
 # summary -------------------------------------------------------------------------------------
 
 
-def test_summary_tells_and_draws_what_there_is(root, tmp_path, capsys):
-    trials = run("summary", root, ROWS, f"output={tmp_path / 'set.png'}")
-    told = ("material", "slip_s", "non_slip_s", "num_onsets")
-    assert [tuple(trial[key] for key in told) for trial in trials] == [
-        ("wood", 1.0, 0.25, 1),
-        ("wood", 0.5, 0.0, 1),
-        ("iron", 3.0, 0.0, 0),
-        ("iron", 0.0, 3.0, 0),
-    ]
-    out = capsys.readouterr().out
-    rows = [line.split() for line in out.splitlines()]
-    assert ["wood", "2", "3.00", "3.00", "6.0", "2", "1.5", "0.2"] in rows
-    assert ["iron", "2", "3.00", "3.00", "6.0", "0", "3.0", "3.0"] in rows
-    seconds = samples(1, dtype=torch.float32).double()
-    films = torch.cat([samples(), seconds, samples(2), samples(3)], 1)[1:]
-    assert ["PVDF", "2", f"{films.min():.6g}", f"{films.max():.6g}"] in rows
-    assert "SIMULATED" not in out
-    with Image.open(tmp_path / "set.png") as image:
-        assert image.width > 1000
-        assert len(image.convert("RGB").getcolors(1 << 24)) > 10
-
-
 # convert -------------------------------------------------------------------------------------
 
 

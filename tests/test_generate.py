@@ -159,8 +159,6 @@ def test_a_file_that_is_not_ours_is_never_replaced(tmp_path, content):
         (["scene=paper", "scene.name=a/b", "materials=[M1]"], "cannot name a file; give the scene"),
         (["format=xls"], "format must be one of npz, text, "),
         (["num_workers=-1"], "num_workers must be null or a number from 0, got -1"),
-        (["figure=true", "cycle=3"], r"cycle must lie in 0\.\.2 to be drawn, got 3"),
-        (["figure=true", "stroke=0"], "stroke counts from 1, got 0"),
         (["~features.frames.PVDF"], "features.frames has no frame for PVDF channels"),
     ],
 )
@@ -189,18 +187,18 @@ def drawn(monkeypatch):
 
 
 def test_the_figures_show_each_material_filtered(tmp_path, drawn):
-    run(tmp_path, "cycle=1", "features.frames.SG=31", "figure=true")
+    run(tmp_path, "features.frames.SG=31", "figure=true")
     assert set(drawn) == {"recordings_paper.png", "onset_paper.png"}
     whole, near = drawn["recordings_paper.png"], drawn["onset_paper.png"]
     assert [title for title, _ in whole[0]] == ["A", "B"]
     for title, row in whole[0]:
-        content, hand, _ = FORMATS["npz"].load(tmp_path / f"{title}_paper_01.npz")
+        content, hand, _ = FORMATS["npz"].load(tmp_path / f"{title}_paper_00.npz")
         assert whole[1] == hand.to_rows()
         for channel, raw, seen in zip(hand.channels, content.samples, row.samples, strict=True):
             frame = 31 if channel.kind == "SG" else 11
             np.testing.assert_allclose(seen, savgol(raw.double().numpy(), frame), atol=1e-12)
         assert row.onsets_s == content.onsets_s
         assert row.sliding_s == content.sliding_s
-    assert whole[2] == near[2] == "Recordings: scene paper, cycle 1"
+    assert whole[2] == near[2] == "Recordings: scene paper"
     assert whole[3] is None
     assert near[3] == [(pytest.approx(1.1), 4.5)] * 2  # two seconds before 3.1 s, to the end

@@ -612,6 +612,8 @@ def test_hops_are_learned_as_what_they_are():
     assert at[label > 0].tolist() == ms((1025, 1320), (2255, 2400))
     left_out = ms((1005, 1020), (1325, 1750), (2405, 2650), (3005, 3450), (4005, 4350))
     assert at[label == 0].tolist() == left_out
+    # 300 ms before a first release
+    assert at[label == -2].tolist() == ms((705, 1000), (1955, 2250))
     plain = SmallTimeline(onsets_s=(1.021,), sliding_s=((1.021, 1.5),))
     label = _labels_of(plain, at / 1000)  # no release is known
     assert at[label > 0].tolist() == ms((1025, 1320))

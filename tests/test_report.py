@@ -4,7 +4,6 @@ import csv
 import itertools
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from drawing import assert_png, rows_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 
+from tactslip_torch.commands.entry import compare_runs
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.events import (
@@ -34,13 +34,9 @@ from tactslip_torch.report.onset import (
     view_of,
 )
 from tactslip_torch.report.recordings import (
-    dataset_figure,
-    ranges_table,
     signals_figure,
-    trials_table,
 )
 from tactslip_torch.report.style import ALARM, table
-from tactslip_torch.report.sweep import sweep_table, write_sweep
 
 REASON = "nobody looked"
 
@@ -226,16 +222,6 @@ def test_choices_show_what_each_view_was_given_and_what_would_have_been_best(cap
     assert line.endswith(": 81.25 % (M1 87.50, M2 75.00)")
 
 
-def test_the_figure_of_choices_has_a_line_a_view_and_a_star_for_each_that_is_kept(drawn, tmp_path):
-    results._validation_figure(metrics_of(validation=VIEW_CHOICES), tmp_path / "validation.png")
-    *of_views, stars = drawn[0].axes[0].get_lines()
-    labels = [line.get_label() for line in of_views]
-    assert [label.split(",")[0] for label in labels] == ["simple", "channel", "pooled"]
-    assert ["dropped" in label for label in labels] == [False, True, False]
-    assert of_views[0].get_xydata().tolist() == pytest.approx(np.array([[0.1, 80], [1, 81]]))
-    assert stars.get_xydata().tolist() == pytest.approx(np.array([[0.1, 80], [1, 75]]))
-
-
 def test_reliability_has_a_row_for_each_role():
     lines = results._reliability_table(metrics_of(alarm={"reliability": BY_ROLE})).splitlines()
     rows = [line.split() for line in lines[2:]]
@@ -324,8 +310,6 @@ def features_of(metrics, path):
 FIGURES = [
     (results._confusion_figure, {}),
     (results._confusion_figure, {"splits": ABSENT}),
-    (results._validation_figure, {"validation": CHOICES}),
-    (results._validation_figure, {"validation": VIEW_CHOICES}),
     (results._reliability_figure, {"alarm": {"reliability": BY_ROLE}}),
     (results._events_figure, {"events": EVENTS}),
     (features_of, {}),
@@ -363,7 +347,6 @@ def test_results_have_a_table_and_a_figure_of_all_there_is(drawn, tmp_path, caps
         assert words in out
     assert {path.name for path in (tmp_path / "all").iterdir()} == {
         *("metrics.json", "confusion.png", "selected_features.png", "events.png"),
-        "validation.png",
     }
     kept = json.loads((tmp_path / "all" / "metrics.json").read_text())
     assert kept["splits"] == everything["splits"]
@@ -549,20 +532,18 @@ def test_the_table_says_what_is_simulated_what_is_wrong_and_what_it_leaves_out()
     assert onsets_of(simulated=False) == ["no alarm, and no slip missed"]
 
 
-RUNS = [
-    ("seed=0", {"test/accuracy": 0.9, "test/balanced_accuracy": 0.8}),
-    ("seed=1", {"test/accuracy": 0.7, "test/balanced_accuracy": 0.6}),
-]
-
-
-def test_runs_stand_beside_each_other_with_mean_and_deviation(tmp_path):
-    lines = sweep_table(RUNS, simulated=True).splitlines()
+def test_runs_stand_beside_each_other_with_mean_and_deviation(tmp_path, capsys):
+    runs = [
+        {"words": ["x=1", f"seed={seed}"], "place": tmp_path, "simulated": True}
+        | {"scores": {"test/accuracy": accuracy, "test/balanced_accuracy": balanced}}
+        for seed, (accuracy, balanced) in enumerate([(0.9, 0.8), (0.7, 0.6)])
+    ]
+    compare_runs(runs)
+    lines = capsys.readouterr().out.strip().splitlines()
     assert "SIMULATED" in lines[0]
     assert lines[2].split() == ["seed=0", "90.00", "80.00"]
     assert lines[4].split() == ["mean", "80.00", "70.00"]
     assert lines[5].split() == ["standard", "deviation", "10.00", "10.00"]
-    write_sweep(RUNS, tmp_path, simulated=True)
-    assert (tmp_path / "runs.png").read_bytes().startswith(b"\x89PNG")
     with (tmp_path / "runs.csv").open() as file:
         assert list(csv.reader(file))[2] == ["seed=1", "0.7", "0.6"]
 
@@ -603,39 +584,3 @@ def test_onsets_are_marked_and_slides_and_handling_shaded_as_far_as_in_view(
     words = [text.get_text() for text in figure.legends[0].get_texts()]
     assert words[:5] == ["little", "ring", "middle", "index", "thumb"]
     assert words[-3:] == ["onset of slip", "slip", "non-slip"]
-
-
-KNOWN = ("material", "scene", "duration_s", "slip_s", "non_slip_s", "num_onsets")
-TRIALS = [
-    dict(zip(KNOWN, known, strict=True))
-    for known in (("wood", "paper", 8.0, 3.5, 0.75, 2), ("iron", "paper", 9.0, 10.0, 0.0, 1))
-]
-
-
-@pytest.mark.parametrize("level", [1.0, np.nan])
-def test_a_set_is_drawn_by_material_above_the_traces_of_a_recording(drawn, tmp_path, level):
-    recording = recording_of()
-    recording.samples[:] *= level
-    wide = replace(recording, samples=recording.samples.tile(2, 1)[:40])
-    for example, names in ((recording, HAND.names), (wide, [f"E{i}" for i in range(40)])):
-        dataset_figure(TRIALS, ("w/0", example), names, tmp_path / "a.png", title="a set")
-    bars, traces = drawn[0].axes
-    assert [label.get_text() for label in bars.get_yticklabels()] == ["wood", "iron"]
-    widths = [patch.get_width() for patch in bars.patches]
-    assert widths == pytest.approx([3.5, 0.75, 3.75, 10.0, 0.0, 0.0])  # labelled more than there is
-    assert len(traces.get_yticklabels()) == 24
-    assert "24 of 40 channels" in drawn[1].axes[1].get_title("left")
-
-
-def test_tables_of_a_set():
-    taps = ("wood", "taps", 4.0, 0.0, 0.0, 0)
-    both = trials_table([*TRIALS, dict(zip(KNOWN, taps, strict=True))], simulated=True)
-    assert both.startswith("SIMULATED")
-    rows = [line.split() for line in both.splitlines()]
-    assert ["wood", "2", "4.00", "8.00", "12.0", "2", "3.5", "0.8"] in rows
-    assert ["taps", "1", "4.00", "4.00", "4.0", "0", "0.0", "0.0"] in rows
-    assert len(trials_table(TRIALS[:1], simulated=False).splitlines()) == 2  # no sum of one row
-    ranges = np.stack([np.full(24, -1.5), np.arange(24.0)], 1)
-    ranges[14:] = np.nan
-    rows = [line.split() for line in ranges_table(CHANNELS, ranges, "V").splitlines()]
-    assert rows[1:] == [["SG", "14", "-1.5", "13"], ["PVDF", "10", "nan", "nan"]]

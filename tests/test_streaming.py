@@ -22,7 +22,6 @@ from tactslip_torch.onset.decisions import (
     Decider,
     joined_decisions,
     score_stream,
-    stream_statistic,
 )
 from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.streaming import StreamingDetector
@@ -301,10 +300,6 @@ def test_what_cannot_be_set_is_refused():
             StreamingDetector(DETECTOR, settings_of(), **options)
     with pytest.raises(ValueError, match=r"no alarm threshold"):
         StreamingDetector(DETECTOR)
-    with pytest.raises(ValueError, match=r"at least 100 samples.*got 99"):
-        stream_statistic(DETECTOR, settings_of(), signal(99))
-    with pytest.raises(ValueError, match=r"expected samples \[\*, 4, T\]"):
-        stream_statistic(DETECTOR, settings_of(), signal(300)[:3])
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
@@ -345,23 +340,6 @@ def test_an_hour_needs_no_more_memory_than_a_second():
     assert max(sizes) - sizes[1] < 64  # larger numbers
     assert max(buffers) == buffers[1] < 4 * 8 * 2500
     assert int(found.number[-1]) == 3599
-
-
-@pytest.mark.parametrize("rule", [KOfN(2, 3), Cusum(-0.5, 0.4)], ids=lambda rule: rule.name)
-def test_gradients_of_a_stream_are_slopes(rule, rng):
-    """Along random directions of some volts each, against a central difference."""
-    samples = signal(300, 5).requires_grad_()
-
-    def statistic(samples):
-        return stream_statistic(DETECTOR, settings_of(rule), samples).statistic[-1]
-
-    (pull,) = torch.autograd.grad(statistic(samples), samples)
-    for _ in range(3):
-        way = torch.from_numpy(rng.standard_normal(samples.shape))
-        step = 1e-7
-        with torch.no_grad():
-            slope = (statistic(samples + step * way) - statistic(samples - step * way)) / (2 * step)
-        torch.testing.assert_close((pull * way).sum(), slope, rtol=1e-4, atol=1e-6)
 
 
 # Decisions that are not valid -------------------------------------------------------------------

@@ -1,10 +1,10 @@
 """Sets of recordings in files: ``python -m tactslip_torch data action=check root=FOLDER``.
 
 ``check`` lists every problem and everything worth a look, with file and line, and shows what
-training would use of each file, and for what; exit status 2 where there is a problem. ``summary``
-prints what there is and draws it. ``convert to=h5 output=FOLDER`` writes the set in another format;
-what was finished before is kept. ``label_template`` writes a manifest to fill in.
-``data=authors_raw`` does the first three for the authors' own files.
+training would use of each file, and for what; exit status 2 where there is a problem. ``convert
+to=h5 output=FOLDER`` writes the set in another format; what was finished before is kept.
+``label_template`` writes a manifest to fill in. ``data=authors_raw`` does the first two for the
+authors' own files.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from hydra.utils import get_object, instantiate
@@ -28,14 +28,11 @@ from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest, write_template
 from tactslip_torch.data.labels import LabelledBins, LabelRule, bins_of, whole_samples
 from tactslip_torch.data.manifest import Problem
-from tactslip_torch.data.recording import Recording, RecordingId, Timeline
+from tactslip_torch.data.recording import RecordingId, Timeline
 from tactslip_torch.features.sensing import level_message, level_ratio
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.report.recordings import (
-    dataset_figure,
-    ranges_table,
-    trials_table,
     use_figure,
     use_table,
     written_table,
@@ -44,7 +41,6 @@ from tactslip_torch.report.style import SIMULATED_LINE
 from tactslip_torch.runtime import __version__, in_processes, runs_of
 from tactslip_torch.signals.filtering import ChannelFilter, frame_lengths
 
-_FIGURE = Path("outputs/data.png")
 _SHOWN = 5  # rows of a template, warnings of a kind
 _WITH_DIGITS = re.compile(r"\S*\d\S*")  # names and numbers, by which warnings of a kind differ
 _LEVELS_S = 30.0  # of a recording, from which levels are taken
@@ -71,7 +67,7 @@ def check(config: DictConfig) -> int:
             if isinstance(found, str):
                 problems.append(entry.problem(found))
             else:
-                warnings += map(entry.problem, found.warnings)
+                warnings += map(entry.problem, found)
     if config.model is not None and source.ids:
         warnings += _levels(config, source)
     for problem in problems:
@@ -89,35 +85,6 @@ def check(config: DictConfig) -> int:
         _show_use(config, source)
     print(_headline(source, problems, warnings))
     return len(problems)
-
-
-def summary(config: DictConfig) -> list[dict[str, Any]]:
-    """Print what a set holds, and draw it; what is known of each recording.
-
-    Raises:
-        ValueError: if no recording can be read.
-        FileNotFoundError: if there is no folder or manifest.
-    """
-    source = _source(config, strict=False)
-    hand = source.hand  # refuses a set of which nothing can be read
-    trials = [_trial(source, recording) for recording in source.ids]
-    print("\n" + trials_table(trials, simulated=source.is_simulated))
-    if any(trial["num_onsets"] for trial in trials):
-        print("labels= takes up to a second before each onset as non-slip; it is not counted here")
-    ranges = np.full((len(hand), 2), np.nan)
-    if config.samples:
-        for _, found in _inspect_all(config, source):
-            if isinstance(found, _Inspected):
-                ranges[:, 0] = np.fmin(ranges[:, 0], found.ranges[:, 0])
-                ranges[:, 1] = np.fmax(ranges[:, 1], found.ranges[:, 1])
-    print("\n" + ranges_table(hand.to_rows(), ranges, source.units))
-    print("\n" + _headline(source, source.problems, source.warnings))
-    path = _FIGURE if config.output is None else Path(config.output)
-    what = "SIMULATED recordings" if source.is_simulated else "Recordings"
-    title = f"{what} in {source.root.resolve().name}"
-    dataset_figure(trials, _example(source), hand.names, path, title=title)
-    print(f"figure in {path}")
-    return trials
 
 
 def convert(config: DictConfig) -> list[Written]:
@@ -183,7 +150,6 @@ def label_template(config: DictConfig) -> Path:
 
 ACTIONS: dict[str, Callable[[DictConfig], object]] = {
     "check": check,
-    "summary": summary,
     "convert": convert,
     "label_template": label_template,
 }
@@ -197,37 +163,24 @@ def _source(config: DictConfig, **options: bool) -> FileRecordings:
     return source
 
 
-class _Inspected(NamedTuple):
-    """What the samples of a recording are.
-
-    Args:
-        ranges: ``[C, 2]``, least and greatest of each channel; NaN if none is finite.
-        warnings: what is worth a look.
-    """
-
-    ranges: NDArray[np.float64]
-    warnings: list[str]
-
-
-def _inspected(source: FileRecordings, recording: RecordingId) -> _Inspected:
-    samples = source.load(recording).samples.double()
-    found = _Inspected(np.full((len(samples), 2), np.nan), [])
-    for row, name, ends in zip(samples, source.hand.names, found.ranges, strict=True):
-        if len(finite := row[row.isfinite()]):
-            ends[:] = finite.min(), finite.max()
-            if ends[0] == ends[1]:
-                found.warnings.append(f"{name} never changes, it is {ends[0]:g} throughout")
-    return found
+def _constant_channels(source: FileRecordings, recording: RecordingId) -> list[str]:
+    """A line for each channel whose finite samples are all the same."""
+    lines = []
+    for row, name in zip(source.load(recording).samples.double(), source.hand.names, strict=True):
+        finite = row[row.isfinite()]
+        if len(finite) and finite.min() == finite.max():
+            lines.append(f"{name} never changes, it is {finite[0]:g} throughout")
+    return lines
 
 
 def _inspect_all(
     config: DictConfig, source: FileRecordings
-) -> list[tuple[RecordingId, _Inspected | str]]:
-    """What the samples of every recording are, or why they cannot be read."""
+) -> list[tuple[RecordingId, list[str] | str]]:
+    """What is worth a look in every recording's samples, or why they cannot be read."""
 
-    def one(recording: RecordingId) -> _Inspected | str:
+    def one(recording: RecordingId) -> list[str] | str:
         try:
-            return _inspected(source, recording)
+            return _constant_channels(source, recording)
         except (ValueError, OSError) as error:
             return one_line(error)
 
@@ -376,29 +329,6 @@ def _headline(
 
 def _number(of: Sequence[object], what: str) -> str:
     return f"{len(of)} {what}{'' if len(of) == 1 else 's'}"
-
-
-def _trial(source: FileRecordings, recording: RecordingId) -> dict[str, Any]:
-    times = source.timeline(recording)
-    return {
-        "material": recording.material,
-        "scene": recording.scene,
-        "duration_s": times.duration_s,
-        "slip_s": sum(end - start for start, end in (*times.sliding_s, *times.slip_s)),
-        "non_slip_s": sum(end - start for start, end in times.non_slip_s),
-        "num_onsets": len(times.onsets_s),
-    }
-
-
-def _example(source: FileRecordings) -> tuple[str, Recording]:
-    """The first recording of which most is known, and what it is called."""
-
-    def known(recording: RecordingId) -> int:
-        times = source.timeline(recording)
-        return bool(times.onsets_s or times.slip_s) + bool(times.non_slip_s)
-
-    recording = max(source.ids, key=known)
-    return f"{recording} ({source.entry(recording).file})", source.load(recording)
 
 
 def _act(config: DictConfig, _: Path) -> None:

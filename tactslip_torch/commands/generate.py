@@ -23,13 +23,13 @@ from omegaconf import DictConfig, ListConfig
 from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest
 from tactslip_torch.data.manifest import MANIFEST
-from tactslip_torch.data.recording import RecordingId, RecordingSource
+from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
 from tactslip_torch.features.cache import source_digest
-from tactslip_torch.report.recordings import signals_figure, view_around, written_table
+from tactslip_torch.report.recordings import signals_figure, written_table
 from tactslip_torch.runtime import bar, in_processes, num_processes
 from tactslip_torch.signals.filtering import ChannelFilter, frame_lengths
 
-BEFORE_S, AFTER_S = 2.0, 3.0  # of the onset drawn close up: five seconds, as in the paper
+_BEFORE_S, _AFTER_S = 2.0, 3.0  # of the onset drawn close up: five seconds, as in the paper
 
 
 def generate(config: DictConfig, folder: Path) -> list[Written]:
@@ -55,7 +55,6 @@ def generate(config: DictConfig, folder: Path) -> list[Written]:
         "libraries": {"numpy": np.__version__, "torch": torch.__version__},
     }
     files = RecordingFolder(source, folder, config.format, made_by)
-    shown = _shown(config, source) if config.figure else {}
     smooth = _filter(config, source)
     files.check()
     save_config(config, folder)
@@ -65,24 +64,15 @@ def generate(config: DictConfig, folder: Path) -> list[Written]:
     )
     write_manifest(folder, written)
     seconds = time.perf_counter() - started
+    shown: dict[str, list[RecordingId]] = {}
+    for recording in source.ids if config.figure else ():
+        if not recording.session and not recording.cycle:
+            shown.setdefault(recording.scene, []).append(recording)
     for scene in bar(shown, "figures", "scene") if shown else ():
-        _draw(files, shown[scene], smooth, scene, config.stroke)
+        _draw(files, shown[scene], smooth, scene)
     print("\n" + written_table([one._asdict() for one in written], seconds))
     print(f"\nrecordings in {folder}")
     return written
-
-
-def _shown(config: DictConfig, source: RecordingSource) -> dict[str, list[RecordingId]]:
-    """The recordings to draw, by scene: of the first session."""
-    first = [recording for recording in source.ids if not recording.session]
-    of_cycle = [recording for recording in first if recording.cycle == config.cycle]
-    if source.ids and not of_cycle:
-        most = max(recording.cycle for recording in source.ids)
-        raise ValueError(f"cycle must lie in 0..{most} to be drawn, got {config.cycle}")
-    if not (isinstance(config.stroke, int) and config.stroke >= 1):
-        raise ValueError(f"stroke counts from 1, got {config.stroke!r}")
-    scenes = dict.fromkeys(recording.scene for recording in of_cycle)
-    return {scene: [r for r in of_cycle if r.scene == scene] for scene in scenes}
 
 
 def _filter(config: DictConfig, source: RecordingSource) -> ChannelFilter:
@@ -97,7 +87,6 @@ def _draw(
     recordings: Sequence[RecordingId],
     channel_filter: ChannelFilter,
     scene: str,
-    stroke: int,
 ) -> None:
     """Both figures of a scene, from the files."""
     rows = []
@@ -108,10 +97,19 @@ def _draw(
     origin = content.provenance
     known = [f"{name} {origin[name]}" for name in ("fidelity", "seed") if name in origin]
     what = "SIMULATED recordings" if origin.get("simulated") else "Recordings"
-    title = ", ".join([f"{what}: scene {scene}", f"cycle {recordings[0].cycle}", *known])
-    views = [view_around(row, stroke, BEFORE_S, AFTER_S) for _, row in rows]
+    title = ", ".join([f"{what}: scene {scene}", *known])
+    views = [_close_up(row) for _, row in rows]
     for name, seen in ((f"recordings_{scene}.png", None), (f"onset_{scene}.png", views)):
         signals_figure(rows, hand.to_rows(), files.folder / name, title=title, views=seen)
+
+
+def _close_up(recording: Recording) -> tuple[float, float]:
+    """Around the second onset or the last before; where nothing slips, around such a start."""
+    begins = recording.onsets_s or tuple(start for start, _ in recording.non_slip_s)
+    if not begins:
+        return 0.0, recording.duration_s
+    centre_s = begins[:2][-1]
+    return max(0.0, centre_s - _BEFORE_S), min(recording.duration_s, centre_s + _AFTER_S)
 
 
 def _saved(config: DictConfig, folder: Path, again: str) -> str:

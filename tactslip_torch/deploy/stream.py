@@ -686,7 +686,7 @@ def _rows(rows: Value, start: Value, places: range) -> Value:
 def _statistic_of(
     rule: Rule, llr: Value, memory: Value, anew: Value | None = None
 ) -> tuple[Value, Value]:
-    """The statistic of each decision as the rule's ``scan`` makes it, and the memory behind.
+    """The statistic of each decision as the rule's ``scan_row`` makes it, and the memory behind.
 
     Args:
         rule: whose statistic.

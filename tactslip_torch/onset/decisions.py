@@ -2,8 +2,7 @@
 
 ``AlarmSettings`` are what makes alarms of scores, kept in the detector's file. ``score_stream``
 scores a whole recording, one bin every hop; ``Decider`` makes decisions and alarms of scores, piece
-by piece, for streams and whole recordings alike; ``stream_statistic`` is all of it with gradients,
-from raw volts to the statistic.
+by piece, for streams and whole recordings alike.
 """
 
 from __future__ import annotations
@@ -639,82 +638,3 @@ class Decider:
         """Of decisions a hop apart."""
         most = most_lost(self._window, round(self.settings.hold_s * self._rate), hop_samples)
         return _StreamRule(rule, threshold, self._latch_times, most)
-
-
-class _StreamStatistic(NamedTuple):
-    """One entry per decision, in order, ``[*, m]`` each, dtype of the samples.
-
-    Attributes:
-        score: at least 0 is slip.
-        llr: log likelihood ratio.
-        probability: of slip, by the bin alone.
-        statistic: of the rule; an alarm is raised where it reaches ``settings.threshold``.
-
-    All are NaN, without gradient, where a decision is not valid.
-    """
-
-    score: Tensor
-    llr: Tensor
-    probability: Tensor
-    statistic: Tensor
-
-
-def stream_statistic(
-    detector: Scorer, settings: AlarmSettings, samples: Tensor
-) -> _StreamStatistic:
-    """Every decision on whole recordings, differentiable in the raw samples.
-
-    Gradients are those of the values: 0 through a feature that is clipped, through a channel that
-    is lost and through entropy; one-sided at ties. All features of the pool are made on the way: a
-    few seconds of stream at once, not hours. The rule keeps its state over lost stretches of any
-    length.
-
-    Args:
-        detector: fitted on this hand.
-        settings: hop, calibration and rule; ``AlarmSettings.of(detector)`` are those in its file.
-        samples: recordings in volts; a channel that is lost in a bin is left out of it.
-
-    Shape:
-        - samples: ``[*, C, T]``, float32 or float64, ``T`` at least a bin and the longest frame
-        - output: ``[*, m]`` each, ``m = (T - n) // hop + 1``
-
-    Raises:
-        ValueError: if samples are not of this hand or too short for a decision.
-
-    Example:
-        The gradient of the highest statistic, volt by volt, summed up for each channel:
-
-        >>> detector = tactslip_torch.SlipDetector.load("onset.pt")  # doctest: +SKIP
-        >>> samples = recording.samples.clone().requires_grad_()  # doctest: +SKIP
-        >>> found = stream_statistic(detector, AlarmSettings.of(detector), samples)
-        ... # doctest: +SKIP
-        >>> (pull,) = torch.autograd.grad(found.statistic.max(), samples)  # doctest: +SKIP
-        >>> pull.abs().sum(-1)  # doctest: +SKIP
-    """
-    detector.channel_filter.check(samples)
-    used = detector.needed_index.tolist()
-    length = detector.pool.bin_samples
-    shortest = max(length, *(detector.channel_filter.window_lengths[i] for i in used))
-    if samples.shape[-1] < shortest:
-        raise ValueError(
-            f"expected at least {shortest} samples, a bin and the longest frame in use, "
-            f"got {samples.shape[-1]}; give a longer recording"
-        )
-    bins = _raw_bins(detector, samples, settings.hop_samples)
-    is_used = torch.zeros(len(detector.pool.hand), 1, dtype=torch.bool, device=bins.device)
-    is_used[used] = True
-    bins = bins.movedim(-3, -2)  # [*, m, C, n + context]
-    bins = torch.where(is_used | bins.isfinite(), bins, 0.0)  # or 0 times NaN comes back
-    found = detector.predict_raw(bins, given=samples.dtype)
-    llr = settings.calibration.llr(torch.where(found.is_valid, found.score, 0.0))
-    rows = []
-    for own, valid in zip(
-        llr.flatten(0, -2) if llr.ndim > 1 else llr[None],
-        found.is_valid.reshape(-1, llr.shape[-1]),
-        strict=True,
-    ):
-        known = settings.rule.scan(own[valid])
-        rows.append(torch.full_like(own, torch.nan).masked_scatter(valid, known))
-    statistic = torch.stack(rows).reshape(llr.shape)
-    llr = torch.where(found.is_valid, llr, torch.nan)
-    return _StreamStatistic(found.score, llr, probability(llr, settings.slip_share), statistic)

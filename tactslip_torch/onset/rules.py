@@ -13,9 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from tactslip_torch.runtime import check_number, check_share
 
@@ -36,7 +34,7 @@ class KOfN:
     """The k-th largest of the last n log likelihood ratios.
 
     It reaches a threshold exactly if k of the last n do: the usual debounce. Among fewer than k
-    decisions it is ``NOTHING_YET``. At ties the gradient goes to one of the equals.
+    decisions it is ``NOTHING_YET``.
 
     Raises:
         ValueError: unless ``1 <= k <= n``.
@@ -55,24 +53,13 @@ class KOfN:
         """The state before the first decision: ``n - 1`` that are none yet."""
         return [NOTHING_YET] * (self.n - 1)
 
-    def scan(self, llr: Tensor) -> Tensor:
-        """The k-th largest of each decision of a stream and the ``n - 1`` before it.
-
-        Finite ratios up to 1e30 of either sign give finite statistics and gradients; what
-        is not valid the caller leaves out. Differentiable.
-
-        Shape:
-            - llr, output: ``[T]``, ``T`` may be 0
-        """
-        if not len(llr):
-            return llr
-        known = torch.cat([llr.new_tensor(self.start()), llr])  # [n - 1 + T]
-        return known.unfold(-1, self.n, 1).kthvalue(self.n - self.k + 1, dim=-1).values
-
     def scan_row(
         self, llrs: Sequence[float], state: list[float], dtype: type[Any]
     ) -> tuple[list[float], list[float]]:
-        """``scan`` from a state on, in plain numbers of a NumPy dtype; the state behind them."""
+        """The k-th largest of each decision and the ``n - 1`` before it, and the state behind them.
+
+        In plain numbers of a NumPy dtype. What is not valid the caller leaves out.
+        """
         known = [*state, *llrs]
         statistic = [sorted(known[i : i + self.n])[-self.k] for i in range(len(llrs))]
         return statistic, known[len(llrs) :]
@@ -88,8 +75,7 @@ class Cusum:
 
     ``S = clamp(S + evidence * (llr - drift), 0, ceiling)``, from 0. Page's test is drift 0 and no
     ceiling; a drift lets ratios that are a little positive for long fade, and the ceiling bounds
-    how long the sum takes to come down after a slip. The gradient passes where a bound is met
-    exactly, and is 0 beyond.
+    how long the sum takes to come down after a slip.
 
     Args:
         drift: ratio that a decision must exceed to add to the sum.
@@ -121,18 +107,10 @@ class Cusum:
         """The state before the first decision: a sum of 0."""
         return [0.0]
 
-    def scan(self, llr: Tensor) -> Tensor:
-        """The sum after each decision of a stream; else as ``KOfN.scan``."""
-        total, statistic = llr.new_zeros(()), []
-        for step in (self.evidence * (llr - self.drift)).unbind():
-            total = (total + step).clamp(0.0, self.ceiling)
-            statistic.append(total)
-        return torch.stack(statistic) if statistic else llr
-
     def scan_row(
         self, llrs: Sequence[float], state: list[float], dtype: type[Any]
     ) -> tuple[list[float], list[float]]:
-        """``scan`` from a state on, in plain numbers of a NumPy dtype; the state behind them."""
+        """The sum after each decision, else as ``KOfN.scan_row``."""
         sums = list(state)
         for llr in llrs:
             step = float(dtype(self.evidence) * (dtype(llr) - dtype(self.drift)))

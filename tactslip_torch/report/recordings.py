@@ -27,7 +27,6 @@ Channels = Sequence[Mapping[str, str]]
 """Rows of ``name``, ``kind``, ``finger``, ``segment``, ``adapting`` where the kind does not say it,
 as ``HandLayout.to_rows`` gives them."""
 
-_UNKNOWN = "#D9D9D9"
 _PALER = {"distal": 0.0, "middle": 0.3, "proximal": 0.5}
 _SLIP: dict[str, Any] = {"facecolor": style.VERMILION, "alpha": 0.14, "linewidth": 0, "zorder": 0}
 _NON_SLIP: dict[str, Any] = {"facecolor": style.BLUE, "alpha": 0.12, "linewidth": 0, "zorder": 0}
@@ -35,7 +34,6 @@ _ONSET: dict[str, Any] = {"color": style.INK, "linestyle": "-.", "linewidth": 1.
 _NUM_SEGMENTS = 1200  # of each line, of which the least and the greatest sample are drawn
 _COLUMN = 3.8  # least width of one, in inches, for its titles to stand side by side
 _LANE = 0.13  # least height of one, in inches, for its name to be read
-_MOST_LANES = 24
 _NAMES = 6.5  # font size of channels in points
 
 
@@ -47,56 +45,7 @@ Recording = Any
 drawn, its exact ``onsets_s``, and start and end of what is slip or known to be without."""
 
 
-def view_around(
-    recording: Recording, stroke: int, before_s: float, after_s: float
-) -> tuple[float, float]:
-    """Where to look for a stroke: around its onset or, where nothing slips, its start.
-
-    Strokes count from 1; the last stands for those that are not there, and the whole recording for
-    a stroke where there is none.
-    """
-    begins = recording.onsets_s or [start for start, _ in recording.non_slip_s]
-    if not begins:
-        return 0.0, recording.duration_s
-    centre_s = begins[min(stroke, len(begins)) - 1]
-    return max(0.0, centre_s - before_s), min(recording.duration_s, centre_s + after_s)
-
-
 # What a set holds --------------------------------------------------------------------------------
-def trials_table(trials: Rows, *, simulated: bool) -> str:
-    """How many recordings of each material there are, how long, and what is known of them.
-
-    Of several scenes the same follows for each scene.
-
-    Args:
-        trials: of each recording its ``material`` and ``scene``, ``duration_s``, how much of that
-            is labelled (``slip_s``, ``non_slip_s``), and ``num_onsets``.
-        simulated: whether any is.
-    """
-
-    def cells(group: Rows) -> Mapping[str, object]:
-        durations = [trial["duration_s"] for trial in group]
-        return {
-            "recordings": len(group),
-            "shortest s": f"{min(durations):.2f}",
-            "longest s": f"{max(durations):.2f}",
-            "seconds": f"{sum(durations):.1f}",
-            "onsets": sum(trial["num_onsets"] for trial in group),
-            "slip s": f"{sum(trial['slip_s'] for trial in group):.1f}",
-            "non-slip s": f"{sum(trial['non_slip_s'] for trial in group):.1f}",
-        }
-
-    scenes = {published.PAPER_SCENE: style.UNNAMED_SCENE}
-    own = [
-        {**trial, "object": trial["material"], "scene": scenes.get(trial["scene"], trial["scene"])}
-        for trial in trials
-    ]
-    tables = [_grouped("material" if simulated else "object", trials if simulated else own, cells)]
-    if len({trial["scene"] for trial in trials}) > 1:
-        tables.append(_grouped("scene", trials if simulated else own, cells))
-    return style.marked(simulated, "\n\n".join(tables))
-
-
 def _grouped(key: str, rows: Rows, cells: Callable[[Rows], Mapping[str, object]]) -> str:
     """A row for each value of ``key``, in the order in which they come, and of several all."""
     groups = {
@@ -134,29 +83,12 @@ def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
     return style.marked(simulated, rows, f"took {seconds:.1f} s")
 
 
-def ranges_table(channels: Channels, ranges: Array, units: str) -> str:
-    """The least and the greatest sample of the channels of each kind.
-
-    Shape:
-        - ranges: ``[C, 2]``, NaN where nothing is finite
-    """
-    rows = []
-    for kind in dict.fromkeys(channel["kind"] for channel in channels):
-        places = [place for place, channel in enumerate(channels) if channel["kind"] == kind]
-        known = ranges[places][np.isfinite(ranges[places]).all(-1)]
-        least, greatest = (known[:, 0].min(), known[:, 1].max()) if len(known) else (np.nan,) * 2
-        row: dict[str, object] = {"kind": kind, "channels": len(places)}
-        row |= {f"least, {units}": f"{least:.6g}", f"greatest, {units}": f"{greatest:.6g}"}
-        rows.append(row)
-    return style.table(rows)
-
-
 _USES = {
     "slip": style.VERMILION,
     "slip, left out": "#F2BFA0",
     "non-slip": style.BLUE,
     "non-slip, left out": "#A6CBE3",
-    "not labelled": _UNKNOWN,
+    "not labelled": "#D9D9D9",
     "missing": style.INK,
 }
 """What training may make of a stretch of a recording, and its colour."""
@@ -221,67 +153,6 @@ def use_figure(rows: Rows, num_all: int, path: str | Path, *, title: str) -> Non
     style.save(figure, path, dpi=120)
 
 
-@style.styled
-def dataset_figure(
-    trials: Rows,
-    example: tuple[str, Recording],
-    names: Sequence[str],
-    path: str | Path,
-    *,
-    title: str,
-) -> None:
-    """Write seconds of each material by what is known of them, and the traces of one recording.
-
-    Of more channels than fit, so many are drawn, evenly chosen.
-
-    Args:
-        trials: at least one, as ``trials_table`` takes them.
-        example: its title, and what is drawn in lanes, each on a scale of its own, slip and
-            non-slip shaded.
-        names: of its channels.
-        path: the PNG to write, replaced as a whole if it exists.
-        title: of the figure; says what is simulated.
-    """
-    materials = list(dict.fromkeys(trial["material"] for trial in trials))
-    num_lanes = min(len(names), _MOST_LANES)
-    heights = [0.28 * len(materials) + 0.8, 0.2 * num_lanes + 0.9]
-    figure = style.new_figure(11.0, sum(heights) + 0.9, title)
-    bars, traces = figure.subplots(2, 1, gridspec_kw={"height_ratios": heights})
-    colours = {style.VERMILION: "slip", style.BLUE: "non-slip", _UNKNOWN: "not labelled"}
-    for lane, material in enumerate(materials):
-        group = [trial for trial in trials if trial["material"] == material]
-        slip = sum(trial["slip_s"] for trial in group)
-        quiet = sum(trial["non_slip_s"] for trial in group)
-        whole = max(sum(trial["duration_s"] for trial in group), slip + quiet)
-        style.stack(bars, lane, (slip, quiet, whole - slip - quiet), colours)
-        text = f"  {len(group)} recording{'s' * (len(group) != 1)}"
-        bars.text(whole, lane, text, va="center", fontsize=7, color=style.GREY)
-    style.lanes(bars, materials)
-    bars.margins(x=0.12)
-    bars.set_xlabel("seconds of signal")
-
-    chosen = sorted({round(place) for place in np.linspace(0, len(names) - 1, num_lanes)})
-    name, recording = example
-    view = (0.0, recording.duration_s)
-    times, values = _points(recording, chosen, view)
-    spans = [span(line, 0.01) for line in values]
-    labels = [
-        f"{names[place]}  {wide or 1.0:.3g} {recording.units}"
-        for place, wide in zip(chosen, spans, strict=True)
-    ]
-    scales = [1.25 * wide or 1.0 for wide in spans]
-    _draw_lanes(traces, times, values, labels, [style.INK] * len(chosen), scales, most=1.2)
-    traces.set_ylim(-len(chosen) + 0.2, 0.8)
-    _mark(traces, recording, view)
-    traces.set_xlabel("time, s")
-    some = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} channels"
-    traces.set_title(f"{name}{some}; beside each name the span of all but 2 % of it")
-    handles: list[Any] = [Patch(color=colour, label=label) for colour, label in colours.items()]
-    handles += [Line2D([], [], label="onset", **_ONSET)] if recording.onsets_s else []
-    style.legend_below(figure, handles, 4)
-    style.save(figure, path, dpi=120)
-
-
 # Signals -----------------------------------------------------------------------------------------
 @style.styled
 def signals_figure(
@@ -316,7 +187,7 @@ def signals_figure(
             times, values = _points(row, places, view)
             scale = lane_height(values) if in_lanes else 1.0
             if in_lanes:
-                _draw_lanes(axes, times, values, names, own, [scale] * len(names))
+                _draw_lanes(axes, times, values, names, own, scale)
                 axes.set_title(f"lanes {scale:.2g} {row.units} apart", loc="right", fontsize=_NAMES)
             for line, name, colour in zip(values, names, own, strict=True):
                 if not in_lanes:
@@ -374,12 +245,11 @@ def _draw_lanes(
     values: Array,
     names: Sequence[str],
     colours: Sequence[Any],
-    scales: Sequence[float],
-    most: float = np.inf,
+    scale: float,
 ) -> None:
-    """A lane per channel around its median, the first on top; bursts reach ``most`` lanes."""
-    for lane, (line, scale) in enumerate(zip(values, scales, strict=True)):
-        shown = np.clip((line - median(line)) / scale, -most, most)
+    """A lane per channel around its median, the first on top."""
+    for lane, line in enumerate(values):
+        shown = (line - median(line)) / scale
         axes.plot(times, shown - lane, color=colours[lane], linewidth=0.5, label=names[lane])
     axes.set_yticks(-np.arange(len(names)), names)
     for label, colour in zip(axes.get_yticklabels(), colours, strict=True):
