@@ -29,8 +29,7 @@ from benchmarks.timing import interleaved, on_threads
 from tactslip_torch import SlipDetector
 from tactslip_torch.deploy.native import SOURCE, NativeFile
 from tactslip_torch.features.cost import COSTS_PATH, MACHINES, WorkCosts
-from tactslip_torch.features.descriptors import DESCRIPTORS
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.descriptors import DESCRIPTORS, FeatureName
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler

@@ -9,7 +9,7 @@ import torch
 
 from tactslip_torch import FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.features.cost import MACHINES, WorkCosts
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.descriptors import FeatureName
 from tactslip_torch.features.selection import forward_selection
 from tactslip_torch.native import _Matrix, reason_unavailable
 from tactslip_torch.training.recipe import General

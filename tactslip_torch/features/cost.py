@@ -19,8 +19,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.descriptors import SORTED
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.descriptors import SORTED, FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.signals.wavelet import wavelet_steps
 
