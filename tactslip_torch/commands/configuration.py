@@ -380,7 +380,7 @@ def _no_key(command: str, key: str, config: DictConfig | None = None) -> str:
         return f"{group}={chosen} has no key {key}; {' or '.join(having)} has it"
     near = _nearest(command, key, config)
     hint = f"did you mean {near}?" if near else f"tactslip {command} --help lists the keys"
-    if "." in key and not near:
+    if group in config and rest and not near:
         hint += f", +{key}=VALUE sets what has no default"
     return f"{command} has no key {key}; {hint}"
 

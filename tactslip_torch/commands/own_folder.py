@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,12 @@ def with_folder(command: str, arguments: Sequence[str]) -> list[str]:
         if re.search(rf"(?m)^(?:  - )?{re.escape(first.partition('.')[0])}:", top.read_text()):
             return list(arguments)  # a key without its value, which is told so
         raise ValueError(f"no folder at {first}; give a folder of recordings, or KEY=VALUE")
+    more = [word for before, word in pairwise(arguments) if not before.startswith("-")]
+    more = [word for word in more if "=" not in word and Path(word).exists()]
+    if more:
+        raise ValueError(
+            f"{command} takes one folder or file, and {more[0]} is a second; give the folder"
+        )
     if command in _PLACES:
         return [f"{_PLACES[command]}={_quoted(first)}", *rest]
     if not folder.is_dir():
@@ -104,6 +111,8 @@ def _settings(command: str, folder: Path, rest: Sequence[str]) -> dict[str, Any]
         info = SlipDetector.load(model).info
         if "data" in info:
             data = {**info["data"], "reading": info.get("reading", {})}
+            if "pattern" not in data and not (folder / _MANIFEST).is_file():
+                data["pattern"] = _pattern(folder)
             return {"data": data, "labels": info.get("labels", {})}
     if (folder / _MANIFEST).is_file():
         return {}
@@ -111,6 +120,15 @@ def _settings(command: str, folder: Path, rest: Sequence[str]) -> dict[str, Any]
         f"{folder} has neither {HAND_FILE} nor {_MANIFEST}, so it is not known how it is read; "
         f"tactslip setup {shlex.quote(str(folder))} looks at it and writes {HAND_FILE}"
     )
+
+
+def _pattern(folder: Path) -> str:
+    """How the names of a folder's recordings are read, where nothing says it."""
+    from tactslip_torch.data.file_names import name_pattern  # of no need for --help
+    from tactslip_torch.data.folder import recording_files
+
+    paths = recording_files(folder, in_folders=True)
+    return name_pattern([path.relative_to(folder).as_posix() for path in paths]).pattern
 
 
 def _read(path: Path) -> dict[str, Any]:
