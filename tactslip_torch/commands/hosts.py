@@ -19,7 +19,7 @@ def hosts_dir() -> Path:
     return packaged_folder("export", "README.md")
 
 
-def host_names() -> list[str]:
+def _host_names() -> list[str]:
     """The hosts there are."""
     return sorted(path.name for path in hosts_dir().iterdir() if (path / "README.md").is_file())
 
@@ -31,8 +31,8 @@ def copy_host(name: str, folder: Path) -> Path:
         ValueError: if there is no such host.
         FileExistsError: if there is something in its place.
     """
-    if name not in host_names():
-        raise ValueError(f"no host {name!r}; there are {', '.join(host_names())}")
+    if name not in _host_names():
+        raise ValueError(f"no host {name!r}; there are {', '.join(_host_names())}")
     parts = _SHARED.get(name, (name,))
     for part in parts:
         if (folder / part).exists():
@@ -65,7 +65,7 @@ def main() -> None:
         description="Copy a program that runs an exported detector (model.onnx, stream.onnx).",
         epilog="example: tactslip hosts c slip-in-c",
     )
-    parser.add_argument("name", help=f"one of {', '.join(host_names())}")
+    parser.add_argument("name", help=f"one of {', '.join(_host_names())}")
     parser.add_argument("folder", type=Path, help="where its folder is put")
     given = parser.parse_args()
     from tactslip_torch.commands.stopping import errors_in_one_line

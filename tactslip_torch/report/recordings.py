@@ -8,11 +8,12 @@ that every burst is seen. Colours are fingers, paler towards the palm.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
@@ -46,17 +47,6 @@ drawn, its exact ``onsets_s``, and start and end of what is slip or known to be 
 
 
 # What a set holds --------------------------------------------------------------------------------
-def _grouped(key: str, rows: Rows, cells: Callable[[Rows], Mapping[str, object]]) -> str:
-    """A row for each value of ``key``, in the order in which they come, and of several all."""
-    groups = {
-        name: [row for row in rows if row[key] == name]
-        for name in dict.fromkeys(row[key] for row in rows)
-    }
-    if len(groups) > 1:
-        groups["all"] = list(rows)
-    return style.table([{key: name, **cells(group)} for name, group in groups.items()])
-
-
 def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
     """How many recordings of each scene are in files, how long, how large, how many made now.
 
@@ -79,8 +69,13 @@ def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
     simulated = any(one["line"]["simulated"] == "true" for one in written)
     is_named = simulated or {one["line"]["scene"] for one in written} != {published.PAPER_SCENE}
     title, key = ("scene", "scene") if is_named else ("object", "material")
-    rows = _grouped(title, [{title: one["line"][key], **one} for one in written], cells)
-    return style.marked(simulated, rows, f"took {seconds:.1f} s")
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for one in written:
+        groups.setdefault(one["line"][key], []).append(one)
+    if len(groups) > 1:
+        groups["all"] = list(written)
+    table = style.table([{title: name, **cells(group)} for name, group in groups.items()])
+    return style.marked(simulated, table, f"took {seconds:.1f} s")
 
 
 _USES = {
@@ -331,7 +326,7 @@ def reading_figure(recording: Recording, channels: Channels, path: str | Path, t
         note = ""
         if np.ptp(middles) > _APART * max(np.median(widths), 1e-300):
             values, note = values - middles[:, None], ", each about its median"
-        colours = style.shades(len(places))
+        colours = _shades(len(places))
         for line, place, colour in zip(values, places, colours, strict=True):
             name = channels[place]["name"]
             axes.plot(times, line, color=colour, linewidth=0.7, alpha=0.85, label=name)
@@ -349,6 +344,13 @@ def reading_figure(recording: Recording, channels: Channels, path: str | Path, t
     if handles:
         style.legend_below(figure, handles, 4)
     style.save(figure, path, dpi=120)
+
+
+def _shades(num: int) -> list[Any]:
+    """So many colours: those of ``PALETTE`` or, of more, a range from dark blue to yellow."""
+    if num <= len(style.PALETTE):
+        return list(style.PALETTE[:num])
+    return list(colormaps["viridis"](np.linspace(0, 0.92, num)))
 
 
 def _mark_missing(axes: Axes, is_missing: NDArray[np.bool_], sample_rate_hz: float) -> None:

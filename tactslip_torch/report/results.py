@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -415,7 +416,7 @@ def _selected_features_figure(
     is_pooled = any(feature.get("statistic") for feature in selected)
     apart = "of each channel" if is_pooled else None
     places = [feature.get("statistic") or apart or feature["finger"] for feature in selected]
-    of_kind = style.kind_colours(sorted(set(kinds)))
+    of_kind = _kind_colours(sorted(set(kinds)))
     of_domain = dict(zip(_DOMAIN_WORDS, (style.PURPLE, style.GREEN), strict=True))
     panels = {
         "sensor kind": (0.5, kinds, kinds, of_kind),
@@ -442,6 +443,13 @@ def _selected_features_figure(
     handles = [Patch(color=colour, label=kind) for kind, colour in of_kind.items()]
     style.legend_below(figure, handles, 6)
     style.save(figure, path, dpi=180)
+
+
+def _kind_colours(kinds: Iterable[str]) -> dict[str, str]:
+    """A colour for each kind of channel: blue for PVDF, orange for SG, others what is left."""
+    known = {"SG": style.ORANGE, "PVDF": style.BLUE}
+    left = cycle(colour for colour in style.PALETTE if colour not in known.values())
+    return {kind: known.get(kind) or next(left) for kind in dict.fromkeys(kinds)}
 
 
 def _counts(
