@@ -143,6 +143,7 @@ def _markdown(path: str) -> str:
             if "image/png" in data:
                 parts.append(f"![Output](data:image/png;base64,{data['image/png'].strip()})")
             elif told := "".join(data["text/plain"]).rstrip():
-                parts.append(f"```text\n{told}\n```")
-    parts.insert(1, parts.pop(0))  # below the title
-    return "\n\n".join(parts)
+                above = parts.pop().removesuffix("```") if parts[-1][:7] == "```text" else "```text\n"
+                parts.append(f"{above}{told}\n```")
+    title, _, rest = parts[1].partition("\n")
+    return "\n\n".join([title, parts[0], rest.strip(), *parts[2:]])
