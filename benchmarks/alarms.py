@@ -5,50 +5,64 @@ Fewer seeds or slips: ``sizes.seeds=[0] sizes.sessions=2``.
 Fits the classifier on the mixture of each seed and sets its threshold, as ``+exp=onset`` does, for
 the detector that comes with the package. Then slips of held-out materials, in worlds of which some
 lie at the end of what was trained on: found within 250 ms of the first release, early, and how
-late; beside it hints, and with the first seed the detector of bins and the largest wavelet detail
-under the same budgets. Then false alarms of held-out materials by kind of recording. All data are
-simulated. What a seed gave is kept, so a run that was stopped resumes. Puts its tables into
-docs/onset.md.
+late; beside it hints, the detector of bins and, with the first seed, the largest wavelet detail
+under the same budgets. Then false alarms of held-out materials by kind of recording, of reflex
+grips and strokes of the arm, and of recordings with imperfections. All data are simulated. What a
+seed gave is kept, so a run that was stopped resumes. Puts its tables into docs/onset.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import numpy as np
 from hydra.utils import instantiate
 
+from benchmarks.earlier import KEPT
 from benchmarks.harness import Benchmark, Job
 from benchmarks.tables import Report, Table, by, percent
 from benchmarks.trainings import composed, resumed, say
 from tactslip_torch import AlarmSettings, SlipDetector
+from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.onset.events import first_releases
-from tactslip_torch.onset.rules import Budget, Cusum
-from tactslip_torch.simulation.simulate import SimulatedRecordings
-from tactslip_torch.simulation.worlds import CONFOUNDERS, SLIP
+from tactslip_torch.onset.rules import Budget
+from tactslip_torch.simulation.simulate import SimulatedRecordings, Timeline
+from tactslip_torch.simulation.worlds import CONFOUNDERS as KINDS
+from tactslip_torch.simulation.worlds import SLIP
 from tactslip_torch.training.alarm import (
+    CONFOUNDERS,
     OURS,
     SLIPPING_NOW,
     Stream,
     Timing,
+    budget_scores,
     decide,
     score_streams,
 )
 
-SOURCES = ("tactslip_torch/pretrained/paper24-sim.pt",)
+SOURCES = (
+    "tactslip_torch/pretrained/paper24-sim.pt",
+    "benchmarks/peers/alarms_0_2_0.json",
+)
 FOUND_S, EARLY_S, HINT_S = 0.25, 0.2, 0.1
 """Of the first release: an alarm until then finds a slip, before it is early; a hint is in time."""
-HINT, BINS = "hint", "bins"
+HINT, BINS, EARLIER = "hint", "bins", "0.2.0"
 DETAIL: BaselineName = "largest_detail"
+GRIPS_PER_S = 0.8
+"""Of recordings of reflex grips, in the mean."""
+GRIPS_PER_S = 0.8
+"""Of recordings of reflex grips, in the mean."""
 
 
 def _pulled(*speeds_mm_s: float, moves: str = "object", distance_mm: float = 16.0) -> Any:
@@ -77,7 +91,7 @@ WORLDS: Mapping[str, Mapping[str, Any]] = {
     "load .3 N": _PULLED | {"load_n": 0.3},
     "between reflex grips": _PULLED
     | {"grips_per_s": 0.8, "grip_share": (0.3, 4.0), "grip_s": (0.04, 0.25)},
-    "bristles, pulled": _PULLED | _BRISTLES,
+    "bristles": _PULLED | _BRISTLES,
     "bristles, by the arm": _BY_ARM | _BRISTLES,
     "creep .2 s": _PULLED | _SILENT | {"recoil_s": 0.2, "slide_rise_s": 0.2},
     "load .1 N": _PULLED | {"load_n": 0.1},
@@ -107,9 +121,9 @@ OVERRIDES = (
     "onset.confidence=0.5",
     "onset.streams.slips=60",
     "onset.streams.confounders.held=600",
-    *(f"onset.streams.confounders.{kind}=60" for kind in CONFOUNDERS if kind != "held"),
+    *(f"onset.streams.confounders.{kind}=60" for kind in KINDS if kind != "held"),
     "onset.hours={held:1.5,slip:0.06,others:0.15}",
-    "onset.check_hours={held:2,slip:0.05,others:0.2}",
+    "onset.check_hours={held:2,slip:0,others:0.2}",
 )
 """Of ``+exp=onset``: fewer hours than by default set the threshold, so at the point estimate."""
 QUICK = '","'.join(
@@ -151,7 +165,7 @@ class Alarms(Benchmark):
     title = "The alarm in many worlds"
     about = "alarms of +exp=onset within the default budget, on recordings that set nothing"
     page, markers, has_headings = "docs/onset.md", "onset", False
-    quick = f'seeds=[0] overrides=["{QUICK}"] worlds=["pulled","pinch"] sessions=1'
+    quick = f'seeds=[0] overrides=["{QUICK}"] worlds=["pulled","bristles"] sessions=1'
     charts: ClassVar = {
         "": [
             ("Slips found", ("found", "bins", "detail")),
@@ -166,42 +180,92 @@ class Alarms(Benchmark):
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Slips in every world and false alarms of every kind, seeds together."""
-        slips, budgets, heads = list[dict[str, Any]](), list[list[Any]](), list[str]()
-        for seed in self.seeds:
-            given = ["+exp=onset", f"seed={seed}", *self.overrides, *job.overrides]
-            folder, has_detail = job.folder / f"seed-{seed}", seed == self.seeds[0]
-            made_by = [*given, f"detail={has_detail}"]
-            of_worlds = [*made_by, *self.worlds, f"sessions={self.sessions}"]
-            say(f"the alarm of seed {seed}")
-            fit = partial(_fitted, given, folder / "detector.pt", has_detail)
-            alarm = resumed(folder / "alarm.json", made_by, fit)
-            say(f"{len(self.worlds)} worlds of seed {seed}")
-            detector = SlipDetector.load(folder / "detector.pt")
-            run = partial(_slips, detector, alarm, self, seed)
-            slips += resumed(folder / "worlds.json", of_worlds, run)
-            budgets.append(alarm["budget"])
-            amounts = alarm["streams"]["calibrate"]
-            heads.append(alarm["classifier"]["head"])
-        rows = [_world_row(world, own) for (world,), own in by(slips, "world").items()]
+        slips, quiet = list[dict[str, Any]](), list[dict[str, Any]]()
+        given = [[f"seed={seed}", *self.overrides, *job.overrides] for seed in self.seeds]
+        set_by = [
+            self._seed(job.folder / f"seed-{seed}", seed, own, slips, quiet)
+            for seed, own in zip(self.seeds, given, strict=True)
+        ]
+        first = self.seeds[0]
+        earlier = json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
+        quiet += [{"method": EARLIER} | row for row in earlier.get("quiet", [])]
+        without = [*given[0], "onset.worlds.bristles=0"]
+        others = replace(self, worlds=tuple(w for w in self.worlds if "bristles" in w))
+        unknown = list[dict[str, Any]]()
+        if others.worlds:
+            others._seed(job.folder / "without bristles", first, without, unknown, [])
+        before = earlier.get("slips", {})
+        rows = [
+            _world_row(world, own, before.get(world, []))
+            for (world,), own in by(slips, "world").items()
+        ]
         rows.sort(key=itemgetter("found %"))
-        return {
-            "tables": {
-                "Slips found": Table(
-                    rows,
-                    "Within 250 ms of the first release, in % of all seeds; *lowest*: of the seed "
-                    "that found least. *Early*: an alarm that stood or was raised up to 200 ms "
-                    "before it. *Hint*: within 100 ms. *Bins*: the detector of bins behind its "
-                    "rule, *detail*: the largest wavelet detail of a fast channel, under the same "
-                    f"budgets; detail of seed {self.seeds[0]} alone. Heads: {', '.join(heads)}.",
-                ),
-                "False alarms": Table(
-                    _alarm_rows(budgets),
-                    "An hour, of materials that were held out, with 95 % intervals; all seeds "
-                    "together. *confounders*: all kinds below it. Thresholds of each seed are "
-                    f"those of {_hours(amounts)} of other materials, at the point estimate.",
-                ),
-            }
+        tables = {
+            "Slips found": Table(
+                rows,
+                "Within 250 ms of the first release, in % of all seeds; *lowest*: of the seed "
+                "that found least. *Early*: an alarm that stood or was raised up to 200 ms "
+                "before it. *Hint*: within 100 ms. *Bins*: the detector of bins behind its "
+                "rule, *detail*: the largest wavelet detail of a fast channel, under the same "
+                f"budgets; detail of seed {first} alone. *0.2.0*: the alarm of that version, as "
+                f"its own training set it, seed {first}. "
+                f"Heads: {', '.join(alarm['classifier']['head'] for alarm in set_by)}.",
+            ),
+            "False alarms": Table(
+                _quiet_rows(quiet, self.budget(given[0])),
+                "An hour, of materials that were held out, with 95 % intervals; all seeds "
+                "together. *Confounders*: all kinds below it but *held*; *with imperfections*: "
+                "those of them whose channels differ. *Of each*: of reflex grips, of which there "
+                f"are {GRIPS_PER_S:g} a second, and of strokes of the arm. Thresholds of each seed "
+                f"are those of {_hours(set_by[-1]['streams']['calibrate'])} of other materials, "
+                "at the point estimate.",
+            ),
         }
+        if unknown:
+            known = {row["world"]: row for row in slips if row["seed"] == first}
+            tables["Without bristles in what is learned from"] = Table(
+                [
+                    {
+                        "world": row["world"],
+                        "found %": percent(_share(row[SLIPPING_NOW], FOUND_S)),
+                        "with bristles %": percent(
+                            _share(known[row["world"]][SLIPPING_NOW], FOUND_S)
+                        ),
+                        "slips": len(row[SLIPPING_NOW]),
+                    }
+                    for row in unknown
+                ],
+                f"Physics that the classifier never saw; seed {first}.",
+            )
+        return {"tables": tables}
+
+    def budget(self, given: Sequence[str]) -> Mapping[str, float]:
+        """False alarms an hour that are allowed, by kind."""
+        of: Mapping[str, float] = composed("train", ["+exp=onset", *given]).onset.budget
+        return of
+
+    def _seed(
+        self,
+        folder: Path,
+        seed: int,
+        given: Sequence[str],
+        slips: list[dict[str, Any]],
+        quiet: list[dict[str, Any]],
+    ) -> dict[str, Any]:
+        """How the alarm of a seed was set; what became of slips and of the rest is added."""
+        given, has_detail = ["+exp=onset", *given], seed == self.seeds[0]
+        made_by = [*given, f"detail={has_detail}"]
+        say(f"the alarm in {folder.name}")
+        fit = partial(_fitted, given, folder / "detector.pt", has_detail)
+        alarm: dict[str, Any] = resumed(folder / "alarm.json", made_by, fit)
+        methods = _Methods.of(SlipDetector.load(folder / "detector.pt"), alarm)
+        say(f"{len(self.worlds)} worlds of {folder.name}")
+        of_worlds = [*made_by, *self.worlds, f"sessions={self.sessions}"]
+        run = partial(_slips, methods, alarm["held_out"], self, seed)
+        slips += resumed(folder / "worlds.json", of_worlds, run)
+        say(f"recordings without slip of {folder.name}")
+        quiet += resumed(folder / "quiet.json", made_by, partial(_quiet, methods, given))
+        return alarm
 
     def section(self, report: Report) -> str:
         """The tables, and their figure."""
@@ -216,11 +280,14 @@ def _fitted(given: Sequence[str], path: Path, has_detail: bool) -> dict[str, Any
     others = {name: scorer for name, scorer in scorers.items() if name != OURS}
     set_alarm = instantiate(config.onset, _convert_="all")
     roles = set_alarm.roles(detector)
-    set_alarm.streams.ids = (*roles["calibrate"], *roles["unseen"])  # none checks seen materials
+    set_alarm.streams.ids = tuple(roles["calibrate"])  # nothing is checked but what is shown
     found: dict[str, Any] = set_alarm(detector, others, num_workers=config.num_workers)
     path.parent.mkdir(parents=True, exist_ok=True)
     detector.save(path)
-    return found
+    held_out = list(dict.fromkeys(recording.material for recording in roles["unseen"]))
+    return {name: found[name] for name in ("methods", "classifier", "streams")} | {
+        "held_out": held_out
+    }
 
 
 def _hours(amounts: Mapping[str, Mapping[str, float]]) -> str:
@@ -240,52 +307,130 @@ def _scorers(detector: SlipDetector, has_detail: bool) -> dict[str, Scorer]:
     }
 
 
+class _Methods(NamedTuple):
+    """What makes alarms of recordings.
+
+    Attributes:
+        scorers: by name.
+        settings: by method the name of its scorer, and what makes alarms of scores.
+    """
+
+    scorers: dict[str, Scorer]
+    settings: dict[str, tuple[str, AlarmSettings]]
+
+    @classmethod
+    def of(cls, detector: SlipDetector, alarm: Mapping[str, Any]) -> Self:
+        ours, pool = AlarmSettings.of(detector), detector.pool
+        assert ours.onset is not None
+        settings = {
+            SLIPPING_NOW: (OURS, ours),
+            HINT: (OURS, ours.at_threshold(ours.onset.hint)),
+        }
+        for name, label in {ours.rule.name: BINS, DETAIL: DETAIL}.items():
+            if made := alarm["methods"].get(name):
+                plain = {field.name: made[field.name] for field in fields(AlarmSettings)}
+                plain |= {"onset": None}
+                own = AlarmSettings.from_dict(plain, pool.hand, pool.sample_rate_hz)
+                settings[label] = made["scorer"], own
+        return cls(_scorers(detector, DETAIL in settings), settings)
+
+    @property
+    def ours(self) -> AlarmSettings:
+        """Of the alarm."""
+        return self.settings[SLIPPING_NOW][1]
+
+    def timing(self, name: str) -> Timing:
+        """Of a scorer."""
+        pool, look_ahead = self.scorers[OURS].pool, self.scorers[name].look_ahead
+        return Timing(pool.sample_rate_hz, self.ours.hop_samples, pool.bin_samples, look_ahead)
+
+    def score(
+        self, source: RecordingSource, recordings: Sequence[RecordingId]
+    ) -> dict[str, list[Stream]]:
+        """Streams of each scorer."""
+        hops = dict.fromkeys(self.scorers, self.ours.hop_samples)
+        return score_streams(source, recordings, self.scorers, hops, self.ours.onset)
+
+
+def world_recordings(
+    world: str, materials: Sequence[str], sessions: int, seed: int
+) -> SimulatedRecordings:
+    """Slips in a world, of mountings and draws that nothing else has."""
+    return SimulatedRecordings(
+        seed=1000 + seed,
+        cycles=1,
+        sessions=sessions,
+        materials=materials,
+        scene=WORLDS[world],
+    )
+
+
+def quiet_recordings(
+    given: Sequence[str],
+) -> tuple[RecordingSource, dict[tuple[str, bool], list[RecordingId]], list[str]]:
+    """Recordings without slip of held-out materials, by kind and whether channels differ.
+
+    Returns:
+        Their source, them, and the materials.
+    """
+    set_alarm = instantiate(composed("train", given).onset, _convert_="all")
+    source = set_alarm.streams
+    groups = defaultdict[tuple[str, bool], list[RecordingId]](list)
+    for recording in set_alarm.roles(SlipDetector.pretrained())["unseen"]:
+        if recording.scene != SLIP:
+            is_imperfect = "local_noise_mv" in source.key(recording).get("imperfections", {})
+            groups[recording.scene, is_imperfect].append(recording)
+    materials = dict.fromkeys(one.material for own in groups.values() for one in own)
+    return source, dict(groups), list(materials)
+
+
 def _slips(
-    detector: SlipDetector, alarm: Mapping[str, Any], sizes: Alarms, seed: int
+    methods: _Methods, materials: Sequence[str], sizes: Alarms, seed: int
 ) -> list[dict[str, Any]]:
     """What became of each slip of held-out materials, by world and method."""
-    ours, pool = AlarmSettings.of(detector), detector.pool
-    assert ours.onset is not None
-    scorers, rate = _scorers(detector, seed == sizes.seeds[0]), pool.sample_rate_hz
-    methods = {
-        SLIPPING_NOW: (OURS, ours),
-        HINT: (OURS, ours.at_threshold(ours.onset.hint)),
-    }
-    for name, label in {ours.rule.name: BINS, DETAIL: DETAIL}.items():
-        if made := alarm["methods"].get(name):
-            plain = {field.name: made[field.name] for field in fields(AlarmSettings)}
-            settings = AlarmSettings.from_dict(plain | {"onset": None}, pool.hand, rate)
-            methods[label] = made["scorer"], settings
-    hops = dict.fromkeys(scorers, ours.hop_samples)
-    timings = {
-        name: Timing(rate, hops[name], pool.bin_samples, scorer.look_ahead)
-        for name, scorer in scorers.items()
-    }
     rows = list[dict[str, Any]]()
     for world in sizes.worlds:
-        source = SimulatedRecordings(
-            seed=1000 + seed,
-            cycles=1,
-            sessions=sizes.sessions,
-            materials=alarm["held_out"],
-            scene=WORLDS[world],
-        )
-        streams = score_streams(source, source.ids, scorers, hops, ours.onset)
+        source = world_recordings(world, materials, sizes.sessions, seed)
+        streams = methods.score(source, source.ids)
         found = {
             name: [
                 delay
-                for stream, made in decide(streams[scorer], own, timings[scorer])
-                for delay in _delays(stream, made)
+                for stream, made in decide(streams[scorer], own, methods.timing(scorer))
+                for delay in delays(stream.times, made)
             ]
-            for name, (scorer, own) in methods.items()
+            for name, (scorer, own) in methods.settings.items()
         }
         rows.append({"world": world, "seed": seed, **found})
     return rows
 
 
-def _delays(stream: Stream, made: Any) -> list[float | str]:
+def _quiet(methods: _Methods, given: Sequence[str]) -> list[dict[str, Any]]:
+    """False alarms of held-out materials by kind, with and without imperfections."""
+    source, groups, _ = quiet_recordings(given)
+    rows = list[dict[str, Any]]()
+    for (scene, is_imperfect), own in groups.items():
+        streams = methods.score(source, own)
+        timelines = [cast(Timeline, source.timeline(recording)) for recording in own]
+        for name, (scorer, settings) in methods.settings.items():
+            timing = methods.timing(scorer)
+            (found,) = budget_scores(streams[scorer], settings, timing, [Budget(scene, 1.0)])
+            alarms = found.alarms(settings, timing.sample_rate_hz)
+            rows.append(
+                {
+                    "kind": scene,
+                    "is_imperfect": is_imperfect,
+                    "method": name,
+                    "alarms": sum(map(len, alarms)),
+                    "hours": found.amount,
+                    "strokes": sum(len(times.arm_s) for times in timelines),
+                }
+            )
+    return rows
+
+
+def delays(times: Any, made: Any) -> list[float | str]:
     """Seconds from the first release of each slip to its alarm, or ``early``, or ``missed``."""
-    times, time_s = stream.times, made.available_s.numpy()
+    time_s = made.available_s.numpy()
     raised, is_on = time_s[made.is_alarm.numpy()], made.is_on.numpy()
     outcomes = list[float | str]()
     for first_s in first_releases(times.onsets_s, times.released_s):
@@ -297,13 +442,16 @@ def _delays(stream: Stream, made: Any) -> list[float | str]:
     return outcomes
 
 
-def _world_row(world: str, by_seed: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    def share(name: str, within_s: float = FOUND_S) -> list[float]:
-        return [
-            fmean(not isinstance(delay, str) and delay <= within_s for delay in of[name])
-            for of in by_seed
-            if name in of
-        ]
+def _share(delays: Sequence[float | str], within_s: float) -> float:
+    """Of slips that are found in time."""
+    return fmean(not isinstance(delay, str) and delay <= within_s for delay in delays)
+
+
+def _world_row(
+    world: str, by_seed: Sequence[Mapping[str, Any]], before: Sequence[float | str]
+) -> dict[str, Any]:
+    def shares(name: str, within_s: float = FOUND_S) -> list[float]:
+        return [_share(of[name], within_s) for of in by_seed if name in of]
 
     every = [delay for of in by_seed for delay in of[SLIPPING_NOW]]
     delays_ms = 1e3 * np.array([delay for delay in every if not isinstance(delay, str)])
@@ -311,37 +459,59 @@ def _world_row(world: str, by_seed: Sequence[Mapping[str, Any]]) -> dict[str, An
     hints = [delay for of in by_seed for delay in of[HINT]]
     return {
         "world": world,
-        "found %": round(100 * fmean(share(SLIPPING_NOW)), 1),
-        "lowest %": round(100 * min(share(SLIPPING_NOW)), 1),
+        "found %": round(100 * fmean(shares(SLIPPING_NOW)), 1),
+        "lowest %": round(100 * min(shares(SLIPPING_NOW)), 1),
         "early %": percent(fmean(delay == "early" for delay in every)),
         "median ms": f"{median:.0f}",
         "p95 ms": f"{p95:.0f}",
-        "hint %": percent(fmean(share(HINT, HINT_S))),
+        "hint %": percent(fmean(shares(HINT, HINT_S))),
         "early hints %": percent(fmean(delay == "early" for delay in hints)),
-        "bins %": percent(fmean(share(BINS))),
-        "detail %": percent(fmean(share(DETAIL))) if share(DETAIL) else "-",
+        "bins %": percent(fmean(shares(BINS))),
+        "detail %": percent(fmean(shares(DETAIL))) if shares(DETAIL) else "-",
+        f"{EARLIER} %": percent(_share(before, FOUND_S)) if before else "-",
         "slips": len(every),
     }
 
 
-def _alarm_rows(by_seed: Iterable[Sequence[Any]]) -> list[dict[str, Any]]:
-    """A row for each kind: rates of the alarm, of bins and of detail, all seeds together."""
-    every = [row for budget in by_seed for row in budget if row["role"] == "unseen"]
-    rows = []
-    for (scene,), own in by(every, "scene").items():
-        limit = own[0]["limit"]
-        row = {"kind": scene.replace("_", " ")}
-        for method, column in {SLIPPING_NOW: "alarm", Cusum.name: BINS, DETAIL: "detail"}.items():
-            of = [one for one in own if one["method"] == method]
-            alarms, hours = sum(one["alarms"] for one in of), sum(one["amount"] for one in of)
-            if not of:
-                continue
-            low, high = Budget(scene, 1.0).interval(alarms, hours)
-            row |= {column: f"{alarms / hours:.2f} [{low:.2f}, {high:.2f}]"}
-            if method == SLIPPING_NOW:
-                row |= {"budget": "-" if limit is None else f"{limit:g} /h", "of": f"{hours:.2f} h"}
-        rows.append(row)
-    return rows
+def _quiet_rows(
+    found: Sequence[Mapping[str, Any]], budget: Mapping[str, float]
+) -> list[dict[str, Any]]:
+    """A row for each kind: rates of the alarm, of hints, of bins and of detail."""
+    others = [row for row in found if row["kind"] not in budget]
+    kinds = by(found, "kind")
+    held = {kind: own for (kind,), own in kinds.items() if kind in budget}
+    alone = {kind.replace("_", " "): own for (kind,), own in kinds.items() if kind not in budget}
+    alone = dict(sorted(alone.items(), key=lambda item: -_rate(item[1], SLIPPING_NOW)))
+    imperfect = [row for row in others if row["is_imperfect"]]
+    groups = held | {CONFOUNDERS: others} | {"with imperfections": imperfect} | alone
+    return [_quiet_row(kind, own, budget.get(kind)) for kind, own in groups.items() if own]
+
+
+def _quiet_row(
+    kind: str, found: Sequence[Mapping[str, Any]], limit: float | None
+) -> dict[str, Any]:
+    row: dict[str, Any] = {"kind": kind}
+    for method in (SLIPPING_NOW, HINT, BINS, DETAIL, EARLIER):
+        own = [one for one in found if one["method"] == method]
+        if not own:
+            continue
+        alarms, hours = sum(one["alarms"] for one in own), sum(one["hours"] for one in own)
+        low, high = Budget(kind, 1.0).interval(alarms, hours)
+        name = "alarm" if method == SLIPPING_NOW else method.replace("largest_", "")
+        row[name] = f"{alarms / hours:.2f} [{low:.2f}, {high:.2f}]"
+        if method == SLIPPING_NOW:
+            of = {
+                "reflex grips": 3600 * GRIPS_PER_S * hours,
+                "arm": sum(one["strokes"] for one in own),
+            }
+            row["of each"] = f"{100 * alarms / of[kind]:.2f} %" if kind in of else "-"
+            row["hours"] = f"{hours:.2f}"
+    return row | {"budget": "-" if limit is None else f"{limit:g} /h"}
+
+
+def _rate(found: Sequence[Mapping[str, Any]], method: str) -> float:
+    own = [one for one in found if one["method"] == method]
+    return float(sum(one["alarms"] for one in own) / sum(one["hours"] for one in own))
 
 
 if __name__ == "__main__":

@@ -24,9 +24,9 @@ from benchmarks.trainings import composed, resumed
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import seen6
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.report.metrics import balanced_accuracy
 from tactslip_torch.runtime import in_processes
 from tactslip_torch.training.bins import BinSample, RecordingBins, SampledBins
-from tactslip_torch.training.choice import balanced_accuracy
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import feature_cache, feature_maker
 from tactslip_torch.training.recipe import Recipe

@@ -44,11 +44,12 @@ from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.report import style
+from tactslip_torch.report.metrics import balanced_accuracy
+from tactslip_torch.report.recordings import signals_figure
 from tactslip_torch.signals.filtering import bins_at
 from tactslip_torch.simulation.scene import SEEN_MATERIALS
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 from tactslip_torch.training.bins import BinSample, SampledBins
-from tactslip_torch.training.choice import balanced_accuracy
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import feature_cache, feature_maker
 from tactslip_torch.training.recipe import Paper
@@ -609,32 +610,18 @@ def _draw_trial(
     style.save(figure, path)
 
 
-@style.styled
 def _draw_signals(maker: FeatureMaker, path: Path) -> None:
     """SGs and PVDF films of every seen material, five seconds around an onset."""
-    hand, rate = maker.source.hand, maker.source.sample_rate_hz
-    materials = [m for m in SEEN_MATERIALS if any(of.material == m for of in maker.source.ids)]
-    figure = style.new_figure(9.2, 1.7 * len(materials) + 1, "Signals at 40 mm/s", simulated=True)
-    panels = figure.subplots(len(materials), 2, sharex=True, squeeze=False)
-    fingers = list(dict.fromkeys(channel.finger for channel in hand.channels))
-    looks = dict(zip(fingers, style.PALETTE, strict=False))
-    for row, material in zip(panels, materials, strict=True):
-        recording = maker.source.load(RecordingId(material, 0))
-        onset = recording.onsets_s[recording.speeds_mm_s.index(SIGNALS_MM_S)]
-        near = slice(round((onset - 2) * rate), round((onset + 3) * rate))
-        volts = maker.channel_filter(recording.samples.double())[:, near]
-        times = torch.arange(volts.shape[-1]) / rate - 2
-        for axes, kind in zip(row, ("SG", "PVDF"), strict=True):
-            for channel, own in zip(hand.channels, 1000 * volts, strict=True):
-                if channel.kind == kind:
-                    axes.plot(times, own, color=looks[channel.finger], linewidth=0.6)
-            axes.axvline(0, color=style.INK, linestyle="-.", linewidth=1)
-            axes.set(ylabel="mV", title=f"{material}, {kind}", xlim=(-2, 3))
-    for axes in panels[-1]:
-        axes.set_xlabel("time from the true onset, s")
-    handles = [Line2D([], [], color=colour, label=finger) for finger, colour in looks.items()]
-    style.legend_below(figure, handles, len(handles))
-    style.save(figure, path)
+    rows, views = [], []
+    for recording in maker.source.ids:
+        if recording.material in SEEN_MATERIALS and not recording.cycle:
+            content = maker.source.load(recording)
+            onset_s = content.onsets_s[content.speeds_mm_s.index(SIGNALS_MM_S)]
+            volts = maker.channel_filter(content.samples.double())
+            rows.append((recording.material, replace(content, samples=volts)))
+            views.append((onset_s - 2, onset_s + 3))
+    title = f"SIMULATED, signals at {SIGNALS_MM_S:g} mm/s"
+    signals_figure(rows, maker.source.hand.to_rows(), path, title=title, views=views)
 
 
 if __name__ == "__main__":

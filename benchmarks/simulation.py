@@ -20,9 +20,9 @@ from benchmarks.tables import Table, percent, times
 from benchmarks.timing import interleaved, on_threads
 from benchmarks.trainings import composed
 from tactslip_torch.data.splits import seen6
+from tactslip_torch.report.metrics import balanced_accuracy
 from tactslip_torch.simulation import SEEN_MATERIALS, Dynamics, Scene, simulate, timeline
 from tactslip_torch.simulation.simulate import SimulatedRecordings
-from tactslip_torch.training.choice import balanced_accuracy
 from tactslip_torch.training.datamodule import SlipDataModule
 from tactslip_torch.training.experiment import feature_maker
 from tactslip_torch.training.recipe import General

@@ -7,7 +7,7 @@ if TYPE_CHECKING:
     from tactslip_torch.data.recording import Recording as Recording
     from tactslip_torch.estimators import SlipClassifier as SlipClassifier
     from tactslip_torch.estimators import TactileFeatures as TactileFeatures
-    from tactslip_torch.features.names import FeatureName as FeatureName
+    from tactslip_torch.features.descriptors import FeatureName as FeatureName
     from tactslip_torch.features.pool import FeaturePool as FeaturePool
     from tactslip_torch.hand import Channel as Channel
     from tactslip_torch.hand import HandLayout as HandLayout
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "AlarmSettings": "onset.decisions",
     "Channel": "hand",
-    "FeatureName": "features.names",
+    "FeatureName": "features.descriptors",
     "FeaturePool": "features.pool",
     "HandLayout": "hand",
     "Prediction": "model.prediction",

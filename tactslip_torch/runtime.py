@@ -543,10 +543,10 @@ def _call(item: Any) -> Any:
 
 def is_first_process() -> bool:
     """Whether this is the only process of a run, or the one that writes for all."""
-    return process_number() == 0
+    return _process_number() == 0
 
 
-def process_number() -> int:
+def _process_number() -> int:
     """The rank of this process in its run, by what torchrun, Lightning or SLURM has set."""
     for name in ("RANK", "SLURM_PROCID", "LOCAL_RANK"):
         if name in os.environ:

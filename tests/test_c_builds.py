@@ -12,7 +12,7 @@ from hosts import EXPORT, alarming_detector, run_host, saved, slipping_stream, t
 
 from benchmarks.native_c import BOARDS, make, missing_tools, on_board, sample_counts
 from tactslip_torch import SlipDetector, StreamingDetector
-from tactslip_torch.commands.packaged import copy_host
+from tactslip_torch.commands.hosts import copy_host
 from tactslip_torch.deploy.native import SOURCE, NativeFile
 
 pytestmark = pytest.mark.slow

@@ -7,8 +7,11 @@ import pytest
 import torch
 
 from tactslip_torch import FeaturePool, HandLayout
-from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
-from tactslip_torch.features.names import SIMPLE_STATISTICS
+from tactslip_torch.features.descriptors import (
+    SIMPLE_STATISTICS,
+    SPECTRUM_DESCRIPTORS,
+    TIME_DESCRIPTORS,
+)
 
 PAGE = Path(__file__).parents[1] / "docs" / "numerics.md"
 ANSWERS = {"same": "same", "g": 1, "g^2": 2, "+ c": "shifts"}

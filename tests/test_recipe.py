@@ -14,8 +14,8 @@ from tactslip_torch.features.pool import FeaturePool, is_simple_of
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
 from tactslip_torch.model.fit import TrainingBins
+from tactslip_torch.report.metrics import balanced_accuracy
 from tactslip_torch.training.bins import BinSample, RecordingBins
-from tactslip_torch.training.choice import balanced_accuracy
 from tactslip_torch.training.columns import VIEWS
 from tactslip_torch.training.recipe import General, Paper
 from tactslip_torch.training.views import ViewBins

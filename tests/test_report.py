@@ -12,6 +12,7 @@ from drawing import assert_png, rows_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 
+from tactslip_torch.commands.entry import compare_runs
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.events import (
@@ -36,7 +37,6 @@ from tactslip_torch.report.recordings import (
     signals_figure,
 )
 from tactslip_torch.report.style import ALARM, table
-from tactslip_torch.report.sweep import sweep_table, write_sweep
 
 REASON = "nobody looked"
 
@@ -222,16 +222,6 @@ def test_choices_show_what_each_view_was_given_and_what_would_have_been_best(cap
     assert line.endswith(": 81.25 % (M1 87.50, M2 75.00)")
 
 
-def test_the_figure_of_choices_has_a_line_a_view_and_a_star_for_each_that_is_kept(drawn, tmp_path):
-    results._validation_figure(metrics_of(validation=VIEW_CHOICES), tmp_path / "validation.png")
-    *of_views, stars = drawn[0].axes[0].get_lines()
-    labels = [line.get_label() for line in of_views]
-    assert [label.split(",")[0] for label in labels] == ["simple", "channel", "pooled"]
-    assert ["dropped" in label for label in labels] == [False, True, False]
-    assert of_views[0].get_xydata().tolist() == pytest.approx(np.array([[0.1, 80], [1, 81]]))
-    assert stars.get_xydata().tolist() == pytest.approx(np.array([[0.1, 80], [1, 75]]))
-
-
 def test_reliability_has_a_row_for_each_role():
     lines = results._reliability_table(metrics_of(alarm={"reliability": BY_ROLE})).splitlines()
     rows = [line.split() for line in lines[2:]]
@@ -320,8 +310,6 @@ def features_of(metrics, path):
 FIGURES = [
     (results._confusion_figure, {}),
     (results._confusion_figure, {"splits": ABSENT}),
-    (results._validation_figure, {"validation": CHOICES}),
-    (results._validation_figure, {"validation": VIEW_CHOICES}),
     (results._reliability_figure, {"alarm": {"reliability": BY_ROLE}}),
     (results._events_figure, {"events": EVENTS}),
     (features_of, {}),
@@ -359,7 +347,6 @@ def test_results_have_a_table_and_a_figure_of_all_there_is(drawn, tmp_path, caps
         assert words in out
     assert {path.name for path in (tmp_path / "all").iterdir()} == {
         *("metrics.json", "confusion.png", "selected_features.png", "events.png"),
-        "validation.png",
     }
     kept = json.loads((tmp_path / "all" / "metrics.json").read_text())
     assert kept["splits"] == everything["splits"]
@@ -545,20 +532,18 @@ def test_the_table_says_what_is_simulated_what_is_wrong_and_what_it_leaves_out()
     assert onsets_of(simulated=False) == ["no alarm, and no slip missed"]
 
 
-RUNS = [
-    ("seed=0", {"test/accuracy": 0.9, "test/balanced_accuracy": 0.8}),
-    ("seed=1", {"test/accuracy": 0.7, "test/balanced_accuracy": 0.6}),
-]
-
-
-def test_runs_stand_beside_each_other_with_mean_and_deviation(tmp_path):
-    lines = sweep_table(RUNS, simulated=True).splitlines()
+def test_runs_stand_beside_each_other_with_mean_and_deviation(tmp_path, capsys):
+    runs = [
+        {"words": ["x=1", f"seed={seed}"], "place": tmp_path, "simulated": True}
+        | {"scores": {"test/accuracy": accuracy, "test/balanced_accuracy": balanced}}
+        for seed, (accuracy, balanced) in enumerate([(0.9, 0.8), (0.7, 0.6)])
+    ]
+    compare_runs(runs)
+    lines = capsys.readouterr().out.strip().splitlines()
     assert "SIMULATED" in lines[0]
     assert lines[2].split() == ["seed=0", "90.00", "80.00"]
     assert lines[4].split() == ["mean", "80.00", "70.00"]
     assert lines[5].split() == ["standard", "deviation", "10.00", "10.00"]
-    write_sweep(RUNS, tmp_path, simulated=True)
-    assert (tmp_path / "runs.png").read_bytes().startswith(b"\x89PNG")
     with (tmp_path / "runs.csv").open() as file:
         assert list(csv.reader(file))[2] == ["seed=1", "0.7", "0.6"]
 

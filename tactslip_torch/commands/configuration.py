@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import textwrap
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,9 +23,6 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from tactslip_torch.commands.own_folder import FOLDER_KEYS, HAND_FILE, OF_HAND, with_folder
-from tactslip_torch.commands.packaged import packaged_folder
-
 _COMMENTED = re.compile(r"( *)(?:- )?([\w@/]+):(?: +([^#\s].*?))?(?: +# (.*))?$")
 _WIDTH, _INDENT = 100, 34
 _HELP = """
@@ -34,6 +32,28 @@ every command also takes:
   --cfg job                       print the configuration and stop
   --config-dir FOLDER             a folder with configuration of your own
   TACTSLIP_TRACEBACK=1            environment variable: errors show where they were raised"""
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+HAND_FILE = "hand.yaml"
+"""How the recordings of its folder are read and labelled; written by ``tactslip setup``."""
+_MANIFEST = "manifest.csv"
+OF_HAND = ("data", "labels", "features", "split")
+"""Its sections."""
+_SECTIONS = {
+    "train": OF_HAND,
+    "pareto": OF_HAND,
+    "evaluate": ("data", "labels"),
+    "calibrate": ("data", "labels"),
+    "data": ("data", "labels", "features"),
+}
+"""Of each command that takes a folder, the sections of ``hand.yaml`` that it has."""
+_PLACES = {"detect": "input", "stream": "source"}
+"""The key of commands that take a file or folder and need no labels."""
+FOLDER_KEYS = {name: ["data.root"] for name in _SECTIONS}
+FOLDER_KEYS |= {"data": ["root", "action"], "detect": ["input"]}
+"""The keys that a folder as first argument sets, by command."""
+_OWN = "own"
 
 
 class CommandLine(NamedTuple):
@@ -60,6 +80,14 @@ class Key(NamedTuple):
     name: str
     value: Any
     description: str
+
+
+def packaged_folder(name: str, hint: str) -> Path:
+    """A folder inside the package (wheel) or beside it (checkout); ``hint`` is a file in it."""
+    for folder in (_PACKAGE / name, _PACKAGE.parent / name):
+        if (folder / hint).is_file():
+            return folder
+    raise FileNotFoundError(f"no {name} folder with {hint} in or beside {_PACKAGE}; reinstall")
 
 
 def conf_dir() -> Path:
@@ -253,7 +281,7 @@ def checked(command: str, arguments: Sequence[str]) -> CommandLine:
         ValueError: if it cannot be composed.
     """
     typed = list(arguments)
-    arguments = with_folder(command, arguments)
+    arguments = _with_folder(command, arguments)
     has_hand = list(arguments) != typed
     if "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("RANK", "0") != "0":
         nowhere = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
@@ -406,3 +434,108 @@ def with_lists(command: str, config: DictConfig, hydra: Any) -> None:
         is_set = key.value != "???" and not str(key.value).startswith("${")
         if is_simple and is_set and key.description.startswith("list"):
             OmegaConf.update(config, key.name, [key.value], merge=False)
+
+
+# A folder of recordings as the first argument -----------------------------------------------------
+
+
+def _with_folder(command: str, arguments: Sequence[str]) -> list[str]:
+    """The arguments of a command, a folder or file as the first of them made overrides.
+
+    Args:
+        command: its name.
+        arguments: as they were typed.
+
+    Raises:
+        ValueError: in one line, if the folder is none or does not say how it is read.
+    """
+    first, *rest = arguments or [""]
+    if not first or first[:1] in "-+~" or "=" in first:
+        return list(arguments)
+    if command not in _SECTIONS and command not in _PLACES:
+        return list(arguments)
+    folder = Path(first)
+    if not folder.exists():
+        top = conf_dir() / f"{command}.yaml"
+        if re.search(rf"(?m)^(?:  - )?{re.escape(first.partition('.')[0])}:", top.read_text()):
+            return list(arguments)  # a key without its value, which is told so
+        raise ValueError(f"no folder at {first}; give a folder of recordings, or KEY=VALUE")
+    if command in _PLACES:
+        return [f"{_PLACES[command]}={_quoted(first)}", *rest]
+    if not folder.is_dir():
+        raise ValueError(f"{first} is a file; give the folder that it is in")
+    settings = _hand_settings(command, folder, rest)
+    kept = {name: settings[name] for name in _SECTIONS[command] if settings.get(name)}
+    node: dict[str, Any] = {"defaults": _group_options(command, kept), **kept}
+    node.setdefault("data", {})["root"] = str(folder)
+    if command in ("train", "pareto"):
+        node["name"] = re.sub(r"[^\w.-]+", "_", folder.resolve().name) or "own"
+    if command == "train":
+        node["train_on_all"] = True
+    if command == "data":
+        node["root"] = str(folder)
+        if not any(word.startswith("action=") for word in rest):
+            rest = ["action=check", *rest]
+    ConfigStore.instance().store(_OWN, node, _OWN, package="_global_")
+    return [f"+{_OWN}={_OWN}", *rest]
+
+
+def _group_options(command: str, settings: Mapping[str, Any]) -> list[Any]:
+    """The options of groups that recordings of one's own take."""
+    files = "named" if "pattern" in settings.get("data", {}) else "files"
+    chosen: list[Any] = [{"override /data": files}]
+    if command in ("train", "pareto"):
+        chosen.append({"override /split": "groups"})
+    return [*chosen, "_self_"]
+
+
+def _hand_settings(command: str, folder: Path, rest: Sequence[str]) -> dict[str, Any]:
+    """What ``hand.yaml`` says, else the detector that is given, else nothing but a manifest.
+
+    Raises:
+        ValueError: if it is no such file, or nothing says how the folder is read.
+    """
+    path = folder / HAND_FILE
+    if path.is_file():
+        return _read_hand(path)
+    model = next((word.removeprefix("model=") for word in rest if word.startswith("model=")), None)
+    if model is not None and Path(model).is_file():
+        from tactslip_torch.model.detector import SlipDetector  # torch, which help does without
+
+        info = SlipDetector.load(model).info
+        if "data" in info:
+            data = {**info["data"], "reading": info.get("reading", {})}
+            return {"data": data, "labels": info.get("labels", {})}
+    if (folder / _MANIFEST).is_file():
+        return {}
+    raise ValueError(
+        f"{folder} has neither {HAND_FILE} nor {_MANIFEST}, so it is not known how it is read; "
+        f"tactslip setup {shlex.quote(str(folder))} looks at it and writes {HAND_FILE}"
+    )
+
+
+def _read_hand(path: Path) -> dict[str, Any]:
+    """The sections of ``hand.yaml``.
+
+    Raises:
+        ValueError: in one line, if it is none.
+    """
+    try:
+        found = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(found, dict) or not set(found) <= set(OF_HAND):
+        has = ", ".join(map(str, found)) if isinstance(found, dict) else repr(found)[:40]
+        raise ValueError(f"{path} must have the sections {', '.join(OF_HAND)}, got {has}")
+    for name, section in found.items():
+        if section is not None and not isinstance(section, dict):
+            raise ValueError(f"{path}: {name} must be KEY: VALUE lines, got {section!r}")
+        if hidden := [key for key in section or {} if str(key).startswith("_")]:
+            raise ValueError(f"{path}: {name} has no key {hidden[0]}; remove it")
+    return {name: section for name, section in found.items() if section}
+
+
+def _quoted(text: str) -> str:
+    """A text that Hydra reads as it is."""
+    escaped = text.replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{escaped}'"

@@ -23,7 +23,7 @@ def demo(folder: Path) -> None:
         raise FileExistsError(f"{folder} is there and not empty; give another one, --out DIR")
     from tactslip_torch.commands.configuration import compose_config  # not for --help
     from tactslip_torch.commands.detect import detect
-    from tactslip_torch.commands.packaged import copy_host
+    from tactslip_torch.commands.hosts import copy_host
     from tactslip_torch.deploy.export import export_detector
     from tactslip_torch.model.detector import SlipDetector
     from tactslip_torch.pretrained import NAME, RECORDING, sample_recording

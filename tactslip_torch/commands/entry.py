@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from statistics import mean, pstdev
 from typing import Any, TextIO
 
 import hydra
@@ -78,23 +79,36 @@ def entry_point(
             sys.argv[1:] = [f"hydra.job.name={command}", *line.arguments]
             hydra.main(str(conf_dir()), command, version_base="1.3")(in_folder)()
             if runs and is_first_process():
-                _compare(runs)
+                compare_runs(runs)
 
     return main
 
 
-def _compare(runs: list[dict[str, Any]]) -> None:
-    """A table and a figure of the runs of a sweep, by what differs between them."""
-    from tactslip_torch.report.sweep import sweep_table, write_sweep  # draws, which few commands do
+def compare_runs(runs: list[dict[str, Any]]) -> None:
+    """Print the scores of a sweep's runs with their mean and deviation, and write ``runs.csv``.
+
+    Args:
+        runs: of each its ``words``, of which those that differ are shown, ``scores`` by name, from
+            0 to 1, the folder ``place``, and whether it is ``simulated``.
+    """
+    from tactslip_torch.report import style  # draws, which few commands do
 
     common = set.intersection(*(set(run["words"]) for run in runs))
-    named = [
-        (" ".join(word for word in run["words"] if word not in common) or "all", run["scores"])
-        for run in runs
+    given = [" ".join(word for word in run["words"] if word not in common) for run in runs]
+    every = [run["scores"] for run in runs]
+    names = list(dict.fromkeys(name for scores in every for name in scores))
+    rows: list[dict[str, Any]] = [
+        {"run": words or "all", **{f"{n} %": style.percent(scores.get(n)) for n in names}}
+        for words, scores in zip(given, every, strict=True)
     ]
-    place, simulated = runs[0]["place"], any(run["simulated"] for run in runs)
-    write_sweep(named, place, simulated=simulated)
-    print(f"\n{sweep_table(named, simulated=simulated)}\n\nruns.csv and runs.png in {place}")
+    for what, reduced in (("mean", mean), ("standard deviation", pstdev)):
+        own = {name: [scores[name] for scores in every if name in scores] for name in names}
+        rows.append({"run": what, **{f"{n} %": style.percent(reduced(v)) for n, v in own.items()}})
+    path = runs[0]["place"] / "runs.csv"
+    with style.csv_writer(path, ["run", *names]) as write:
+        write([row["run"], *map(of.get, names)] for row, of in zip(rows, every, strict=False))
+    simulated = any(run["simulated"] for run in runs)
+    print(f"\n{style.marked(simulated, style.table(rows))}\n\nthe same in {path}")
 
 
 def _are_scores(returned: Any) -> bool:

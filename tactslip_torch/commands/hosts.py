@@ -6,7 +6,46 @@ import argparse
 import shutil
 from pathlib import Path
 
-from tactslip_torch.commands.packaged import copy_host, host_names
+from tactslip_torch.commands.configuration import packaged_folder
+
+_SHARED = {"web": ("web", "node"), "native": ("native", "c")}
+"""Hosts of several folders: the page shares the reader and the stream of ``node``, the C library
+the command line of ``c``."""
+_LEFT_OUT = shutil.ignore_patterns("node_modules", "__pycache__", "build", "*.o")
+
+
+def hosts_dir() -> Path:
+    """The folder ``export``."""
+    return packaged_folder("export", "README.md")
+
+
+def _host_names() -> list[str]:
+    """The hosts there are."""
+    return sorted(path.name for path in hosts_dir().iterdir() if (path / "README.md").is_file())
+
+
+def copy_host(name: str, folder: Path) -> Path:
+    """Copy a host program, with what it shares with others, into a folder; returns its own.
+
+    Raises:
+        ValueError: if there is no such host.
+        FileExistsError: if there is something in its place.
+    """
+    if name not in _host_names():
+        raise ValueError(f"no host {name!r}; there are {', '.join(_host_names())}")
+    parts = _SHARED.get(name, (name,))
+    for part in parts:
+        if (folder / part).exists():
+            raise FileExistsError(f"{folder / part} is there already; give another folder")
+    for part in parts:
+        shutil.copytree(hosts_dir() / part, folder / part, ignore=_LEFT_OUT)
+    if name == "native":
+        sources = folder / name / "src"
+        sources.mkdir()
+        for path in packaged_folder("native", "build.py").iterdir():
+            if path.suffix in (".cpp", ".h"):
+                shutil.copy(path, sources)
+    return folder / name
 
 
 def _add_sample(page: Path) -> None:
@@ -26,7 +65,7 @@ def main() -> None:
         description="Copy a program that runs an exported detector (model.onnx, stream.onnx).",
         epilog="example: tactslip hosts c slip-in-c",
     )
-    parser.add_argument("name", help=f"one of {', '.join(host_names())}")
+    parser.add_argument("name", help=f"one of {', '.join(_host_names())}")
     parser.add_argument("folder", type=Path, help="where its folder is put")
     given = parser.parse_args()
     from tactslip_torch.commands.stopping import errors_in_one_line

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
-from tactslip_torch.commands.own_folder import HAND_FILE
+from tactslip_torch.commands.configuration import HAND_FILE
 
 if TYPE_CHECKING:
     from tactslip_torch.data.file_recordings import FileRecordings

@@ -95,7 +95,7 @@ def stopping() -> Iterator[None]:
 
 
 def _rank() -> int:
-    """``runtime.process_number``, without torch."""
+    """``runtime._process_number``, without torch."""
     names = ("RANK", "SLURM_PROCID", "LOCAL_RANK")
     return int(next((os.environ[name] for name in names if name in os.environ), 0))
 

@@ -21,7 +21,7 @@ from omegaconf import DictConfig
 
 from tactslip_torch.commands.detect import plain_section, reading_of, settings_of
 from tactslip_torch.commands.entry import entry_point
-from tactslip_torch.commands.packaged import hosts_dir
+from tactslip_torch.commands.hosts import hosts_dir
 from tactslip_torch.live.frames import Frames
 from tactslip_torch.live.mcap_log import McapLog
 from tactslip_torch.live.pump import watch

@@ -19,18 +19,19 @@ from torch import Tensor
 from tactslip_torch.features.descriptors import (
     COMMON_DESCRIPTORS,
     DESCRIPTORS,
+    SIMPLE_STATISTICS,
     SORTED,
     SPECTRUM_DESCRIPTORS,
     STEPPED,
     TIME_DESCRIPTORS,
     TINY,
+    FeatureName,
     Rows,
     band_energy_ratios,
     like,
     root,
     taken,
 )
-from tactslip_torch.features.names import SIMPLE_STATISTICS, FeatureName
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import ascending, is_traced
 from tactslip_torch.signals.wavelet import (

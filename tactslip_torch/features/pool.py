@@ -33,8 +33,7 @@ from tactslip_torch.features.bank import (
     make_plan,
     pool_names,
 )
-from tactslip_torch.features.descriptors import DESCRIPTORS
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.descriptors import DESCRIPTORS, FeatureName
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import check_choice, for_each, full_precision, is_concrete

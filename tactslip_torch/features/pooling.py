@@ -20,8 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from tactslip_torch import native
-from tactslip_torch.features.descriptors import like, root
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.descriptors import FeatureName, like, root
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import (
     are_unchanged,

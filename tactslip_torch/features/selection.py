@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.descriptors import FeatureName
 from tactslip_torch.hand import HandLayout
 
 CLASS_NAMES = ("non-slip", "slip")

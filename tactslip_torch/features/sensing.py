@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.descriptors import FeatureName
 from tactslip_torch.hand import HandLayout
 
 SILENT_FRACTION = 0.1

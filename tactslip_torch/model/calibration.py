@@ -6,6 +6,7 @@ how common either is. A stream's share of slip comes in afterwards, by Bayes (``
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -16,6 +17,8 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, softplus
 
 from tactslip_torch.runtime import check_share
+
+log = logging.getLogger(__name__)
 
 LARGEST_LLR = 1e30  # where llrs saturate, so that what adds them up stays finite in float32
 LARGEST_SCORE = 1e300  # beyond it the difference of two scores may leave float64
@@ -103,6 +106,15 @@ def fit_platt(scores: Tensor, is_slip: Tensor, weights: Tensor | None = None) ->
         raise ValueError("slip has the lower scores; change their sign or look at the labels")
     slope = max(slope, 0.0) / spread
     return Platt(slope / size, offset - prior - slope * centre)
+
+
+def platt_or_none(scores: Tensor, is_slip: Tensor, weights: Tensor | None) -> dict[str, Any] | None:
+    """Platt's calibration of held-out scores, JSON-able; ``None``, logged, if they are reversed."""
+    try:
+        return fit_platt(scores, is_slip, weights).to_dict()
+    except ValueError as error:
+        log.warning("scores are not calibrated: %s", error)
+        return None
 
 
 def probability(llr: Tensor, slip_share: float) -> Tensor:

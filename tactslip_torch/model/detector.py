@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.descriptors import FeatureName
 from tactslip_torch.features.pool import FeaturePool, saturating
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import (

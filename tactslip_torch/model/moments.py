@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.model.fit import check_weights, solve_normal_equations
-from tactslip_torch.model.kernels import Polynomial, QuadraticForm
-from tactslip_torch.model.products import ProductSums
+from tactslip_torch.model.kernels import Polynomial, ProductSums, QuadraticForm
 from tactslip_torch.package_files import SUMS, load_table, reading, save_table
 
 _CLASSES = ("non-slip", "slip")

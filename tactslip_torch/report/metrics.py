@@ -75,6 +75,17 @@ def split_metrics(confusion: Sequence[Sequence[int]]) -> dict[str, Any]:
     }
 
 
+def balanced_accuracy(
+    says_slip: Tensor, is_slip: Tensor, weights: Tensor | None = None
+) -> float | None:
+    """Mean recall of both classes, of decisions and truths ``[N]``; ``None`` if one is absent."""
+    is_right = says_slip == is_slip
+    weights = torch.ones(len(is_slip), dtype=torch.float64) if weights is None else weights
+    return _mean(
+        [_ratio(weights[of & is_right].sum(), weights[of].sum()) for of in (~is_slip, is_slip)]
+    )
+
+
 def bin_metrics(
     is_slip_true: Tensor,
     is_slip_predicted: Tensor,

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
@@ -331,7 +332,7 @@ def reading_figure(recording: Recording, channels: Channels, path: str | Path, t
         note = ""
         if np.ptp(middles) > _APART * max(np.median(widths), 1e-300):
             values, note = values - middles[:, None], ", each about its median"
-        colours = style.shades(len(places))
+        colours = _shades(len(places))
         for line, place, colour in zip(values, places, colours, strict=True):
             name = channels[place]["name"]
             axes.plot(times, line, color=colour, linewidth=0.7, alpha=0.85, label=name)
@@ -349,6 +350,13 @@ def reading_figure(recording: Recording, channels: Channels, path: str | Path, t
     if handles:
         style.legend_below(figure, handles, 4)
     style.save(figure, path, dpi=120)
+
+
+def _shades(num: int) -> list[Any]:
+    """So many colours: those of ``PALETTE`` or, of more, a range from dark blue to yellow."""
+    if num <= len(style.PALETTE):
+        return list(style.PALETTE[:num])
+    return list(colormaps["viridis"](np.linspace(0, 0.92, num)))
 
 
 def _mark_missing(axes: Axes, is_missing: NDArray[np.bool_], sample_rate_hz: float) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +63,7 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
     """Write ``metrics.json`` and the figures of a run into a folder.
 
     Results on several kinds of scenes also get ``confound.png``, those with events ``events.png``,
-    those that set an alarm ``alarm.png``
-    and ``reliability.png``, those that chose a model ``validation.png``.
+    those that set an alarm ``alarm.png`` and ``reliability.png``.
 
     Args:
         folder: made if it is not there.
@@ -81,7 +81,6 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
         (_drawn_events(metrics), _events_figure, "events"),
         (alarm, _alarm_figure, "alarm"),
         (alarm.get("reliability"), _reliability_figure, "reliability"),
-        (metrics.get("validation"), _validation_figure, "validation"),
     ):
         if is_there:
             draw(metrics, folder / f"{name}.png")
@@ -417,7 +416,7 @@ def _selected_features_figure(
     is_pooled = any(feature.get("statistic") for feature in selected)
     apart = "of each channel" if is_pooled else None
     places = [feature.get("statistic") or apart or feature["finger"] for feature in selected]
-    of_kind = style.kind_colours(sorted(set(kinds)))
+    of_kind = _kind_colours(sorted(set(kinds)))
     of_domain = dict(zip(_DOMAIN_WORDS, (style.PURPLE, style.GREEN), strict=True))
     panels = {
         "sensor kind": (0.5, kinds, kinds, of_kind),
@@ -444,6 +443,13 @@ def _selected_features_figure(
     handles = [Patch(color=colour, label=kind) for kind, colour in of_kind.items()]
     style.legend_below(figure, handles, 6)
     style.save(figure, path, dpi=180)
+
+
+def _kind_colours(kinds: Iterable[str]) -> dict[str, str]:
+    """A colour for each kind of channel: blue for PVDF, orange for SG, others what is left."""
+    known = {"SG": style.ORANGE, "PVDF": style.BLUE}
+    left = cycle(colour for colour in style.PALETTE if colour not in known.values())
+    return {kind: known.get(kind) or next(left) for kind in dict.fromkeys(kinds)}
 
 
 def _counts(
@@ -473,8 +479,9 @@ def _validation_table(metrics: _Metrics) -> str:
         metrics: the content of ``metrics.json``, with ``validation``.
     """
     choices = metrics["validation"]
-    chosen = _chosen(choices)
-    best: dict[str, Mapping[str, Any]] = {}
+    chosen = [row for row in choices if row.get("chosen")]
+    chosen = chosen or [max(choices, key=lambda row: float(row["mean"]))]
+    best: dict[tuple[Any, ...], Mapping[str, Any]] = {}
     for row in sorted(choices, key=lambda row: -row["mean"]):
         best.setdefault(_structure(row), row)
     rows: list[_Row] = []
@@ -502,45 +509,9 @@ def _validation_table(metrics: _Metrics) -> str:
     return style.marked(metrics["simulated"], *lines)
 
 
-@style.styled
-def _validation_figure(metrics: _Metrics, path: str | Path) -> None:
-    """Write the balanced accuracy on left-out groups over C, one line for each view.
-
-    Args:
-        metrics: the content of ``metrics.json``, with ``validation``.
-        path: the PNG to write, replaced as a whole if it exists.
-    """
-    choices = metrics["validation"]
-    title = "Choice on training groups left out one at a time"
-    figure = style.new_figure(8.4, 4.6, title, simulated=metrics["simulated"])
-    axes = figure.subplots()
-    structures = list(dict.fromkeys(map(_structure, choices)))
-    colours = style.colours_of(structures)
-    for structure in structures:
-        rows = [row for row in choices if _structure(row) == structure]
-        rows.sort(key=lambda row: float(row["penalty"]))
-        penalties, means = zip(*((row["penalty"], 100 * row["mean"]) for row in rows), strict=True)
-        axes.plot(penalties, means, marker="o", color=colours[structure], label=structure, lw=2)
-    stars = [(row["penalty"], 100 * row["mean"]) for row in _chosen(choices)]
-    axes.plot(*zip(*stars, strict=True), "*", color="black", ms=14, ls="none", label="chosen")
-    axes.set(xscale="log", xlabel="C", ylabel="balanced accuracy on the group left out, %")
-    axes.legend(**style.UPPER_LEFT_OUTSIDE)
-    style.save(figure, path)
-
-
-def _chosen(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The rows that were taken: those that say so, else the first of the best mean."""
-    taken = [row for row in rows if row.get("chosen")]
-    return taken or [max(rows, key=lambda row: float(row["mean"]))]
-
-
-def _structure(row: Mapping[str, Any]) -> str:
+def _structure(row: Mapping[str, Any]) -> tuple[Any, ...]:
     """What a choice is but for its penalty: view and weight, or degree and offset; columns."""
-    kernel, num = row["kernel"], row["num_features"] or "all"
-    if "view" in row:
-        weight = f"weight {row['weight']:.2f}" if row["weight"] else "dropped"
-        return f"{row['view']}, {weight}, {num} columns"
-    return f"degree {kernel['degree']}, c {kernel['offset']:g}, {num} columns"
+    return (*row["kernel"].values(), row["num_features"], row.get("view"), row.get("weight"))
 
 
 # Confounders: scenes that have motion without slip, or slip without motion ------------------------

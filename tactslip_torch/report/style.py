@@ -14,8 +14,7 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from matplotlib import colormaps, rc_context
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -32,7 +31,6 @@ PALETTE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 INK, GREY, LIGHT = "#222222", "#666666", "#DDDDDD"
 ALARM = "#C6361B"
 _EMPTY: set[object] = {None, "-"}
-_KIND_COLOURS = {"SG": ORANGE, "PVDF": BLUE}
 
 UPPER_LEFT_OUTSIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 
@@ -212,19 +210,6 @@ def legend_below(figure: Figure, handles: Sequence[Any], ncols: int) -> None:
 def colours_of(names: Iterable[str]) -> dict[str, str]:
     """A colour for each name, in the order of ``PALETTE``."""
     return dict(zip(dict.fromkeys(names), cycle(PALETTE)))
-
-
-def shades(num: int) -> list[Any]:
-    """So many colours: those of ``PALETTE`` or, of more, a range from dark blue to yellow."""
-    if num <= len(PALETTE):
-        return list(PALETTE[:num])
-    return list(colormaps["viridis"](np.linspace(0, 0.92, num)))
-
-
-def kind_colours(kinds: Iterable[str]) -> dict[str, str]:
-    """A colour for each kind of channel: blue for PVDF, orange for SG, others what is left."""
-    left = cycle(colour for colour in PALETTE if colour not in _KIND_COLOURS.values())
-    return {kind: _KIND_COLOURS.get(kind) or next(left) for kind in dict.fromkeys(kinds)}
 
 
 def is_fast(channel: Mapping[str, str]) -> bool:

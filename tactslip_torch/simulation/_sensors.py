@@ -444,7 +444,7 @@ def _common_volts(scene: Scene, grid: Grid, channels: list[int]) -> Array:
     signs = np.where(session.random((num, modes)) < 0.5, -1.0, 1.0)
     arm_v = 1e-3 * of.arm_transient_mv * signs * lognormal(session, 0.4, (num, modes))
 
-    bursts = mains_bursts(scene)
+    bursts = _mains_bursts(scene)
     if of.mains_mv > 0 or bursts:
         mains = _mains(scene, grid)
         add(mains_v * couplings, mains)
@@ -489,7 +489,7 @@ def _mains(scene: Scene, grid: Grid) -> Array:
     return wave
 
 
-def mains_bursts(scene: Scene) -> list[Interval]:
+def _mains_bursts(scene: Scene) -> list[Interval]:
     """When the mains is stronger; bursts may overlap, and then add."""
     per_s = scene.disturbances.mains_bursts_per_s
     return _at_random(scene, scene.key("mains bursts"), per_s, _MAINS_BURST_S)

@@ -24,7 +24,6 @@ from torch import Tensor
 from tactslip_torch.features.pool import FeaturePool, is_rounding, is_simple_of
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.training.bins import SampledBins
-from tactslip_torch.training.choice import has_both_classes
 
 POOLED_NUMBER = "best_pooled_number"
 CONSTANT_BINS = 1200  # at most, of which compression learns its medians
@@ -63,7 +62,7 @@ def _fit_regression(columns: Tensor, sample: SampledBins, *, with_logs: bool = F
     folds = [
         [part.nonzero()[:, 0].numpy() for part in split]
         for split in splits
-        if all(has_both_classes(sample.is_slip[part]) for part in split)
+        if all(len(sample.is_slip[part].unique()) == 2 for part in split)
     ]
     is_wide = z.shape[1] > WIDE
     solver = "lbfgs" if is_wide else "newton-cholesky"
@@ -194,7 +193,7 @@ def _best_threshold(features: Tensor, is_slip: Tensor, weights: Tensor) -> tuple
     Raises:
         ValueError: if a class is absent.
     """
-    if not has_both_classes(is_slip):
+    if len(is_slip.unique()) < 2:
         raise ValueError("baselines need training bins of both classes; got only one")
     slip, quiet = weights * is_slip, weights * ~is_slip
     step = slip / slip.sum() - quiet / quiet.sum()

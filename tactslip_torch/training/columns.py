@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.descriptors import FeatureName
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.sensing import Sensing, SpanFeatures
 from tactslip_torch.hand import HandLayout

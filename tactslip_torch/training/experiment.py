@@ -32,7 +32,7 @@ from tactslip_torch.features.cache import (
     default_cache_folder,
     versions,
 )
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.descriptors import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import statistics_of
 from tactslip_torch.hand import HandLayout

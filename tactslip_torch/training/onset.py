@@ -2,8 +2,10 @@
 
 A hop is positive from the release of half of the load to 0.3 s behind it, or to the end of the
 slide. Left out are those from the first release to that of half, and the rest of the slide with
-0.25 s behind it. All others are negative; kinds of recordings weigh alike, or as is said. Heads are
-fitted by the logistic loss on all hops; that which finds more slips of materials left out is taken.
+0.25 s behind it. All others are negative; kinds of recordings weigh alike, or as is said, and the
+0.3 s before a first release are a kind of its own: a load grows there, and nothing slips yet. Heads
+are fitted by the logistic loss on all hops; that which finds more slips of materials left out is
+taken.
 """
 
 from __future__ import annotations
@@ -50,6 +52,8 @@ SETTLED_S = 0.25
 """Behind a slide, from which on hops are negative."""
 FOUND_S = 0.25
 """Behind the first release, within which an alarm counts as found."""
+BEFORE, BEFORE_S = "before", 0.3
+"""A kind of hops: so long before a first release, which are negative."""
 _POSITIVE_WEIGHT = 0.5  # of all positive hops, over that of all others
 _TAIL = 0.001  # of hops whose columns are clipped at either end
 _SCALED_ROWS = 200_000  # of which ranges are taken
@@ -72,7 +76,8 @@ class OnsetTraining:
             fitted without it.
         comb_periods: of the mains, over which the comb takes the mean.
         mains_hz: nominal.
-        weights: of kinds of recordings without slip, in place of 1.
+        weights: of kinds of recordings without slip, in place of 1; ``"before"`` of hops before
+            slips.
         seed: of a network's weights and batches.
 
     Raises:
@@ -214,7 +219,7 @@ class _Hops:
 
     Attributes:
         columns: of each, ``[N, K]``, float16.
-        label: 1 slip, -1 not, 0 left out, ``[N]``.
+        label: 1 slip, -1 not, -2 not yet, 0 left out, ``[N]``.
         recording: number of its recording, ``[N]``.
         first: number of the first hop of its recording, ``[N]``.
         time_s: end of each, ``[N]``.
@@ -311,7 +316,7 @@ def _columns_of(evidence: OnsetEvidence, samples: Tensor) -> tuple[Array, Array]
 
 
 def _labels_of(times: Timeline, time_s: NDArray[np.float64]) -> NDArray[np.int8]:
-    """1 where a hand slips, -1 where it does not, 0 where nothing is learned.
+    """1 where a hand slips, -1 where it does not, -2 just before, 0 where nothing is learned.
 
     Args:
         times: what is true of the recording.
@@ -321,10 +326,12 @@ def _labels_of(times: Timeline, time_s: NDArray[np.float64]) -> NDArray[np.int8]
         - time_s, output: ``[N]``
     """
     label = np.full(len(time_s), -1, np.int8)
+    firsts = first_releases(times.onsets_s, times.released_s)
+    for first_s in firsts:
+        label[(time_s > first_s - BEFORE_S) & (time_s <= first_s)] = -2
     stretches = [*times.slip_s, *times.missing_s, *times.unlabelled_s]
     for start_s, end_s in stretches:
         label[(time_s > start_s) & (time_s <= end_s + SETTLED_S)] = 0
-    firsts = first_releases(times.onsets_s, times.released_s)
     for first_s, (_, end_s) in zip(firsts, times.sliding_s, strict=True):
         label[(time_s > first_s) & (time_s <= end_s + SETTLED_S)] = 0
     for onset_s, (_, end_s) in zip(times.onsets_s, times.sliding_s, strict=True):
@@ -384,7 +391,7 @@ class _Batches(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
         self._hops, self._known, self._lags = hops, known, lags
         self._scaler = FeatureScaler(scaler.minimum.float(), scaler.maximum.float())
         self._target = torch.from_numpy((label > 0).astype(np.float32))
-        kinds = hops.kind[hops.recording[known]]
+        kinds = np.where(label == -2, BEFORE, hops.kind[hops.recording[known]])
         self._weight = torch.from_numpy(_weights(kinds, label > 0, weights))
         self._rng = np.random.default_rng(seed)
 

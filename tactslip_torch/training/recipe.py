@@ -36,12 +36,14 @@ from tactslip_torch.features.sensing import (
     least_alive,
     most_stuck_samples,
 )
+from tactslip_torch.model.calibration import platt_or_none
 from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
 from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, QuadraticForm
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.ridge import ClassSums
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.report.metrics import balanced_accuracy
 from tactslip_torch.runtime import (
     add_over_processes,
     bar,
@@ -53,7 +55,6 @@ from tactslip_torch.runtime import (
 )
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.bins import BinSample, RecordingBins, SampledBins, bin_keys
-from tactslip_torch.training.choice import balanced_accuracy, platt_or_none
 from tactslip_torch.training.columns import VIEWS, FeatureSelection
 from tactslip_torch.training.views import (
     THRESHOLDS,

@@ -25,6 +25,7 @@ from torch import Tensor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import forward_selection
 from tactslip_torch.features.sensing import SpanFeatures
+from tactslip_torch.model.calibration import platt_or_none
 from tactslip_torch.model.kernels import (
     PAPER_KERNEL,
     Polynomial,
@@ -35,7 +36,6 @@ from tactslip_torch.model.kernels import (
 from tactslip_torch.model.ridge import ClassSums, balanced_weights, class_targets, solve_dual
 from tactslip_torch.runtime import one_thread, steps, trim_memory
 from tactslip_torch.training.bins import even_places
-from tactslip_torch.training.choice import platt_or_none
 from tactslip_torch.training.columns import FeatureSelection, joined, view_columns
 
 log = logging.getLogger(__name__)

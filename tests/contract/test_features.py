@@ -16,8 +16,7 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from tactslip_torch.deploy.bins import described
 from tactslip_torch.deploy.value import Graph
-from tactslip_torch.features.descriptors import DESCRIPTORS
-from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.descriptors import DESCRIPTORS, FeatureName
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
