@@ -143,7 +143,8 @@ def _markdown(path: str) -> str:
             if "image/png" in data:
                 parts.append(f"![Output](data:image/png;base64,{data['image/png'].strip()})")
             elif told := "".join(data["text/plain"]).rstrip():
-                above = parts.pop().removesuffix("```") if parts[-1][:7] == "```text" else "```text\n"
+                follows = parts[-1].startswith("```text")
+                above = parts.pop().removesuffix("```") if follows else "```text\n"
                 parts.append(f"{above}{told}\n```")
     title, _, rest = parts[1].partition("\n")
     return "\n\n".join([title, parts[0], rest.strip(), *parts[2:]])
