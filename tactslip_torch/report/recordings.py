@@ -8,7 +8,7 @@ that every burst is seen. Colours are fingers, paler towards the palm.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,17 +47,6 @@ drawn, its exact ``onsets_s``, and start and end of what is slip or known to be 
 
 
 # What a set holds --------------------------------------------------------------------------------
-def _grouped(key: str, rows: Rows, cells: Callable[[Rows], Mapping[str, object]]) -> str:
-    """A row for each value of ``key``, in the order in which they come, and of several all."""
-    groups = {
-        name: [row for row in rows if row[key] == name]
-        for name in dict.fromkeys(row[key] for row in rows)
-    }
-    if len(groups) > 1:
-        groups["all"] = list(rows)
-    return style.table([{key: name, **cells(group)} for name, group in groups.items()])
-
-
 def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
     """How many recordings of each scene are in files, how long, how large, how many made now.
 
@@ -80,8 +69,13 @@ def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
     simulated = any(one["line"]["simulated"] == "true" for one in written)
     is_named = simulated or {one["line"]["scene"] for one in written} != {published.PAPER_SCENE}
     title, key = ("scene", "scene") if is_named else ("object", "material")
-    rows = _grouped(title, [{title: one["line"][key], **one} for one in written], cells)
-    return style.marked(simulated, rows, f"took {seconds:.1f} s")
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for one in written:
+        groups.setdefault(one["line"][key], []).append(one)
+    if len(groups) > 1:
+        groups["all"] = list(written)
+    table = style.table([{title: name, **cells(group)} for name, group in groups.items()])
+    return style.marked(simulated, table, f"took {seconds:.1f} s")
 
 
 _USES = {

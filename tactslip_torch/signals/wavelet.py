@@ -290,32 +290,6 @@ def wavelet_steps(
 SpectrumMethod = Literal["reference", "clean"]
 
 
-def amplitude_spectrum(x: Tensor, method: SpectrumMethod = "reference") -> Tensor:
-    """One-sided amplitude spectrum, no window, mean kept.
-
-    ``reference`` is what the authors compute: with ``L = 2 (n - 1)``, an FFT over the next power
-    of two above ``L`` (256 for n = 100, zero-padded), lines ``0 .. n-1`` of it divided by ``L``,
-    all but the first and the last doubled. ``clean`` (ours) is the discrete spectrum of the bin:
-    ``rfft`` over its ``n`` samples divided by ``n``, all lines but DC and Nyquist doubled, so
-    that a tone on a line has its amplitude there.
-
-    The gradient of a line that is exactly zero is taken as zero.
-
-    Shape:
-        - x: ``[*, n]`` with ``n >= 2``
-        - output: ``[*, n]`` (``reference``) or ``[*, n // 2 + 1]`` (``clean``), unit of ``x``
-
-    Raises:
-        ValueError: if the method is unknown or the signal shorter than two samples.
-    """
-    num_samples = x.shape[-1]
-    num_fft, scale = _transform(num_samples, method)
-    if not x.numel():  # the FFT refuses an empty batch
-        return x.new_zeros(*x.shape[:-1], len(scale))
-    lines: Tensor = torch.fft.rfft(x, n=num_fft)[..., : len(scale)]
-    return lines.abs() * scale.to(x)
-
-
 def frequency_axis_hz(
     num_samples: int, sample_rate_hz: float, method: SpectrumMethod = "reference"
 ) -> Tensor:
@@ -336,16 +310,22 @@ def frequency_axis_hz(
 
 
 def spectrum_matrix(num_samples: int, method: SpectrumMethod = "reference") -> Tensor:
-    """The spectrum before its modulus, as a matrix: ``amplitude = abs(matrix @ x)``.
+    """The one-sided spectrum, no window, mean kept, as a matrix: ``amplitude = abs(matrix @ x)``.
+
+    ``reference`` is what the authors compute: with ``L = 2 (n - 1)``, an FFT over the next power
+    of two above ``L`` (256 for n = 100, zero-padded), lines ``0 .. n-1`` of it divided by ``L``,
+    all but the first and the last doubled. ``clean`` (ours) is the discrete spectrum of the bin:
+    ``rfft`` over its ``n`` samples divided by ``n``, all lines but DC and Nyquist doubled, so
+    that a tone on a line has its amplitude there.
 
     At bin lengths a constant matrix is as fast as an FFT and exports to ONNX without its slow and
     inexact DFT operator.
 
     Shape:
-        - output: ``[lines, n]``, complex128
+        - output: ``[n, n]`` (``reference``) or ``[n // 2 + 1, n]`` (``clean``), complex128
 
     Raises:
-        ValueError: as ``amplitude_spectrum``.
+        ValueError: if the method is unknown or there are fewer than two samples.
     """
     num_fft, scale = _transform(num_samples, method)
     identity = torch.eye(num_samples, dtype=torch.float64)
