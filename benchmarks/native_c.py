@@ -12,14 +12,16 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from hydra.utils import instantiate
 
 from benchmarks import ROOT
 from benchmarks.deployment import host
@@ -27,10 +29,13 @@ from benchmarks.harness import Benchmark, Job, say
 from benchmarks.subjects import Array, loaded
 from benchmarks.tables import Table
 from benchmarks.timing import interleaved, on_threads
-from benchmarks.trainings import trained
+from benchmarks.trainings import composed, trained
 from tactslip_torch import SlipDetector, StreamingDetector, sample_recording
+from tactslip_torch.deploy.bins import Precision
+from tactslip_torch.deploy.check import Run, _session_of, runner
 from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.deploy.native import FILE, SOURCE, NativeFile
+from tactslip_torch.deploy.stream import stream_graph
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.decisions import KEY, AlarmSettings
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence, Perceptron
@@ -40,6 +45,7 @@ HOST = ROOT / "export" / "native"
 SOURCES = ("export/native/*", "export/native/board/*", "export/c/*.c", "export/c/*.h")
 TOOLS = ("make", "arm-none-eabi-g++", "qemu-system-arm", "aarch64-linux-gnu-g++", "qemu-aarch64")
 BOARDS = {"m7": "Cortex-M7 (mps2-an500)", "m4": "Cortex-M4F (mps2-an386)"}
+MARGIN_SD: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-3}  # as deploy/check.py allows
 _FULL_SCALE = 32000  # counts of the largest sample
 
 
@@ -99,6 +105,7 @@ class NativeC(Benchmark):
     Args:
         columns: of a second, smaller detector, which is trained; 0: there is none.
         rounds: of the sample recording, for each way in turn.
+        every: of the recordings that ``+exp=unseen4`` tests on, each such one is decided on by all.
     """
 
     title = "The C library"
@@ -109,10 +116,11 @@ class NativeC(Benchmark):
     )
     page = "docs/deploy.md"
     charts: ClassVar = {"": (("A decision on this machine", "us a decision"),)}
-    quick = "rounds=2"
+    quick = "rounds=2 every=50"
     libraries = ("onnxruntime",)
     columns: int = 0
     rounds: int = 20
+    every: int = 1
 
     @torch.inference_mode()
     def measure(self, job: Job) -> dict[str, Any]:
@@ -131,6 +139,7 @@ class NativeC(Benchmark):
                 "A decision on this machine": _here(detectors, Path(folder), self.rounds),
                 "The same file on aarch64": _on_aarch64(detectors[NAME], Path(folder)),
                 "Error of float32": _float32(detectors[NAME]),
+                "The test set, decided on by all": _test_set(detectors[NAME], self.every),
                 "Emulated boards": _boards(detectors, Path(folder)),
             }
             return {"tables": tables}
@@ -146,7 +155,7 @@ def _here(detectors: Mapping[str, SlipDetector], folder: Path, rounds: int) -> T
         for precision in ("float64", "float32"):
             place = folder / name / precision
             place.mkdir(parents=True)
-            NativeFile.export(detector, place, precision)
+            NativeFile.checked(detector, precision).write(place)
             words = [folder / "timing", place / FILE, folder / "recording.npy", str(rounds)]
             done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=True)
             found = json.loads(done.stdout)
@@ -237,6 +246,69 @@ def _float32(detector: SlipDetector) -> Table:
     return Table(rows, "Against the package, which computes in float64.")
 
 
+def _test_set(detector: SlipDetector, every: int) -> Table:
+    """Decisions of C library and graph that are not those of the package."""
+    config = composed("train", ["+exp=unseen4"])
+    source = instantiate(config.data, _convert_="all")
+    (fold,) = instantiate(config.split, _convert_="all")(source.ids)
+    chosen = [each for each in source.ids if fold.roles.get(each) in ("test", "unseen")][::every]
+    ways: dict[tuple[str, Precision], Callable[[Array], Mapping[str, Array]]] = {}
+    for precision in MARGIN_SD:
+        ways["C", precision] = partial(_by_library, NativeFile.of(detector, precision))
+        model = stream_graph(detector, AlarmSettings.of(detector), precision).model()
+        ways["graph", precision] = partial(_by_graph, runner(_session_of(model)))
+    found: dict[tuple[str, Precision], list[Array]] = {way: [] for way in ways}
+    for number, each in enumerate(chosen):
+        say(f"native_c: recording {number + 1} of {len(chosen)} of the test set")
+        given = source.load(each).samples.T.contiguous()
+        for precision in MARGIN_SD:
+            samples = given.to(getattr(torch, precision))
+            decided = StreamingDetector(detector, dtype=samples.dtype).push(samples)
+            wanted = [decided.score, decided.is_on, decided.is_alarm, decided.is_valid]
+            expected = np.stack([column.double().numpy() for column in wanted])
+            for way in ("C", "graph"):
+                own = ways[way, precision](samples.numpy())
+                columns = [own[name] for name in ("score", "on", "alarm", "valid")]
+                found[way, precision].append(np.stack([*columns, *expected]))
+    rows = []
+    for (way, precision), parts in found.items():
+        both = np.concatenate(parts, 1)
+        (score, on, alarm, valid), expected = both[:4], both[4:]
+        off, spread = np.abs(score - expected[0]), np.nanstd(expected[0])
+        is_other = (score >= 0) != (expected[0] >= 0)
+        is_outside = is_other & (np.abs(expected[0]) > MARGIN_SD[precision] * spread)
+        rows.append(
+            {
+                "way": f"{way}, {precision}",
+                "decisions": f"{len(score):,}",
+                "largest difference of a score, sd": f"{np.nanmax(off) / spread:.1e}",
+                "other sign of the score": str(is_other.sum()),
+                "of these outside the margin": str(is_outside.sum()),
+                "other status": str((on != expected[1]).sum()),
+                "alarms": f"{expected[2].sum():.0f}",
+                "other alarms": str((alarm != expected[2]).sum()),
+                "other validity": str((valid != expected[3]).sum()),
+            }
+        )
+    return Table(
+        rows,
+        f"{len(chosen)} recordings of materials seen in training and held out (simulated), against "
+        f"the package; the margin is {MARGIN_SD['float32']:g} of the scores' standard deviation in "
+        f"float32, {MARGIN_SD['float64']:g} in float64.",
+    )
+
+
+def _by_library(made: NativeFile, samples: Array) -> Mapping[str, Array]:
+    """The decisions of a stream in C on a recording."""
+    return made.stream().push(samples)
+
+
+def _by_graph(run: Run, samples: Array) -> Mapping[str, Array]:
+    """The outputs of a stream's graph on a recording."""
+    none = np.empty(0)
+    return run({"samples": samples, "tail": samples[:0], "state": none, "threshold": none})
+
+
 def _boards(detectors: Mapping[str, SlipDetector], folder: Path) -> Table:
     counts, scale = sample_counts()
     rows = []
@@ -244,7 +316,7 @@ def _boards(detectors: Mapping[str, SlipDetector], folder: Path) -> Table:
     for name, detector in detectors.items():
         place = folder / "board"  # where the library is built once
         place.mkdir(exist_ok=True)
-        NativeFile.export(detector, place, "float32", scale=scale, source=True)
+        NativeFile.checked(detector, "float32", scale=scale).write(place, source=True)
         decided = StreamingDetector(detector).push(counts.astype(np.float32) * np.float32(scale))
         wanted = [(alarm.alarm_s, alarm.onset_s) for alarm in decided.alarms]
         for board, title in BOARDS.items():

@@ -37,6 +37,7 @@ from tactslip_torch.model.calibration import Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import Align, ChannelFilter
+from tactslip_torch.training.alarm import DebouncedAlarm
 from tactslip_torch.training.bins import RecordingBins, join_groups
 from tactslip_torch.training.recipe import POOLING, ClassFit, Fit, General
 from tactslip_torch.training.views import ViewBins
@@ -395,6 +396,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
                 is_slip = torch.from_numpy(np.asarray(y == self.slip_label_))
                 fit = _fitted(recipe, pool, x, is_slip, group, names)
                 detector = fit.detector(pool, features._filter, self._calibrated(fit, recipe))
+                DebouncedAlarm()(detector)
             else:
                 labels = torch.from_numpy(np.searchsorted(self.classes_, y))
                 fits = _fitted_to_classes(recipe, pool, x, labels, group, names)
@@ -533,7 +535,7 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return cls.from_detector(SlipDetector.load(path))
 
     def export_onnx(self, folder: str | os.PathLike[str]) -> tuple[Any, ...]:
-        """Write ``model.onnx``, and ``stream.onnx`` if the detector has an alarm.
+        """Write ``model.onnx`` and, if the detector has an alarm, as ``fit`` sets, ``stream.onnx``.
 
         Returns:
             The paths; each has its metadata beside it, ``<file>.json``.
@@ -544,7 +546,10 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     @property
     def detector_(self) -> SlipDetector:
-        """The ``SlipDetector``, for streams, ONNX and the commands; of two labels only."""
+        """The ``SlipDetector``, for streams, ONNX and the commands; of two labels only.
+
+        Its alarm is raised where two of three decisions say slip, half a window apart.
+        """
         return self._whole()
 
     def _whole(self) -> SlipDetector:

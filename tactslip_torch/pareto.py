@@ -90,6 +90,8 @@ class Candidate:
         look_ahead_ms: of the filter.
         bin_ms: length of a bin.
         timing: of one decision.
+        m7_instructions: of one decision on a Cortex-M7, in float32, computed from the table of
+            costs (``features.cost``), not run.
         folder: of its training.
     """
 
@@ -101,6 +103,7 @@ class Candidate:
     look_ahead_ms: float
     bin_ms: float
     timing: Timing
+    m7_instructions: float
     folder: str
 
     @property
@@ -121,7 +124,7 @@ class Candidate:
 
     def row(self) -> dict[str, Any]:
         """Its numbers, JSON-able."""
-        names = ("recipe", "size", "precision", "hop_ms", "accuracy", "worst_ms")
+        names = "recipe", "size", "precision", "hop_ms", "accuracy", "worst_ms", "m7_instructions"
         return {name: getattr(self, name) for name in names} | self.timing._asdict()
 
 
@@ -160,7 +163,9 @@ def pareto_table(content: Mapping[str, Any]) -> str:
             "p50 us": f"{row['p50_us']:.0f}",
             "p99 us": f"{row['p99_us']:.0f}",
             "latency ms": f"{row['worst_ms']:.2f}",
+            "M7 M instr.": f"{row['m7_instructions'] / 1e6:.2f}",
             "front": place in content["front"],
+            "M7 front": place in content["m7_front"],
             "chosen": row == content["chosen"],
         }
         for place, row in enumerate(content["candidates"])

@@ -190,7 +190,7 @@ def test_c_and_graph_decide_alike(detector, native):
         assert_same(native.push(samples), {name: wanted[name] for name in names}, 1e-9)
 
 
-OUT_OF_FLOAT32 = ("offset 1000", "huge")  # docs/deploy.md says so
+OUT_OF_FLOAT32 = ("huge",)  # docs/deploy.md says so
 
 
 def test_in_float32_scores_are_near_and_decisions_alike():
@@ -337,17 +337,39 @@ def test_the_command_writes_the_file_and_its_constants(typed, tmp_path):
     assert NativeFile(content).stream().channels == alarming_detector().pool.hand.names
 
 
-def test_a_file_that_decides_otherwise_is_not_kept(detector, tmp_path, monkeypatch):
-    other = _NativeStream.push
+def scores_off(monkeypatch, is_off):
+    """Scores of the streams of which ``is_off`` says so are a hundredth larger than they are."""
+    right = _NativeStream.push
 
     def push(self, samples):
-        found = other(self, samples)
-        return found | {"score": found["score"] * 1.01}
+        found = right(self, samples)
+        return found | {"score": found["score"] * (1.01 if is_off(self) else 1.0)}
 
     monkeypatch.setattr(_NativeStream, "push", push)
+
+
+@pytest.mark.parametrize("precision", ["auto", "float32", "float64"])
+def test_a_file_that_decides_otherwise_is_refused(precision, monkeypatch):
+    scores_off(monkeypatch, lambda stream: True)
     with pytest.raises(ValueError, match=r"detector.tslip was not written: .*score differs"):
-        NativeFile.export(detector, tmp_path)
-    assert not list(tmp_path.iterdir())
+        NativeFile.checked(alarming_detector(), precision)
+
+
+def test_where_float32_is_off_the_default_is_float64_and_says_why(typed, tmp_path, monkeypatch):
+    scores_off(monkeypatch, lambda stream: not stream._info.is_double)
+    model = tmp_path / "detector.pt"
+    alarming_detector().save(model)
+    status, out, err = typed(export, "graph=native", f"model={model}")
+    assert status == 0, err
+    (line,) = out.splitlines()
+    assert "float64, as in float32 " in line
+    assert "score differs from torch" in line
+    assert NativeFile((tmp_path / FILE).read_bytes()).precision == "float64"
+    (tmp_path / FILE).unlink()
+    status, _, err = typed(export, "graph=native", "precision=float32", f"model={model}")
+    assert status == 2
+    assert err.strip().endswith("give precision=float64 or auto")
+    assert not (tmp_path / FILE).exists()
 
 
 def test_without_an_alarm_there_is_no_file():

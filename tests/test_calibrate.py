@@ -319,6 +319,13 @@ def test_a_user_may_say_that_nothing_slips(command, general, tmp_path):
     assert alarm["hours"] == pytest.approx(6 * 4.8 / 3600, rel=0.05)
 
 
+def test_without_a_label_there_is_nothing_to_evaluate(command, general, tmp_path):
+    root = write_use(tmp_path / "use", num=1, label="")
+    ran = command(tmp_path, "evaluate", *told(general.file, root))
+    assert ran.status == 2
+    assert "no recording has a label" in ran.err
+
+
 def test_another_hand_is_refused(command, general, tmp_path):
     root = write_use(tmp_path / "use")
     fewer = [

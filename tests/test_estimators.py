@@ -24,7 +24,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.utils import estimator_checks, get_tags
 from small_set import SMALL_HAND
 
-from tactslip_torch import SlipClassifier, SlipDetector, TactileFeatures
+from tactslip_torch import SlipClassifier, SlipDetector, StreamingDetector, TactileFeatures
 from tactslip_torch.estimators import _fitted_to_classes
 
 RATE_HZ = 2000.0
@@ -103,7 +103,9 @@ def test_a_classifier_is_a_detector_before_and_after_it_was_kept(
     says_slip = fitted.detector_.score_raw(torch.from_numpy(X)) >= 0
     np.testing.assert_array_equal(says_slip, fitted.predict(X) == "slip")
     fitted.save(tmp_path / "slip.pt")
-    SlipDetector.load(tmp_path / "slip.pt")
+    stream = StreamingDetector(SlipDetector.load(tmp_path / "slip.pt"))
+    slips = np.concatenate(X[y == "slip"][:6], -1).T
+    assert stream.push(slips).alarms
     for other in (
         SlipClassifier.load(tmp_path / "slip.pt"),
         SlipClassifier.from_detector(fitted.detector_),
@@ -129,7 +131,7 @@ def test_an_exported_file_scores_as_the_classifier(
 ) -> None:
     import onnxruntime
 
-    (path,) = fitted.export_onnx(tmp_path)
+    path, _ = fitted.export_onnx(tmp_path)
     session = onnxruntime.InferenceSession(path)
     given = session.get_inputs()[0]
     (score, *_) = session.run(None, {given.name: data[0].astype(np.float32)})

@@ -122,6 +122,38 @@ def test_in_float32_throughout_scores_are_within_the_stated_margin(level, monkey
 
 
 @needs_engine
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("compression", [None, 1e-3, 1.0, 1e7])
+@pytest.mark.parametrize("num", [1, 20])
+def test_columns_of_a_narrow_range_keep_their_digits_in_float32(
+    level, compression, num, rng, monkeypatch
+):
+    """Within 1e-5 of a range of 2, of which float32 rounds such a value to 1e-3."""
+    monkeypatch.setenv(native.SWITCH, level)
+    centre = np.float32(rng.choice([-1, 1], 33) * 10 ** rng.uniform(-6, 6, 33))
+    scales = None if compression is None else compression * np.abs(centre).astype(np.float64)
+
+    def compressed(x):
+        x = x.astype(np.longdouble)
+        return x if scales is None else np.sign(x) * scales * np.log1p(np.abs(x) / scales)
+
+    ends = np.sort([compressed(centre * np.float32(f)) for f in (0.9999, 1.0002)], axis=0)
+    values = centre * np.float32(1 + 1e-4 * rng.uniform(-0.9, 1.9, (num, 33)))
+    values[:, 0], values[:, 1], values[:, 2] = -centre[0], 0.0, 1e3 * centre[2]
+    machine = native.Machine(
+        num_channels=1,
+        num_inputs=33,
+        num_columns=33,
+        singles=[(i, i) for i in range(33)],
+        scaling=(*ends.astype(np.float64), scales, None),
+        dtype=np.float32,
+    )
+    # the ends are float64 in a file
+    low, high = ends.astype(np.float64).astype(np.longdouble)
+    expected = np.clip(2 * (compressed(values) - low) / (high - low) - 1, -1, 1)
+    np.testing.assert_allclose(machine.columns(values), expected.astype(np.float64), 0, 1e-5)
+
+
 @pytest.mark.parametrize("num", [1, 20])
 @pytest.mark.parametrize(
     ("wanted", "read"),

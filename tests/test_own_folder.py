@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 import yaml
 from contract.recordings import CHANNELS, HELD_OUT, SEEN, TRIALS
 from hydra.core.config_store import ConfigStore
+from hydra.utils import instantiate
 
 from tactslip_torch import HandLayout, SlipDetector
 from tactslip_torch.commands.configuration import checked
@@ -74,6 +76,26 @@ def test_a_folder_of_which_nothing_is_known_asks_for_setup(folder):
         checked("train", [str(folder)])
     with pytest.raises(ValueError, match="no folder at"):
         checked("train", [str(folder / "none")])
+
+
+def test_a_detector_of_a_manifest_reads_a_folder_without_one(folder, monkeypatch):
+    for name in ("hand.yaml", "manifest.csv"):
+        (folder / name).unlink()
+    (folder / "slips.csv").write_text("file,start,end\nA_1,1,2\n")  # is no recording
+    model = folder / "detector.pt"
+    model.touch()
+    known = SimpleNamespace(info={"data": {"channels": CHANNELS}})
+    monkeypatch.setattr(SlipDetector, "load", lambda path: known)
+    config = checked("calibrate", [str(folder), f"model={model}", "slip_free=true"]).config
+    assert config.data.pattern == "{material}_{trial}"
+    source = instantiate(config.data, _convert_="all")
+    assert len(source.ids) == len(TRIALS) * len({*SEEN, *HELD_OUT})
+    assert not any(source.timeline(one).has_stretches for one in source.ids)
+
+
+def test_a_second_folder_or_file_is_refused(folder):
+    with pytest.raises(ValueError, match=r"detect takes one folder or file, and .*my hand"):
+        checked("detect", [str(folder / "A_1.csv"), str(folder), "model=x.pt"])
 
 
 def test_evaluate_takes_no_simulated_hand_by_itself(command, general, tmp_path):

@@ -1,6 +1,7 @@
 """A deadline in, a detector that keeps it out."""
 
 import json
+import re
 import time
 
 import pytest
@@ -10,11 +11,20 @@ from contract.recordings import of_set, split_of_set
 from tactslip_torch import SlipDetector
 from tactslip_torch.commands.configuration import compose_config
 from tactslip_torch.commands.pareto import pareto
-from tactslip_torch.pareto import Candidate, Timing, _time_detector, choose, nondominated
+from tactslip_torch.features.cost import WorkCosts
+from tactslip_torch.pareto import (
+    Candidate,
+    Timing,
+    _time_detector,
+    choose,
+    nondominated,
+    pareto_table,
+)
 
 
-def candidate(accuracy, p99_us, hop_ms=10.0):
-    return Candidate("general", 5, "float64", hop_ms, accuracy, 10.0, 50.0, Timing(1, p99_us), "")
+def candidate(accuracy, p99_us, hop_ms=10.0, m7=2e6):
+    timing = Timing(1, p99_us)
+    return Candidate("general", 5, "float64", hop_ms, accuracy, 10.0, 50.0, timing, m7, "")
 
 
 def test_the_most_accurate_that_keeps_the_limits_is_chosen():
@@ -35,6 +45,17 @@ def test_what_another_beats_is_not_on_the_front():
     assert nondominated([(1, 5), (2, 2), (3, 2), (4, 1), (2, 2)]) == [0, 1, 3]
 
 
+def test_the_table_has_instructions_of_a_microcontroller_and_their_front():
+    rows = [candidate(0.9, 300.0, m7=1.25e6).row(), candidate(0.8, 200.0, m7=3e6).row()]
+    content = {"candidates": rows, "front": [0, 1], "m7_front": [0], "chosen": rows[0]}
+    table = pareto_table({**content, "simulated": False})
+    names, *lines = [re.split(r"\s{2,}", line.strip()) for line in table.splitlines()]
+    cells = [dict(zip(names, line, strict=True)) for line in lines]
+    assert [each["M7 M instr."] for each in cells] == ["1.25", "3.00"]
+    assert cells[0]["M7 front"] != cells[1]["M7 front"]
+    assert cells[0]["front"] == cells[1]["front"]
+
+
 def test_a_detector_is_timed_by_its_calls(paper, monkeypatch):
     detector = paper.detector
     monkeypatch.setattr(detector, "predict_raw", lambda samples: time.sleep(0.002))
@@ -45,8 +66,8 @@ def test_a_detector_is_timed_by_its_calls(paper, monkeypatch):
 def of(recordings, cache, *overrides):
     small = ["recipes.paper.num_features=8", "calls=5", "sizes=[null,4]", "hops_ms=[25]"]
     data = [*of_set(recordings), *split_of_set(), *settings(workers=0, cache=cache)]
-    given = ["~recipe@recipes.general", "precisions=[float64]", *small, *data, *overrides]
-    return compose_config("pareto", given)
+    given = ["~recipe@recipes.general", "~recipes.cheap", "precisions=[float64]"]
+    return compose_config("pareto", [*given, *small, *data, *overrides])
 
 
 @pytest.mark.slow
@@ -57,6 +78,10 @@ def test_the_detector_that_is_left_keeps_its_deadline(recordings, cache, tmp_pat
     best = max(row["accuracy"] for row in found["candidates"])
     assert found["chosen"]["accuracy"] == best
     detector = SlipDetector.load(tmp_path / "detector.pt")
+    costs = WorkCosts.measured(detector.pool, "m7")
+    num, products = len(detector.selected_names), detector.head.cost.multiply_adds
+    cost = costs.cost([costs.decision(detector.selected_names, num, products)])
+    assert found["chosen"]["m7_instructions"] == pytest.approx(cost)
     assert len(detector.selected_names) == found["chosen"]["size"]
     assert "chosen" in capsys.readouterr().out
     again = tmp_path / "again"

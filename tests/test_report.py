@@ -529,7 +529,10 @@ def test_the_table_says_what_is_simulated_what_is_wrong_and_what_it_leaves_out()
     many = onsets_of(*[entry()] * 20, simulated=False)
     assert many[-1] == "and 80 more, see onsets.csv"
     assert "SIMULATED" not in many[0]
-    assert onsets_of(simulated=False) == ["no alarm, and no slip missed"]
+    found = entry() | {"alarms": []}
+    assert onsets_of(found | {"truth": None}, simulated=False) == ["no alarm"]
+    truth = {"onsets": []}
+    assert onsets_of(found | {"truth": truth}, simulated=False) == ["no alarm, and no slip missed"]
 
 
 def test_runs_stand_beside_each_other_with_mean_and_deviation(tmp_path, capsys):

@@ -205,13 +205,26 @@ def test_a_table_of_intervals_becomes_a_manifest(tmp_path):
     assert "pattern" not in proposal.settings["data"]
     rows = {row["file"]: row for row in proposal.manifest}
     assert set(rows) == {"cup_1.csv", "cup_2.csv", "box_1.csv", "box_2.csv"}
-    assert rows["cup_1.csv"]["slip_s"] == "1-2.5005; 3-3.5"
+    assert rows["cup_1.csv"]["sliding_s"] == "1-2.5005; 3-3.5"  # so onsets are known
+    assert rows["cup_1.csv"]["slip_s"] == rows["box_2.csv"]["sliding_s"] == ""
+    assert rows["box_2.csv"]["slip_s"] == "0-0.5"  # begun before the recording
     assert rows["cup_1.csv"]["non_slip_s"] == "0-1; 2.5005-3; 3.5-end"
     assert rows["box_2.csv"]["non_slip_s"] == "0.5-end"
     assert rows["cup_2.csv"]["slip_s"] == rows["cup_2.csv"]["non_slip_s"] == ""  # nobody says
     assert (rows["box_2.csv"]["material"], rows["box_2.csv"]["trial"]) == ("box", "2")
     (tmp_path / "manifest.csv").write_text("file,material,slip_s\ncup_1.csv,cup,0-1\n")
     assert not propose(look(tmp_path)).manifest  # one that is there is kept
+
+
+def test_a_table_that_is_not_understood_is_named(tmp_path):
+    for name in ("cup_1", "cup_2", "box_1", "box_2"):
+        write(tmp_path / f"{name}.csv", ["a", "b"])
+    (tmp_path / "slips.csv").write_text("Datei;Beginn;Ende\ncup_1;1;2\n")
+    question, *_ = propose(look(tmp_path)).questions
+    assert "slips.csv is none" in question.text
+    (tmp_path / "slips.csv").write_text("file;start;end\ncup_1;1;2 s\n")
+    with pytest.raises(ValueError, match=r"slips\.csv: end '2 s' is no number"):
+        look(tmp_path)
 
 
 def test_files_that_are_no_recordings_are_told_and_do_not_change_how_names_are_read(tmp_path):

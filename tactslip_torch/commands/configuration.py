@@ -13,6 +13,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -408,7 +409,7 @@ def _no_key(command: str, key: str, config: DictConfig | None = None) -> str:
         return f"{group}={chosen} has no key {key}; {' or '.join(having)} has it"
     near = _nearest(command, key, config)
     hint = f"did you mean {near}?" if near else f"tactslip {command} --help lists the keys"
-    if "." in key and not near:
+    if group in config and rest and not near:
         hint += f", +{key}=VALUE sets what has no default"
     return f"{command} has no key {key}; {hint}"
 
@@ -460,6 +461,12 @@ def _with_folder(command: str, arguments: Sequence[str]) -> list[str]:
         if re.search(rf"(?m)^(?:  - )?{re.escape(first.partition('.')[0])}:", top.read_text()):
             return list(arguments)  # a key without its value, which is told so
         raise ValueError(f"no folder at {first}; give a folder of recordings, or KEY=VALUE")
+    more = [word for before, word in pairwise(arguments) if not before.startswith("-")]
+    more = [word for word in more if "=" not in word and Path(word).exists()]
+    if more:
+        raise ValueError(
+            f"{command} takes one folder or file, and {more[0]} is a second; give the folder"
+        )
     if command in _PLACES:
         return [f"{_PLACES[command]}={_quoted(first)}", *rest]
     if not folder.is_dir():
@@ -505,6 +512,8 @@ def _hand_settings(command: str, folder: Path, rest: Sequence[str]) -> dict[str,
         info = SlipDetector.load(model).info
         if "data" in info:
             data = {**info["data"], "reading": info.get("reading", {})}
+            if "pattern" not in data and not (folder / _MANIFEST).is_file():
+                data["pattern"] = _pattern(folder)
             return {"data": data, "labels": info.get("labels", {})}
     if (folder / _MANIFEST).is_file():
         return {}
@@ -512,6 +521,15 @@ def _hand_settings(command: str, folder: Path, rest: Sequence[str]) -> dict[str,
         f"{folder} has neither {HAND_FILE} nor {_MANIFEST}, so it is not known how it is read; "
         f"tactslip setup {shlex.quote(str(folder))} looks at it and writes {HAND_FILE}"
     )
+
+
+def _pattern(folder: Path) -> str:
+    """How the names of a folder's recordings are read, where nothing says it."""
+    from tactslip_torch.data.file_names import name_pattern  # of no need for --help
+    from tactslip_torch.data.folder import recording_files
+
+    paths = recording_files(folder, in_folders=True)
+    return name_pattern([path.relative_to(folder).as_posix() for path in paths]).pattern
 
 
 def _read_hand(path: Path) -> dict[str, Any]:

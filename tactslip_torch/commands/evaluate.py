@@ -70,6 +70,8 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
             make_trainer(config.trainer, place).test(learner, datamodule=data, verbose=False)
             results[data.fold.name], events[data.fold.name] = learner.metrics, learner.events
     metrics = common_metadata(maker, config) | merged_results(results, events)
+    if not metrics["splits"]:
+        raise ValueError("no recording has a label, so nothing can be counted; detect needs none")
     metrics |= {
         "selected": [str(name) for name in detector.selected_names],
         "timing_s": {"total": time.perf_counter() - started},

@@ -8,6 +8,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.deploy.bins import Precision
 from tactslip_torch.deploy.export import export_detector, summary, wanted_graphs
 from tactslip_torch.deploy.native import NativeFile
 from tactslip_torch.model.detector import SlipDetector
@@ -28,11 +29,15 @@ def export(config: DictConfig, results: Path) -> None:
         raise ValueError(f"output must be a folder, got {folder}; the files have their names")
     if config.graph == "native":
         given: Any = OmegaConf.to_container(config.native)
-        for path in NativeFile.export(detector, folder, config.precision, **given):
-            print(f"{path}: {path.stat().st_size / 1000:.0f} kB, {config.precision}")
+        with_source = given.pop("source")
+        made = NativeFile.checked(detector, config.precision, **given)
+        reason = f", as in float32 {made.why_double}" if made.why_double else ""
+        for path in made.write(folder, source=with_source):
+            print(f"{path}: {path.stat().st_size / 1000:.0f} kB, {made.precision}{reason}")
         return
     graphs = wanted_graphs(config.graph, detector)
-    for path in export_detector(detector, folder, graphs, config.precision, source=source):
+    precision: Precision = "float32" if config.precision == "auto" else config.precision
+    for path in export_detector(detector, folder, graphs, precision, source=source):
         print(summary(path))
 
 

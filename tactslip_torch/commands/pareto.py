@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.commands.train import train
+from tactslip_torch.features.cost import WorkCosts
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.pareto import (
     Candidate,
@@ -67,11 +68,13 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
     limits = {"deadline_us": config.deadline_us, "latency_ms": config.latency_ms}
     chosen = choose(candidates, **limits)
     points = [(c.worst_ms, c.timing.p99_us, -c.accuracy) for c in candidates]
+    on_m7 = [(c.hop_ms, c.m7_instructions, -c.accuracy) for c in candidates]
     content = {
         "simulated": "simulation" in str(config.data._target_),
         **limits,
         "candidates": [each.row() for each in candidates],
         "front": nondominated(points),
+        "m7_front": nondominated(on_m7),
         "chosen": chosen and chosen.row(),
     }
     write_json(folder / "pareto.json", content)
@@ -109,6 +112,9 @@ def _trained(
     detector = SlipDetector.load(folder / "detector.pt")
     rate, bin_samples = detector.pool.sample_rate_hz, detector.pool.bin_samples
     timing = time_in_fresh_process(folder / "detector.pt", config.calls)
+    costs = WorkCosts.measured(detector.pool, "m7")
+    num_scaled, products = len(detector.scaler.minimum), detector.head.cost.multiply_adds
+    m7_instructions = costs.cost([costs.decision(detector.selected_names, num_scaled, products)])
     return [
         Candidate(
             recipe,
@@ -119,6 +125,7 @@ def _trained(
             1000 * detector.look_ahead / rate,
             1000 * bin_samples / rate,
             timing,
+            m7_instructions,
             str(folder),
         )
         for hop_ms in config.hops_ms

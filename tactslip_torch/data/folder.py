@@ -18,12 +18,20 @@ from tactslip_torch.data.formats import (
     format_of,
     named_format,
 )
+from tactslip_torch.data.formats._inference import cells_of
+from tactslip_torch.data.labels import label_of
 from tactslip_torch.data.manifest import MANIFEST, write_table
 from tactslip_torch.data.recording import TIMES, RecordingId, RecordingSource
+
+_STARTS = re.compile(r"(start|begin|from|onset)(_?(s|ms|sec|seconds|time))*", re.IGNORECASE)
+_ENDS = re.compile(r"(end|stop|to|until)(_?(s|ms|sec|seconds|time))*", re.IGNORECASE)
+_MOST_ROWS_BYTES = 2**20
 
 
 def recording_files(place: Path, *, in_folders: bool = False) -> list[Path]:
     """The file, bag or episode, or those of a folder that are of a known format, by name.
+
+    A manifest and a table of intervals are none.
 
     Args:
         place: a recording, or a folder.
@@ -50,10 +58,52 @@ def recording_files(place: Path, *, in_folders: bool = False) -> list[Path]:
                 found.append(path)
             elif in_folders and path.is_dir() and not path.is_symlink():
                 folders.append(path)
+    table, _ = interval_rows(place, found)
+    found = [path for path in found if path != place / table]
     if not found:
         known = " or ".join(f".{ending}" for ending in endings())
         raise ValueError(f"no recording in {place}; give a folder of {known} files")
     return found
+
+
+def interval_rows(folder: Path, paths: Sequence[Path]) -> tuple[str, list[dict[str, str]]]:
+    """A table in the folder that names recordings, with starts and ends; ``""`` if none is there.
+
+    Returns:
+        Its name, and of each row ``file``, ``start`` and ``end`` as they stand there, ``unit``
+        (``s`` or ``ms``) and ``label``, which is ``slip`` where no column says it.
+    """
+    known = {name: path for path in paths for name in (path.stem, path.name)}
+    known |= {path.relative_to(folder).as_posix(): path for path in paths}
+    for path in sorted(folder.glob("*.csv")):
+        if path.stat().st_size > _MOST_ROWS_BYTES or path.name == MANIFEST:
+            continue
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            first = file.readline()
+            delimiter = max(";,\t", key=first.count)
+            names = cells_of(first.rstrip("\n"), delimiter)
+            starts = [n for n, name in enumerate(names) if _STARTS.fullmatch(name)]
+            ends = [n for n, name in enumerate(names) if _ENDS.fullmatch(name)]
+            if not (starts and ends):
+                continue
+            rows = [cells_of(line.rstrip("\n"), delimiter) for line in file if line.strip()]
+        rows = [row for row in rows if len(row) == len(names)]
+        named = [n for n in range(len(names)) if rows and all(row[n] in known for row in rows)]
+        if not named:
+            continue
+        used = (starts[0], ends[0], named[0])
+        others = [n for n in range(len(names)) if n not in used]
+        labels = [n for n in others if all(label_of(row[n]) for row in rows)]
+        unit = "ms" if "ms" in re.split(r"[\W_]+", names[starts[0]].lower()) else "s"
+        table = []
+        for row in rows:
+            start, end, name = (row[n] for n in used)
+            label = (label_of(row[labels[0]]) if labels else None) or "slip"
+            place = known[name].relative_to(folder).as_posix()
+            times = {"start": start, "end": end, "unit": unit}
+            table.append({"file": place, **times, "label": label})
+        return path.name, table
+    return "", []
 
 
 def file_metadata(path: Path, archived: Archived | None) -> dict[str, Any]:

@@ -23,13 +23,12 @@ from scipy.signal import detrend
 
 from tactslip_torch.data.clock import even_clock, nominal_rate
 from tactslip_torch.data.file_names import name_pattern, word_choices
-from tactslip_torch.data.folder import guessed, recording_files
+from tactslip_torch.data.folder import guessed, interval_rows, recording_files
 from tactslip_torch.data.formats import Reading, find_format, open_file
 from tactslip_torch.data.formats._inference import (
     NUMBER,
     SECONDS,
     TimeUnit,
-    cells_of,
     is_time,
     no_channels,
     seconds_and_nanoseconds,
@@ -226,7 +225,6 @@ def look(folder: Path, answers: Answers | None = None) -> Look:
         raise FileNotFoundError(f"no folder at {folder}")
     paths = sorted(recording_files(folder, in_folders=True))
     name, intervals = _intervals(folder, paths)
-    paths = [path for path in paths if path.relative_to(folder).as_posix() != name]
     tables: list[_Table] = []
     problems: dict[str, str] = {}
     num_bytes = 0
@@ -340,45 +338,23 @@ def _times_by_values(
 
 # Tables of intervals ------------------------------------------------------------------------------
 
-_STARTS = re.compile(r"(start|begin|from|onset)(_?(s|ms|sec|seconds|time))*", re.IGNORECASE)
-_ENDS = re.compile(r"(end|stop|to|until)(_?(s|ms|sec|seconds|time))*", re.IGNORECASE)
-_MOST_ROWS_BYTES = 2**20
-
 
 def _intervals(folder: Path, paths: Sequence[Path]) -> tuple[str, list[Mapping[str, str]]]:
-    """A table in the folder that names recordings, with starts and ends, and its rows."""
-    known = {name: path for path in paths for name in (path.stem, path.name)}
-    known |= {path.relative_to(folder).as_posix(): path for path in paths}
-    for path in sorted(folder.glob("*.csv")):
-        if path.stat().st_size > _MOST_ROWS_BYTES or path.name == MANIFEST:
-            continue
-        text = path.read_text("utf-8-sig", "replace")
-        lines = [line for line in text.splitlines() if line.strip()]
-        if len(lines) < 2:
-            continue
-        delimiter = max(";,\t", key=lines[0].count)
-        names, *rows = (cells_of(line, delimiter) for line in lines)
-        rows = [row for row in rows if len(row) == len(names)]
-        starts = [n for n, name in enumerate(names) if _STARTS.fullmatch(name)]
-        ends = [n for n, name in enumerate(names) if _ENDS.fullmatch(name)]
-        named = [n for n in range(len(names)) if rows and all(row[n] in known for row in rows)]
-        if not (starts and ends and named):
-            continue
-        labels = [
-            n
-            for n in range(len(names))
-            if n not in (starts[0], ends[0], named[0]) and all(label_of(row[n]) for row in rows)
-        ]
-        scale = 1e-3 if "ms" in re.split(r"[\W_]+", names[starts[0]].lower()) else 1.0
-        table: list[Mapping[str, str]] = []
-        for row in rows:
-            start, end = (float(row[n].replace(",", ".")) * scale for n in (starts[0], ends[0]))
-            label = label_of(row[labels[0]]) if labels else "slip"
-            file = known[row[named[0]]].relative_to(folder).as_posix()
-            span = {"start": f"{start:.10g}", "end": f"{end:.10g}"}
-            table.append({"file": file, **span, "label": label or ""})
-        return path.name, table
-    return "", []
+    """The table of intervals of a folder, and its rows with times in seconds.
+
+    Raises:
+        ValueError: if a time is no number.
+    """
+    name, rows = interval_rows(folder, paths)
+    table: list[Mapping[str, str]] = []
+    for row in rows:
+        times = {}
+        for end in ("start", "end"):
+            if not NUMBER.fullmatch(cell := row[end].replace(",", ".")):
+                raise ValueError(f"{folder / name}: {end} {row[end][:40]!r} is no number")
+            times[end] = f"{float(cell) * (1e-3 if row['unit'] == 'ms' else 1.0):.10g}"
+        table.append({**row, **times})
+    return name, table
 
 
 def _manifest_rows(
@@ -386,8 +362,8 @@ def _manifest_rows(
 ) -> list[dict[str, str]]:
     """Rows of a manifest: of each file its intervals; what lies between slips is non-slip.
 
-    If intervals of non-slip are given as well, what lies between is not labelled. Files without
-    an interval have no label.
+    So it is known when such a slip begins. If intervals of non-slip are given as well, what lies
+    between is not labelled. Files without an interval have no label.
     """
     spans_of: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for row in rows:
@@ -400,7 +376,10 @@ def _manifest_rows(
             edges = [0.0, *(edge for span in slips for edge in span), math.inf]
             pairs = zip(edges[::2], edges[1::2], strict=True)
             rest = [(start, end) for start, end in pairs if start < end]
-        spans = {"slip_s": slips, "non_slip_s": rest}
+        starts = {end for _, end in rest} if not has_both else set()
+        sliding = [span for span in slips if span[0] in starts]  # the others began unseen
+        slip = [span for span in slips if span not in sliding]
+        spans = {"sliding_s": sliding, "slip_s": slip, "non_slip_s": rest}
         texts = {name: "; ".join(map(_span_text, each)) for name, each in spans.items()}
         columns = {name: known.get(name, "") for name in ("material", "trial", "scene", "session")}
         found.append({"file": file, **columns, **texts})
@@ -765,7 +744,7 @@ def _propose_labels_and_groups(
         for row in intervals:
             classes.setdefault(row["file"], {False}).add(row["label"] == "slip")
     elif not (has_manifest or found.tables[0].is_native):
-        by_name = _words_of_names(found.files, given, draft)
+        by_name = _words_of_names(found, given, draft)
         if not by_name:
             return classes
     if has_manifest:
@@ -860,8 +839,9 @@ def _is_slip(word: str, words: Mapping[str, bool]) -> bool | None:
     return None if label is None else label == "slip"
 
 
-def _words_of_names(files: Sequence[str], given: Answers, draft: Proposal) -> dict[str, bool]:
+def _words_of_names(found: Look, given: Answers, draft: Proposal) -> dict[str, bool]:
     """The words of names or folders that are labels; asks where there is none that is known."""
+    files = found.files
     choices = word_choices(files)
     if given.pattern is not None and "{label" in given.pattern:
         read = [guessed(file, given.pattern).get("label") for file in files]
@@ -884,17 +864,20 @@ def _words_of_names(files: Sequence[str], given: Answers, draft: Proposal) -> di
             f"no part of all names holds the words {', '.join(given.words)}; names tell apart "
             f"{' or '.join('|'.join(words) for words in choices) or 'nothing'}"
         )
+    others = [file for file in found.problems if file.endswith(".csv") and "/" not in file]
+    nothing = (
+        "Nothing tells where slip is: no column, no table of intervals (a CSV with the columns "
+        "file, which names a recording, start and end"
+        f"{f'; {others[0]} is none' if others else ''})"
+    )
     if not choices:
-        text = (
-            "Nothing tells where slip is: no column, no table of intervals (a CSV with the columns "
-            "file, start and end), no words in names. Which column says it?"
-        )
+        text = f"{nothing}, no words in names. Which column says it?"
         draft.ask("column", text, "--column NAME")
         return {}
     listed = "; or ".join(", ".join(words[:12]) for words in choices)
     text = (
-        "Nothing tells which recordings slip. Which word in the names of files or folders, or "
-        f"which words with commas between, mean that nothing slips? They have {listed}"
+        f"{nothing}. Which word in the names of files or folders, or which words with commas "
+        f"between, mean that nothing slips? They have {listed}"
     )
     draft.ask("non_slip", text, "--non-slip WORD, or --column NAME")
     return {}

@@ -14,10 +14,10 @@ import os
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -92,11 +92,13 @@ def _pointed(address: int | None, count: int, dtype: Any) -> Array:
 class NativeFile:
     """A detector as the C library reads it.
 
-    Args:
+    Attributes:
         content: of ``detector.tslip``.
+        why_double: how float32 failed its comparison, where ``checked`` took float64 instead.
     """
 
     content: bytes
+    why_double: str = ""
 
     @classmethod
     def of(
@@ -142,40 +144,50 @@ class NativeFile:
         return cls(out.whole())
 
     @classmethod
-    def export(
+    def checked(
         cls,
         detector: SlipDetector,
-        folder: str | os.PathLike[str],
-        precision: Precision = "float32",
-        *,
-        source: bool = False,
+        precision: Precision | Literal["auto"] = "auto",
         **counts: float | Sequence[float],
-    ) -> tuple[Path, ...]:
-        """Write ``detector.tslip``, checked against torch; with its bytes as constants on request.
+    ) -> NativeFile:
+        """That of a detector, compared with torch.
 
         Args:
             detector: as of ``of``.
-            folder: for the files.
-            precision: of all numbers.
-            source: whether ``detector.c`` is written too, for a detector in flash.
+            precision: ``"auto"`` is float32 where its comparison passes, and float64 elsewhere.
             counts: ``scale`` and ``offset``.
 
         Raises:
-            ValueError: as ``of``, or if the file fails its check: nothing is written then.
+            ValueError: as ``of``, or if a comparison fails.
         """
-        made = cls.of(detector, precision, **counts)
+        only: Precision = "float32" if precision == "auto" else precision
+        made = cls.of(detector, only, **counts)
         try:
-            compare(
-                _runner(made), detector, "stream", precision, exact_onsets=precision == "float64"
-            )
+            compare(_runner(made), detector, "stream", only, exact_onsets=only == "float64")
         except ValueError as error:
-            advice = "; give precision=float64" if precision == "float32" else ""
+            if precision == "auto":
+                return replace(cls.checked(detector, "float64", **counts), why_double=str(error))
+            advice = "; give precision=float64 or auto" if precision == "float32" else ""
             raise ValueError(f"{FILE} was not written: {error}{advice}") from error
-        contents = {FILE: made.content} | ({SOURCE: made.as_constants()} if source else {})
+        return made
+
+    def write(self, folder: str | os.PathLike[str], *, source: bool = False) -> tuple[Path, ...]:
+        """Write ``detector.tslip`` and, on request, its bytes as constants for flash.
+
+        Args:
+            folder: for the files.
+            source: whether ``detector.c`` is written too.
+        """
+        contents = {FILE: self.content} | ({SOURCE: self.as_constants()} if source else {})
         for name, each in contents.items():
             with whole_file(Path(folder) / name) as temporary:
                 temporary.write_bytes(each)
         return tuple(Path(folder) / name for name in contents)
+
+    @property
+    def precision(self) -> Precision:
+        """Of all its numbers."""
+        return "float32" if _HEAD.unpack_from(self.content)[-1] == 4 else "float64"
 
     def as_constants(self) -> bytes:
         """The file as C source, at a multiple of 8 bytes."""
@@ -292,10 +304,11 @@ def _write_machine(out: _Writer, machine: ctypes.Structure) -> None:
         out.arrays(machine, fill=machine.num_columns)
     num, num_scaled = _filled(machine.num_scaled), machine.num_scaled
     out.arrays(machine, np.int32, sources=num)
-    out.arrays(machine, minimum=num, maximum=num)
-    out.numbers(bool(machine.compression))
-    if machine.compression:
-        out.arrays(machine, compression=num)
+    out.arrays(machine, minimum=num, width=num)
+    for name in ("compression", "centre"):
+        out.numbers(bool(getattr(machine, name)))
+        if getattr(machine, name):
+            out.arrays(machine, **{name: num})
     out.arrays(machine, imputation=num_scaled)
     out.arrays(machine, np.int32, channels=num_scaled)
     out.arrays(machine, linear=num)

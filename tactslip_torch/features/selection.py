@@ -203,7 +203,12 @@ _LEFT = 1e-6  # of a column's square; what is below is explained by the columns 
 
 
 def forward_selection(
-    columns: Tensor, targets: Tensor, weights: Tensor, num: int, ridge: float = 1.0
+    columns: Tensor,
+    targets: Tensor,
+    weights: Tensor,
+    num: int,
+    ridge: float = 1.0,
+    costs: tuple[Tensor, Tensor, float] | None = None,
 ) -> list[int]:
     """Columns that explain targets best together, best first: greedy least squares.
 
@@ -217,9 +222,13 @@ def forward_selection(
         weights: of bins.
         num: of columns to take, at most.
         ridge: added to the square of each column.
+        costs: which parts of the work each column needs, the cost of each part, and what any column
+            costs itself (``cost.WorkCosts``). Then the column is taken whose gain is largest for
+            what it adds to the cost; parts that columns before it need as well add nothing.
 
     Shape:
         - columns: ``[N, S]``, float64; targets: ``[N, R]``; weights: ``[N]``
+        - costs: ``[S, P]``, 0 or 1; ``[P]``
 
     Reference:
         Chen, Billings and Luo (1989), International Journal of Control 50(5), 1873-1896.
@@ -234,6 +243,10 @@ def forward_selection(
         gain = cross.square().sum(1) / square.clamp(min=1e-300)
         gain = torch.where(square > _LEFT * whole, gain, -1.0)
         gain[taken] = -1.0
+        if costs is not None:
+            needs, price, own = costs
+            is_paid = needs[taken].amax(0) if taken else 0 * price
+            gain = gain / (own + needs @ (price * (1 - is_paid)))
         best = int(gain.argmax())
         if gain[best] <= 0:
             break

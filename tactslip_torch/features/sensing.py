@@ -302,7 +302,7 @@ def level_message(ratio: float | None, unit: str) -> str:
     if ratio is None or 1 / LEVEL_FACTOR <= ratio <= LEVEL_FACTOR:
         return ""
     if not ratio:
-        return "nothing moves: all levels at rest are 0; is the hand connected?"
+        return "half of the channels or more do not move at all; is the hand connected?"
     power = round(math.log10(ratio) / 3)
     near = {-2: "a millionth", -1: "a thousandth", 1: "a thousand times", 2: "a million times"}
     is_unit = power in near and abs(math.log10(ratio) - 3 * power) <= 0.7

@@ -103,8 +103,8 @@ class _Machine(ctypes.Structure):
             "num_channels", "num_inputs", "num_columns", "num_scaled", "num_quadratic",
             "num_factors", "num_singles", "num_pools", "most_channels")),
         *((name, ctypes.c_void_p) for name in (
-            "single_inputs", "single_columns", "pools", "fill", "sources", "minimum", "maximum",
-            "compression", "imputation", "channels", "quadratic", "signs", "linear")),
+            "single_inputs", "single_columns", "pools", "fill", "sources", "minimum", "width",
+            "compression", "centre", "imputation", "channels", "quadratic", "signs", "linear")),
         ("constant", ctypes.c_double),
     )  # fmt: skip
 
@@ -463,9 +463,12 @@ class Machine(_Kept):
         self.of.sources = self._filled_up(sources, 0, np.int32)
         if fill is not None:
             self.of.fill = self._array(fill)
-        if minimum is not None:
+        if minimum is not None and maximum is not None:
+            if dtype is np.float32:
+                centre, minimum, maximum = _centred(minimum, maximum, compression)
+                self.of.centre = self._filled_up(centre, 0.0)
             self.of.minimum = self._filled_up(minimum, 0.0)
-            self.of.maximum = self._filled_up(maximum, 0.0)
+            self.of.width = self._filled_up(maximum - minimum, 0.0)
         if compression is not None:
             self.of.compression = self._filled_up(compression, 1.0)
         if imputation is not None:
@@ -504,6 +507,35 @@ class Machine(_Kept):
             call.is_lost = is_lost.ctypes.data
         self._run(None, self.of, call)
         return found
+
+
+_NARROW = 16  # ranges of a column between it and 0, from which on it has a centre
+
+
+def _centred(
+    minimum: Array, maximum: Array, compression: Array | None
+) -> tuple[Array, Array, Array]:
+    """Centres of scaled columns in float32, and minimum and maximum less those, all ``[S]``.
+
+    A centre is a column's value in the middle of a narrow range, or 0. Rounding to float32 is of
+    the size of a value; of its distance from the centre it is little where ranges are narrow.
+
+    Args:
+        minimum: ``[S]``, of compressed columns where there is compression.
+        maximum: ``[S]``.
+        compression: scales, ``[S]``.
+    """
+    middle = minimum / 2 + maximum / 2
+    is_narrow = np.abs(middle) > _NARROW * (maximum - minimum)
+    with np.errstate(over="ignore"):
+        spread = middle if compression is None else np.expm1(np.abs(middle) / compression)
+        centre = middle if compression is None else np.sign(middle) * compression * spread
+        centre = np.where(is_narrow, centre, 0.0).astype(np.float32)
+    centre = np.where(np.isfinite(centre), centre, 0.0).astype(np.float64)
+    at = centre
+    if compression is not None:
+        at = np.sign(centre) * compression * np.log1p(np.abs(centre) / compression)
+    return centre, minimum - at, maximum - at
 
 
 class Scores(NamedTuple):

@@ -42,6 +42,12 @@ template <class E, class V> INLINE void product(const Matrix<E>& matrix, const V
   }
 }
 
+// a / b; 0 where b is not positive.
+template <class V> INLINE V over(V a, V b) {
+  V value = a / b;
+  return b > 0 ? value : V{};
+}
+
 template <class V> struct Extent {
   V low, high, mean;
 };
@@ -96,7 +102,6 @@ template <class E> struct Describe {
     row.n = (E)n;
   }
 
-  static V mean(const Row& s) { return s.centre; }
   static V median(const V* sorted, int32_t n) {
     return n % 2 ? sorted[n / 2] : (sorted[n / 2 - 1] + sorted[n / 2]) * (E)0.5;
   }
@@ -112,7 +117,6 @@ template <class E> struct Describe {
     }
     return best;
   }
-  static V range(const Row& s) { return s.span; }
   static V mean_deviation(const Row& s) { return s.span * s.first / s.n; }
   static V std(const Row& s) { return s.span * root(s.second / (s.n - 1)); }
   static V cv(const Row& s) {
@@ -139,7 +143,6 @@ template <class E> struct Describe {
     V value = s.n * s.fourth / (s.second * s.second);
     return s.span > 0 ? value : V{} + 3;
   }
-  static V energy(const Row& s) { return s.energy; }
   // Levels of sorted values as bytes; how many are equal to the one r places before is how often a
   // cell holds more than r, and gain[r] what that adds. `levels` has VECTOR_BYTES to spare.
   static V entropy(const V* sorted, const E* gain, int32_t* wholes, uint8_t* levels, int32_t n) {
@@ -175,11 +178,7 @@ template <class E> struct Describe {
     }
     return total;
   }
-  static V peak_factor(const Row& s) {
-    V rms = root(s.energy / s.n);
-    V value = s.top / rms;
-    return rms > 0 ? value : V{};
-  }
+  static V peak_factor(const Row& s) { return over(s.top, rms(s)); }
   static V rms(const Row& s) { return root(s.energy / s.n); }
   // Between neighbours in time, before values are sorted.
   static V mean_abs_change(const Row& s, const V* d, int32_t n) {
@@ -191,18 +190,13 @@ template <class E> struct Describe {
     V value = s.both / root(s.second * s.other);
     return (s.span > 0) & (s.other > 0) ? value : V{};
   }
-  static V spectral_centroid(V moment, V total) {
-    V value = moment / total;
-    return total > 0 ? value : V{};
-  }
   static V spectral_spread(const V* amplitude, V total, V centre, const E* frequency_hz, int32_t n) {
     V moment = {};
     for (int32_t i = 0; i < n; ++i) {
       V away = frequency_hz[i] - centre;
       moment += away * away * amplitude[i];
     }
-    V value = root(moment / total);
-    return total > 0 ? value : V{};
+    return root(over(moment, total));
   }
 
   INLINE Bytes load(const uint8_t* from) {
@@ -239,6 +233,7 @@ template <class E> struct Group : Describe<E> {
   bool is_broken[W];  // holds NaN or Inf
   E loudest[W];       // size of a sample as given, in the frames of its filter
   V first, scale, unit, span;
+  V quiet;  // a row whose span is below is rounding
   V *window, *weights;  // samples that the filter takes in, and its weights
   V *y, *approximation, *coefficients, *row, *raw, *d, *few, *lines, *total;
   int32_t* wholes;
@@ -292,7 +287,7 @@ template <class E> struct Group : Describe<E> {
       int32_t span = n + filter.length - 1;
       E* to = (E*)window + k;
       for (int32_t i = 0; i < span; ++i) to[i * W] = (E)from[i];
-      for (int32_t i = span; i < n + most_taps - 1; ++i) to[i * W] = 0;
+      for (int32_t i = span; i < n + most_taps - 1; ++i) to[i * W] = to[0];
       to = (E*)weights + k;
       for (int32_t i = 0; i < most_taps; ++i)
         to[i * W] = i < filter.length ? filter.weights[i] : 0;
@@ -301,13 +296,18 @@ template <class E> struct Group : Describe<E> {
     settle();
     V offset = window[0], base = {};  // a small vibration keeps its digits on any offset
     for (int32_t i = 0; i < taps; ++i) base += offset * weights[i];
-    for (int32_t i = 0; i < n + most_taps - 1; ++i) window[i] -= offset;
+    V most = {};
+    for (int32_t i = 0; i < n + most_taps - 1; ++i) {
+      window[i] -= offset;
+      if (sizeof(E) == 4) most = larger(most, magnitude(window[i]));
+    }
     convolve(taps);
     Extent<V> e = extent(y, n);
     span = e.high - e.low;
     scale = larger(base + e.high, -(base + e.low));
-    V inverse = 1 / scale, start = y[0];
-    unit = scale > 0 ? inverse : V{};
+    V start = y[0];
+    unit = over(V{} + 1, scale);
+    quiet = larger(Limits<E>::NOISE * most, (E)Limits<double>::NOISE * scale);
     first = base + start;
     for (int32_t i = 0; i < n; ++i) y[i] -= start;
     if (bins.sensing) note_channels();
@@ -387,14 +387,12 @@ template <class E> struct Group : Describe<E> {
   void describe(uint32_t wanted, int32_t count, Row& s, const E* gain, bool in_time) {
     s.other = other;
     if (in_time) s.energy = s.span * s.span * s.second + s.n * s.centre * s.centre;
-    if (wanted & 1u << MEAN) values[MEAN] = Base::mean(s);
-    if (wanted & 1u << RANGE) values[RANGE] = Base::range(s);
+    values[MEAN] = s.centre, values[RANGE] = s.span, values[ENERGY] = s.energy;
     if (wanted & 1u << MEAN_DEVIATION) values[MEAN_DEVIATION] = Base::mean_deviation(s);
     if (wanted & 1u << STD) values[STD] = Base::std(s);
     if (wanted & 1u << CV) values[CV] = Base::cv(s);
     if (wanted & 1u << SKEWNESS) values[SKEWNESS] = Base::skewness(s);
     if (wanted & 1u << KURTOSIS) values[KURTOSIS] = Base::kurtosis(s);
-    if (wanted & 1u << ENERGY) values[ENERGY] = Base::energy(s);
     if (wanted & 1u << PEAK_FACTOR) values[PEAK_FACTOR] = Base::peak_factor(s);
     if (wanted & 1u << CORRELATION) values[CORRELATION] = Base::correlation(s);
     if (wanted & 1u << RMS) values[RMS] = Base::rms(s);
@@ -438,7 +436,7 @@ template <class E> struct Group : Describe<E> {
     Extent<V> e = extent(row, n);
     V offset = keeps_first ? first : V{};
     s.span = e.high - e.low;
-    auto constant = s.span * (1 / Limits<E>::NOISE) < scale;
+    auto constant = s.span < quiet;
     s.span = constant ? V{} : s.span;
     V middle = e.mean + offset;
     if (!keeps_first) middle = constant ? V{} : middle;
@@ -447,9 +445,7 @@ template <class E> struct Group : Describe<E> {
     is_constant = constant ? V{} + 1 : V{};
     centre = e.mean;
     if (wanted) {
-      V factor = 1 / s.span;
-      factor = s.span > 0 ? factor : V{};
-      Base::sum(s, row, e.mean, factor, d, with, n);
+      Base::sum(s, row, e.mean, over(V{} + 1, s.span), d, with, n);
       describe(wanted, n, s, plan.gain_time, true);
       write(row_number);
     }
@@ -471,8 +467,7 @@ template <class E> struct Group : Describe<E> {
       most = larger(most, square);
     }
     if (!wanted) return energy;
-    V inverse = 1 / most, low = V{} + 1, high = {}, sum = {}, moment = {};
-    inverse = most > 0 ? inverse : V{};
+    V inverse = over(V{} + 1, most), low = V{} + 1, high = {}, sum = {}, moment = {};
     for (int32_t i = 0; i < count; ++i) {
       V amplitude = root_of_part(d[i] * inverse);
       d[i] = amplitude;
@@ -482,16 +477,15 @@ template <class E> struct Group : Describe<E> {
       high = larger(high, amplitude);
     }
     if (wanted & WEIGHTED) {
-      V centroid = Base::spectral_centroid(moment, sum);
+      V centroid = over(moment, sum);
       values[SPECTRAL_CENTROID] = centroid;
       if (wanted & 1u << SPECTRAL_SPREAD)
         values[SPECTRAL_SPREAD] =
             Base::spectral_spread(d, sum, centroid, plan.frequency_hz, count);
     }
-    V mean = sum / (E)count, spread = high - low, factor = 1 / spread;
-    factor = spread > 0 ? factor : V{};
+    V mean = sum / (E)count, spread = high - low;
     Row s;
-    Base::sum(s, d, mean, factor, d, nullptr, count);
+    Base::sum(s, d, mean, over(V{} + 1, spread), d, nullptr, count);
     s.top = scale * root(most);
     s.centre = s.top * mean;
     s.span = s.top * spread;
@@ -518,8 +512,8 @@ template <class E> struct Group : Describe<E> {
     if (!levels_wanted) return;
     // the bin itself, for correlation
     Extent<V> e = extent(y, n);
-    V around = e.high - e.low, factor = 1 / around;
-    factor = (around * (1 / Limits<E>::NOISE) < scale) | (around <= 0) ? V{} : factor;
+    V around = e.high - e.low, factor = over(V{} + 1, around);
+    factor = around < quiet ? V{} : factor;
     other = V{};
     for (int32_t i = 0; i < n; ++i) {
       raw[i] = (y[i] - e.mean) * factor;
@@ -572,10 +566,7 @@ template <class E> struct Group : Describe<E> {
   void band_energy_ratio(const V* energies) {
     V sum = {};
     for (int32_t b = 0; b < num_branches; ++b) sum += energies[b];
-    for (int32_t b = 0; b < num_branches; ++b) {
-      V value = energies[b] / sum;
-      values[b] = sum > 0 ? value : V{};
-    }
+    for (int32_t b = 0; b < num_branches; ++b) values[b] = over(energies[b], sum);
     write(2 * num_branches);
   }
 

@@ -86,7 +86,9 @@ template <class E> struct Machine {
   const Pool<E>* pools;
   const E* fill;           // [columns], where no channel is in use; null: nothing is pooled
   const int32_t* sources;  // [scaled], the column that each is made of
-  const E *minimum, *maximum, *compression;  // [scaled]; null: not scaled, not compressed
+  // [scaled]; null: not scaled, not compressed. In float, columns and their minimum are less a centre
+  // where their range is narrow, or its digits are lost.
+  const E *minimum, *width, *compression, *centre;
   const E* imputation;      // [scaled], of a lost channel; null: they stay as they are
   const int32_t* channels;  // [scaled], -1: of several; null without imputation
   // of the first num_quadratic scaled columns, [blocks, columns, WHOLE rows of a block]; null: none.

@@ -50,6 +50,13 @@ template <class E> struct Reader {
     return it;
   }
 
+  // An array of which every number passes a test.
+  template <class X, class Test> const X* tested(int64_t count, Test test) {
+    const X* table = array<X>(count);
+    for (int64_t i = 0; table && i < count; ++i) is_wrong |= !test(table[i]);
+    return is_wrong ? nullptr : table;
+  }
+
   struct Number {
     int32_t* to;
     int32_t least, most;
@@ -70,12 +77,9 @@ template <class E> struct Reader {
     int32_t least, most;
   };
   template <int N> void all(const Numbers (&tables)[N]) {
-    for (const Numbers& each : tables) {
-      const int32_t* table = array<int32_t>(each.count);
-      for (int64_t i = 0; table && i < each.count; ++i)
-        is_wrong |= table[i] < each.least || table[i] > each.most;
-      *each.to = is_wrong ? nullptr : table;
-    }
+    for (const Numbers& each : tables)
+      *each.to = tested<int32_t>(
+          each.count, [&](int32_t x) { return x >= each.least && x <= each.most; });
   }
 
   struct Reals {  // finite ones
@@ -83,11 +87,8 @@ template <class E> struct Reader {
     int64_t count;
   };
   template <int N> void all(const Reals (&tables)[N]) {
-    for (const Reals& each : tables) {
-      const E* table = array<E>(each.count);
-      for (int64_t i = 0; table && i < each.count; ++i) is_wrong |= !(table[i] - table[i] == 0);
-      *each.to = is_wrong ? nullptr : table;
-    }
+    for (const Reals& each : tables)
+      *each.to = tested<E>(each.count, [](E x) { return x - x == 0; });
   }
 
   // In 8 bytes whatever the precision, at any place; may be infinite.
@@ -105,9 +106,7 @@ template <class E> struct Reader {
   }
 
   const uint8_t* flags(int64_t count) {
-    const uint8_t* all = array<uint8_t>(count);
-    for (int64_t i = 0; all && i < count; ++i) is_wrong |= all[i] > 1;
-    return is_wrong ? nullptr : all;
+    return tested<uint8_t>(count, [](uint8_t x) { return x <= 1; });
   }
 };
 
@@ -284,8 +283,9 @@ template <class E> struct Model {
     if (m.num_pools) in.all({{&m.fill, m.num_columns}});
     int64_t num = filled(m.num_scaled);
     in.all({{&m.sources, num, 0, m.num_columns - 1}});
-    in.all({{&m.minimum, num}, {&m.maximum, num}});
+    in.all({{&m.minimum, num}, {&m.width, num}});
     if (in.number(0, 1)) in.all({{&m.compression, num}});
+    if (in.number(0, 1)) in.all({{&m.centre, num}});
     in.all({{&m.imputation, m.num_scaled}});
     in.all({{&m.channels, m.num_scaled, -1, num_channels - 1}});
     in.all({{&m.linear, num}});

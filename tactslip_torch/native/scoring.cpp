@@ -9,7 +9,7 @@
 
 namespace {
 
-// log(1 + x) for x >= 0, as fdlibm has it: an error below 1 ulp. Of f, less than the square root of 2
+// log(1 + x) for x > -1, as fdlibm has it: an error below 1 ulp. Of f, less than the square root of 2
 // over 1, it is a series in the squares of s = f / (2 + f).
 template <class E> struct Series;
 template <> struct Series<double> {
@@ -45,7 +45,9 @@ template <class E> INLINE typename Lanes<E>::V log1p_of(typename Lanes<E>::V x) 
   V u = 1 + x, lost = x < 1 ? x - (u - 1) : 1 - (u - x);
   Bits bits = (Bits)u + (Own::ONE - Own::LOWEST);
   V k = (V)((bits >> Own::DIGITS) + ((Bits)(V{} + whole) - Own::BIAS)) - whole;
-  V f = (V)((bits & digits) + Own::LOWEST) - 1;
+  auto is_near = (u >= (E)0.75) & (u < (E)1.4);  // k = 0: nothing is lost, however small x is
+  V f = is_near ? x : (V)((bits & digits) + Own::LOWEST) - 1;
+  lost = is_near ? V{} : lost;
   V s = f / (2 + f), z = s * s, half = (E)0.5 * f * f;
   V about = (V)(Own::INVERSE - (Bits)smaller(u, V{} + (E)0x1p60));  // to an eighth: enough
   return k * Own::LN2_HIGH - ((half - (s * (half + Own::at(z)) + (k * Own::LN2_LOW + lost * about))) - f);
@@ -56,18 +58,27 @@ template <class V> INLINE V inverse_of(V scale) {
   return smaller(1 / scale, V{} + Limits<E>::LARGEST);
 }
 
-// sign(x) scale log(1 + |x| / scale)
-template <class E, class V> INLINE V signed_log(V x, V scale, V inverse) {
-  V size = magnitude(x), ratio = size * inverse, bent = scale * log1p_of<E>(ratio);
+// sign(x) scale log(1 + |x| / scale), less the same of a centre. Near the centre it is the log of one
+// ratio, so that what lies close together stays apart.
+template <class E, class V> INLINE V signed_log(V x, V scale, V centre) {
+  V turned = centre < 0 ? -x : x, middle = magnitude(centre);
+  auto is_beside = 2 * turned >= middle;
+  V away = is_beside ? turned - middle : magnitude(turned);
+  V whole = is_beside ? scale + middle : scale, inverse = inverse_of(whole);
+  V ratio = away * inverse, bent = scale * log1p_of<E>(ratio);
   auto is_far = ratio > Limits<E>::LARGEST;
   if (any(is_far))
     for (int k = 0; k < Lanes<E>::NUM; ++k)
       if (is_far[k]) {
-        E far = log_of(size[k] > scale[k] ? size[k] : scale[k]) - log_of(scale[k]);
+        E far = log_of(away[k] > whole[k] ? away[k] : whole[k]) - log_of(whole[k]);
         bent[k] = scale[k] * (far > Series<E>::LN_LARGEST ? far : Series<E>::LN_LARGEST);
       }
-  bent = ratio < Limits<E>::SMALLEST ? size : bent;  // a denormal ratio has lost its digits
-  return x < 0 ? -bent : bent;
+  bent = magnitude(ratio) < Limits<E>::SMALLEST ? away : bent;  // a denormal ratio has lost digits
+  if (any(~is_beside)) {
+    V own = turned < 0 ? -bent : bent;
+    bent = is_beside ? bent : own - scale * log1p_of<E>(middle * inverse);
+  }
+  return centre < 0 ? -bent : bent;
 }
 
 enum Across { BINS, ONE_BIN };
@@ -174,9 +185,9 @@ template <class E> struct Scorer {
     }
     for (int32_t r = 0; r < p.num_families; r += step<ACROSS>()) {
       V mean = {}, square = {}, low = {}, high = {}, last = {};
-      V scale = constants<ACROSS>(p.scales + r), inverse = inverse_of(scale);
+      V scale = constants<ACROSS>(p.scales + r);
       for (int32_t c = 0; c < p.num_channels; ++c) {
-        V value = signed_log<E>(gathered<ACROSS>(x, p.inputs + c * stride + r), scale, inverse);
+        V value = signed_log<E>(gathered<ACROSS>(x, p.inputs + c * stride + r), scale, V{});
         values[c] = in_use[c] > 0 ? value : V{};
         mean += values[c];
         last = larger(last, values[c]);
@@ -221,16 +232,31 @@ template <class E> struct Scorer {
   template <Across ACROSS> void scale(int32_t i) {
     const Machine<E>& m = machine;
     V value = gathered<ACROSS>(y, m.sources + i);
-    if (m.compression) {
-      V scale = constants<ACROSS>(m.compression + i);
-      value = signed_log<E>(value, scale, inverse_of(scale));
-    }
+    V centre = m.centre ? constants<ACROSS>(m.centre + i) : V{};
+    if (m.compression)
+      value = signed_log<E>(value, constants<ACROSS>(m.compression + i), centre);
+    else
+      value -= centre;
     if (m.minimum) {
-      V low = constants<ACROSS>(m.minimum + i), width = constants<ACROSS>(m.maximum + i) - low;
+      V low = constants<ACROSS>(m.minimum + i), width = constants<ACROSS>(m.width + i);
       V scaled = clamped<E>(2 * ((value - low) / width) - 1, 1);
       value = width > 0 ? scaled : value - value;  // 0; NaN stays NaN
     }
     z[i / step<ACROSS>()] = value;
+  }
+
+  // Adds the product of a scaled column with rows of a block.
+  template <Across ACROSS, int NUM> void add_column(V (&pull)[NUM], const E* block, int32_t j) {
+    V other = ACROSS == BINS ? z[j] : V{} + of<ACROSS>(z, j, 0);
+#pragma GCC unroll 4
+    for (int v = 0; v < NUM; ++v)
+      pull[v] += other * constants<ACROSS>(block + WHOLE * j + v * step<ACROSS>());
+  }
+
+  // Adds the terms of rows to the scores of a few bins, or to that of one in lane 0.
+  template <Across ACROSS> static void add(V& sums, V terms) {
+    if (ACROSS == BINS) sums += terms;
+    for (int k = 0; ACROSS == ONE_BIN && k < L; ++k) sums[0] += terms[k];
   }
 
   // The scores of a few bins, or that of one in lane 0.
@@ -246,17 +272,8 @@ template <class E> struct Scorer {
       for (int v = 0; v < num; ++v) pull[v] = constants<ACROSS>(m.linear + i + v * step<ACROSS>());
       const E* block = m.quadratic + i / WHOLE * WHOLE * num_quadratic + i % WHOLE;
       int32_t reach = i + rows < num_quadratic ? i + rows : num_quadratic;
-      for (int32_t j = 0; i < num_quadratic && j < reach; ++j) {
-        V other = ACROSS == BINS ? z[j] : V{} + of<ACROSS>(z, j, 0);
-#pragma GCC unroll 4
-        for (int v = 0; v < num; ++v)
-          pull[v] += other * constants<ACROSS>(block + WHOLE * j + v * step<ACROSS>());
-      }
-      for (int v = 0; v < num; ++v) {
-        V terms = pull[v] * z[i / step<ACROSS>() + v];
-        if (ACROSS == BINS) sums += terms;
-        for (int k = 0; ACROSS == ONE_BIN && k < L; ++k) sums[0] += terms[k];
-      }
+      for (int32_t j = 0; i < num_quadratic && j < reach; ++j) add_column<ACROSS>(pull, block, j);
+      for (int v = 0; v < num; ++v) add<ACROSS>(sums, pull[v] * z[i / step<ACROSS>() + v]);
     }
     if (m.signs) factors<ACROSS>(sums);
     return sums;
@@ -270,20 +287,12 @@ template <class E> struct Scorer {
     for (int32_t i = 0; i < m.num_factors; i += rows) {
       const E* block = m.quadratic + i / WHOLE * WHOLE * m.num_quadratic + i % WHOLE;
       V pull[PARTS][num] = {};
-      for (int32_t j = 0; j < m.num_quadratic; j += PARTS) {
+      for (int32_t j = 0; j < m.num_quadratic; j += PARTS)
 #pragma GCC unroll 4
-        for (int p = 0; p < PARTS; ++p) {
-          V other = ACROSS == BINS ? z[j + p] : V{} + of<ACROSS>(z, j + p, 0);
-#pragma GCC unroll 4
-          for (int v = 0; v < num; ++v)
-            pull[p][v] += other * constants<ACROSS>(block + WHOLE * (j + p) + v * step<ACROSS>());
-        }
-      }
+        for (int p = 0; p < PARTS; ++p) add_column<ACROSS>(pull[p], block, j + p);
       for (int v = 0; v < num; ++v) {
         V whole = (pull[0][v] + pull[1][v]) + (pull[2][v] + pull[3][v]);
-        V terms = whole * whole * constants<ACROSS>(m.signs + i + v * step<ACROSS>());
-        if (ACROSS == BINS) sums += terms;
-        for (int k = 0; ACROSS == ONE_BIN && k < L; ++k) sums[0] += terms[k];
+        add<ACROSS>(sums, whole * whole * constants<ACROSS>(m.signs + i + v * step<ACROSS>()));
       }
     }
   }

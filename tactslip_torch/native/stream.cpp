@@ -136,7 +136,8 @@ template <class E> struct Stream : tactslip {
 
   // -- Samples --------------------------------------------------------------------------------------
 
-  template <class X> size_t push(const X* rows, size_t n, bool are_counts) {
+  template <class X> size_t push(const X* rows, size_t n) {
+    constexpr bool are_counts = (X)0.5 == 0;
     const Model<E>& m = model;
     int64_t room = capacity - num_held;
     if (room < (int64_t)n) room += drop();
@@ -426,16 +427,16 @@ int tactslip_init(
 }
 
 size_t tactslip_push(tactslip* self, const float* samples, size_t n) {
-  return OF(self, push(samples, n, false));
+  return OF(self, push(samples, n));
 }
 size_t tactslip_push_double(tactslip* self, const double* samples, size_t n) {
-  return OF(self, push(samples, n, false));
+  return OF(self, push(samples, n));
 }
 size_t tactslip_push_int16(tactslip* self, const int16_t* counts, size_t n) {
-  return OF(self, push(counts, n, true));
+  return OF(self, push(counts, n));
 }
 size_t tactslip_push_int32(tactslip* self, const int32_t* counts, size_t n) {
-  return OF(self, push(counts, n, true));
+  return OF(self, push(counts, n));
 }
 int tactslip_next(tactslip* self, tactslip_decision* decision) { return OF(self, next(decision)); }
 void tactslip_set_threshold(tactslip* self, double value) { OF(self, set_threshold(value)); }

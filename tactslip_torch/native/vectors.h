@@ -93,7 +93,8 @@ template <> struct Limits<double> {
   static constexpr bool IS_SMALL_ODD = true;  // below counts as odd; or as silent
 };
 template <> struct Limits<float> {
-  static constexpr float NOISE = 0x1p-19f, TOLERANCE = 0x1p-22f, HALF = 0.5f + 0x1p-13f;
+  static constexpr float NOISE = 0x1p-19f;  // of samples less the first, beside that of double
+  static constexpr float TOLERANCE = 0x1p-22f, HALF = 0.5f + 0x1p-13f;
   static constexpr float LARGEST = LARGEST_FLOAT, SMALLEST = 0x1p-126f;
   static constexpr float SMALLEST_USUAL = 0x1p-50f, LARGEST_USUAL = 0x1p56f;
   static constexpr bool IS_SMALL_ODD = false;

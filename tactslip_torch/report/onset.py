@@ -304,7 +304,8 @@ def onsets_table(content: Mapping[str, Any]) -> str:
         cells |= {"true onset s": _seconds(row["true_onset_s"])}
         cells |= {"delay s": _seconds(row["delay_s"]), "outcome": row["outcome"]}
         shown.append(cells)
-    nothing = "no alarm, and no slip missed"
+    is_known = any(entry["truth"] for entry in content["recordings"])
+    nothing = "no alarm" + ", and no slip missed" * is_known
     lines = [style.table(shown, merged=1, kept=1) if rows else nothing]
     if len(rows) > _MOST_ROWS:
         lines.append(f"and {len(rows) - _MOST_ROWS} more, see onsets.csv")

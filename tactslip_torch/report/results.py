@@ -32,7 +32,7 @@ BASELINES = {
     "logistic_regression_simple": "logistic regression on simple statistics",
     "random_forest_simple": "random forest on simple statistics",
 }
-"""What baselines (``tactslip_torch.training.learner``) are called in tables."""
+"""What baselines (``tactslip_torch.training.baselines``) are called in tables."""
 _OF_SIMPLE = (
     "try recipe.views=[simple], longer bins (labels.bin_ms) and recordings of more objects; where "
     "it stays ahead, a classifier on simple statistics is the better one for this hand"

@@ -60,6 +60,13 @@ class FeatureSelection:
         """Number of scaled columns, S."""
         return len(self.scaler.minimum)
 
+    @property
+    def column_names(self) -> list[FeatureName]:
+        """What each scaled column is of, S names."""
+        names = self.names if self.pooling is None else self.pooling.names
+        assert self.scaler.columns is not None  # view_columns
+        return [names[column] for column in self.scaler.columns.tolist()]
+
     def __call__(self, features: Tensor, is_lost: Tensor | None = None) -> Tensor:
         """Scaled columns in float64, ``[N, F] -> [N, S]``, without lost channels ``[N, C]``."""
         if self.silence is not None:

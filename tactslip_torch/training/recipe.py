@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.data.recording import PAPER_SCENE
+from tactslip_torch.features.cost import MACHINES
 from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
 from tactslip_torch.features.pool import FeaturePool, is_rounding, is_simple_of
 from tactslip_torch.features.selection import (
@@ -320,6 +321,8 @@ class General(_Recipe):
             of its branches and spectra) and ``pooled`` (statistics of those over channels).
             Validation drops those that do no good.
         num_features: columns of each view, the best together; ``None`` takes all.
+        per_cost: ``m7`` or ``x86``: of columns with ``num_features`` those with the largest gain
+            for their cost there (``features.cost``); ``None``: by gain alone.
         threshold: part of the validated shift of the threshold that is applied, ``zero``, ``half``
             or ``full``.
         pooling: statistics over the channels of a kind, as ``features.pooling`` has them.
@@ -338,6 +341,7 @@ class General(_Recipe):
     penalties: float | Sequence[float] = (0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
     views: str | Sequence[str] = VIEWS
     num_features: int | None = None
+    per_cost: str | None = None
     threshold: str = "half"
     descriptors: Sequence[str] | None = (
         "mean",
@@ -367,6 +371,10 @@ class General(_Recipe):
         check_choice("recipe.threshold", self.threshold, tuple(THRESHOLDS))
         if self.num_features is not None:
             check_number("recipe.num_features", self.num_features, whole=True)
+        if self.per_cost is not None:
+            check_choice("recipe.per_cost", self.per_cost, MACHINES)
+            if self.num_features is None:
+                raise ValueError("recipe.per_cost chooses columns: give recipe.num_features too")
         for name in ("tolerance", "drop_channels"):
             if not 0 <= _numbers(f"recipe.{name}", getattr(self, name))[0] < 1:
                 raise ValueError(f"recipe.{name} must lie in [0, 1), got {getattr(self, name)!r}")
@@ -415,6 +423,7 @@ class General(_Recipe):
             self.threshold,
             self.num_features,
             self.pooling,
+            self.per_cost,
         )
 
     def fit(self, bins: Iterable[RecordingBins], pool: FeaturePool, *, show: bool = False) -> Fit:

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.cost import WorkCosts
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import forward_selection
 from tactslip_torch.features.sensing import SpanFeatures
@@ -106,6 +107,7 @@ class View:
         held_out: score of each bin, and of its second copy if it has one, by the machine without
             its group, for each penalty, ``[1 or 2, P, N, R]``; NaN where there is none.
         sums: of the columns of all training bins, for degree 1; ``None``: those in memory are all.
+        costs: of its columns, as ``forward_selection`` takes them.
     """
 
     name: str
@@ -114,6 +116,7 @@ class View:
     gain: Tensor
     held_out: Tensor
     sums: ClassSums | None = None
+    costs: tuple[Tensor, Tensor, float] | None = None
 
     @property
     def degree(self) -> int:
@@ -199,6 +202,7 @@ class ViewSettings:
         threshold: one of ``THRESHOLDS``.
         num_features: columns of each view, by forward selection; ``None``: all.
         pooling: statistics over channels.
+        per_cost: the machine of whose costs a column's gain is taken; ``None``: columns cost alike.
     """
 
     views: Sequence[str]
@@ -207,6 +211,7 @@ class ViewSettings:
     threshold: str
     num_features: int | None = None
     pooling: str | Sequence[str] | None = None
+    per_cost: str | None = None
 
 
 def base_views(
@@ -225,7 +230,11 @@ def base_views(
         args = allowed[name], bins.features, bins.weights, settings.pooling
         selection = view_columns(name, pool.hand, pool.names, spans, *args)
         center, gain = _standard(name, selection.in_parts(bins.features), bins.weights)
-        made.append(View(name, selection, center, gain, gain.new_zeros(0)))
+        view = View(name, selection, center, gain, gain.new_zeros(0))
+        if settings.per_cost is not None:
+            costs = WorkCosts.measured(pool, settings.per_cost).table(selection.column_names)
+            view = replace(view, costs=costs)
+        made.append(view)
     return made
 
 
@@ -349,6 +358,7 @@ class _Rows:
         u: ``[n, S]``.
         place: which bin each row is; labels, groups, weights: of it; all ``[n]``.
         num_bins: rows before the copies.
+        costs: of the columns.
     """
 
     name: str
@@ -358,6 +368,7 @@ class _Rows:
     groups: Tensor
     weights: Tensor
     num_bins: int
+    costs: tuple[Tensor, Tensor, float] | None
 
     @classmethod
     def of(cls, view: View, bins: ViewBins, z: Tensor, most: int = MOST_CHOICE_BINS) -> _Rows:
@@ -368,7 +379,7 @@ class _Rows:
             u = torch.cat([u, view.units(bins.features[places], bins.is_lost[places])])
             places, weights = places.repeat(2), weights.repeat(2) / 2
         labels, groups = bins.labels[places], bins.groups[places]
-        return cls(view.name, u, places, labels, groups, weights, num)
+        return cls(view.name, u, places, labels, groups, weights, num, view.costs)
 
     @property
     def kernel(self) -> Polynomial:
@@ -382,7 +393,8 @@ class _Rows:
         balanced = balanced_weights(labels, weights, num_classes)
         u = self.u[is_in]
         u = u / u.std(0).clamp(min=_NO_SPREAD)
-        return forward_selection(u, class_targets(num_classes)[labels], balanced, num)
+        targets = class_targets(num_classes)[labels]
+        return forward_selection(u, targets, balanced, num, costs=self.costs)
 
     def unit(self, columns: Sequence[int]) -> Tensor:
         """By what some of the columns are multiplied to be of unit size."""

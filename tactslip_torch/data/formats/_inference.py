@@ -319,8 +319,7 @@ def _row_with_words(lines: Iterable[Iterable[tuple[str, list[str]]]]) -> tuple[i
                 return place - 1, mark
         before = shapes
     raise Refused(
-        f"holds no row of numbers in its first {HEAD >> 20} MiB; "
-        "it must be a table of numbers, with a decimal point"
+        f"holds no row of numbers in its first {HEAD >> 20} MiB; it must be a table of numbers"
     )
 
 
