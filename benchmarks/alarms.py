@@ -502,7 +502,7 @@ def _quiet_row(
         if method == SLIPPING_NOW:
             of = {
                 "reflex grips": 3600 * GRIPS_PER_S * hours,
-                "arm": sum(one["strokes"] for one in own),
+                **dict.fromkeys(("arm", "lifted"), sum(one["strokes"] for one in own)),
             }
             row["of each"] = f"{100 * alarms / of[kind]:.2f} %" if kind in of else "-"
             row["hours"] = f"{hours:.2f}"

@@ -49,6 +49,7 @@ _LAG_S = 0.01  # of the actuator behind its delay: a first-order lag
 _MARGIN = 1.5  # of the force that the controller takes over the one that the object should need
 _TAP_S = 0.015  # half a sine
 _SLIDES_MM_S = 2.0  # of a pad, from when on it counts as sliding
+_AGAIN_S = 0.25  # from one tightening to the next; an alarm stands .2 s at least
 _PAUSE_S = 0.02  # of a slide, at which it still goes on
 _RECENT_S = 0.25  # behind a slide, in which a tightening is not false
 _FILMED_HOPS, _FILM_SIZE = 10, (230, 150)  # a frame each 50 ms; height and width
@@ -227,7 +228,7 @@ class Listening:
 
 @dataclass
 class Reflex:
-    """How much a grip is tightened: 1.5 times at a slip, 1.2 times each .15 s that it goes on.
+    """How much a grip is tightened: 1.5 times at a slip, 1.2 times each .25 s that it goes on.
 
     At what may be slip 1.15 times, at most each .3 s and up to 1.3 times in all; at a slip up to 3
     times.
@@ -245,7 +246,7 @@ class Reflex:
             return False
         if level == 2:
             self._last_s = time_s
-        self._next_s[level] = time_s + (0.3 if level == 1 else 0.15)
+        self._next_s[level] = time_s + (0.3 if level == 1 else _AGAIN_S)
         self.factor = min(step * self.factor, most)
         return True
 

@@ -91,9 +91,11 @@ def test_an_alarm_tightens_the_grip():
 def test_a_reflex_tightens_once_for_a_slip_and_again_while_it_goes_on():
     reflex = Reflex()
     made = [(t, reflex.factor) for t in np.arange(1.0, 1.4, 0.005) if reflex.tightens(t, 2)]
-    assert [time_s for time_s, _ in made] == pytest.approx([1.0, 1.15, 1.3], abs=0.011)
-    assert [factor for _, factor in made] == pytest.approx([1.5, 1.8, 2.16])
+    assert [time_s for time_s, _ in made] == pytest.approx([1.0, 1.25], abs=0.011)
+    assert [factor for _, factor in made] == pytest.approx([1.5, 1.8])
     assert reflex.tightens(2.0, 2)  # another slip, up to the most
+    assert reflex.factor == pytest.approx(2.7)
+    assert reflex.tightens(2.25, 2)
     assert reflex.factor == 3.0
     assert not reflex.tightens(3.0, 2)
 

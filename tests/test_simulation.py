@@ -222,6 +222,7 @@ RELAXED = {"relaxation": (1.0, 1.0), "relaxation_time_s": (0.2, 0.2)}
 SOFT = Contact(presliding_mm=(0.3, 0.3), touching=("PVDF7", "PVDF9"), **RELAXED)
 LOOSE = Contact(touching=("SG1",), finger_loads=(("little", 0.0),))
 HEAVY, TAPPED, GRIPPED = Handling(carried_kg=50.0), Handling(taps_per_s=1), Handling(grips_per_s=1)
+LIFTED = Handling(carried_kg=1.0, weight_share=0.94)
 AT_ONCE = (Stroke(40.0, 20.0, 0.5), Stroke(40.0, 20.0, 0.0, "both"))
 
 
@@ -279,6 +280,7 @@ REFUSED = [
     (Dynamics, {"num_bristles": 1.5}, r"num_bristles must be a whole number of 1 or more"),
     (surface, {"mu_s": -1, "mu_ratio": (0.8, 0.9)}, r"x: expected mu_s > 0 .* -1 and \(0\.8, 0\.9"),
     (truth, {"strokes": CARRY, "handling": HEAVY}, r"50 kg at 0\.5 m/s2 takes 25 N, more than"),
+    (truth, {"strokes": CARRY, "handling": LIFTED}, r"weight 0\.94 of .*, together more"),
     (truth, {"strokes": AT_ONCE}, r"stroke 2, and up to 1 may be left of the slide before: pause"),
     (truth, {"strokes": (Stroke(40.0, 20.0, 0.2),), "handling": TAPPED}, r"rest long .* 0\.1 s to"),
     (truth, {"strokes": (Stroke(40.0, 20.0, 1.1),), "handling": GRIPPED}, "grips of up to 1 s"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.simulation import Handling, Scene, Sensors, simulate, timeline
+from tactslip_torch.simulation import Handling, Scene, Sensors, Stroke, simulate, timeline
 from tactslip_torch.simulation._contact import draw_grasp
 from tactslip_torch.simulation._sensors import Handled
 from tactslip_torch.simulation.worlds import CONFOUNDERS, SLIP, WorldRecordings
@@ -29,7 +29,7 @@ def test_every_recording_has_its_kind_material_and_mounting():
     for recording in worlds.ids:
         times = worlds.timeline(recording)
         assert len(times.onsets_s) == (3 if recording.scene == SLIP else 0)
-        assert bool(times.arm_s) or recording.scene != "arm"
+        assert bool(times.arm_s) or recording.scene not in ("arm", "lifted")
 
 
 def test_a_seed_draws_the_same_whatever_else_is_drawn():
@@ -79,6 +79,20 @@ def test_worlds_cover_what_was_asked_for():
 def test_what_cannot_be_drawn_is_refused(changes, match):
     with pytest.raises(ValueError, match=match):
         WorldRecordings(**changes)
+
+
+def test_a_weight_comes_when_an_object_is_lifted_and_goes_when_it_is_put_down():
+    strokes = (Stroke(40.0, 20.0, 0.5, "both"), Stroke(40.0, 20.0, 0.8, "both"))
+    handling = Handling(carried_kg=0.0, weight_share=0.6, lift_s=0.1)
+    scene = Scene("M2", strokes=strokes, handling=handling, tail_s=0.5)
+    grasp = draw_grasp(scene)
+    handled = Handled(scene, grasp)
+    lifted_s, down_s = (stroke.start_s for stroke in scene.arm)
+    at = np.array([lifted_s, lifted_s + 0.05, lifted_s + 0.1, down_s, down_s + 0.1])
+    found = sum(handled.shear_n(element, at) for element in grasp.touching)
+    wanted = 0.6 * grasp.friction_n.sum() * np.array([0, 0.5, 1, 1, 0])
+    assert found == pytest.approx(wanted, abs=1e-9)
+    assert not timeline(scene).onsets_s
 
 
 def loosened(**changes):

@@ -637,7 +637,8 @@ _MARGIN_S = 0.1  # between a tap or grip, with its settling, and a stroke that s
 _SETTLE_S = 0.1  # how long a fast channel still shows a tap or grip that is over (ours)
 _EVENT_SPREAD = 0.3  # how unevenly elements take part in a tap or grip (ours)
 _RINGING_S = 0.3  # how long the arm's ringing counts as handling after a stroke (ours)
-_MOST_CARRIED = 0.5  # of static friction, what a carried object may take
+_MOST_CARRIED = 0.5  # of static friction, what a carried object's inertia may take
+_MOST_LIFTED = 0.95  # of static friction, what inertia and weight may take (ours)
 _MOST_LOOSENED = 0.8  # of the load beyond what the shear needs, by which a grip may loosen (ours)
 _KNOCK_V_PER_N = (
     0.05  # first swing of a knock's modes at a fast channel, per newton of the peak (ours)
@@ -696,7 +697,7 @@ class Handled:
     def __init__(self, scene: Scene, grasp: Grasp) -> None:
         self._scene, self._grasp, of = scene, grasp, scene.handling
         self._load_n = grasp.load_n
-        has_mass = of.carried_kg > 0
+        has_mass = of.carried_kg > 0 or of.weight_share > 0
         self.carried = [stroke for stroke in scene.arm if has_mass and not stroke.slides]
         if self.carried:
             _require_carriable(scene, grasp)
@@ -741,7 +742,8 @@ class Handled:
         events = self._events("loosenings", of.loosenings_per_s, of.loosening_share, of.grip_s)
         held = [self._grasp.shear_after * (event.start_s > first_s) for event in events]
         if self.carried:
-            held = [max(share, _MOST_CARRIED) for share in held]
+            most = _MOST_LIFTED if of.weight_share else _MOST_CARRIED
+            held = [max(share, most) for share in held]
         return [
             event._replace(size=-np.minimum(event.size, _MOST_LOOSENED * (1.0 - share)))
             for event, share in zip(events, held, strict=True)
@@ -775,16 +777,19 @@ class Handled:
         return tuple(union)
 
     def shear_n(self, element: int, time_s: Array) -> Array:
-        """Newtons of the carried object's inertia on an element; signed like a slide's friction."""
-        total = np.zeros(time_s.shape)
-        for stroke in self.carried:
+        """Newtons of a carried object on an element; signed like a slide's friction."""
+        total, weight, of = np.zeros(time_s.shape), np.zeros(time_s.shape), self._scene.handling
+        for number, stroke in enumerate(self.carried):
             stop_s = stroke.stop_s - stroke.start_s
             corners_s = (0.0, stroke.ramp_s, stop_s - stroke.ramp_s, stop_s)
             since = time_s - stroke.start_s
             up, even, down, rest = (smooth_step((since - at) / _JERK_S) for at in corners_s)
             total += 1e-3 * stroke.acceleration_mm_s2 * (up - even - down + rest)
+            if of.weight_share:
+                weight += (-1.0) ** number * smooth_step(since / of.lift_s)
         fraction = float((self._load_n / self._load_n.sum())[element])
-        return self._scene.handling.carried_kg * fraction * total
+        weight_n = of.weight_share * float(self._grasp.friction_n.sum()) * weight
+        return fraction * (of.carried_kg * total + weight_n)
 
     def press_n(self, element: int, before_n: Array, grid: Grid) -> Array:
         """Newtons that taps and grips add to an element's load.
@@ -836,6 +841,12 @@ def _require_carriable(scene: Scene, grasp: Grasp) -> None:
         raise ValueError(
             f"{what} {force_n:.3g} N, more than half of the {friction_n:.3g} N of static friction: "
             "lower carried_kg or acceleration_m_s2, or raise load_n"
+        )
+    if force_n > (_MOST_LIFTED - scene.handling.weight_share) * friction_n:
+        raise ValueError(
+            f"{what} {force_n:.3g} N and its weight {scene.handling.weight_share:g} of the "
+            f"{friction_n:.3g} N of static friction, together more than {_MOST_LIFTED:g}: lower "
+            "weight_share or carried_kg"
         )
     fraction = force_n / friction_n
     for number, stroke in enumerate(scene.arm, 1):

@@ -304,6 +304,10 @@ class Handling(_Parameters):
     Args:
         carried_kg: mass of the object that moves with the hand (strokes that move ``"both"``);
             its inertia loads the contact with shear, shared among elements by normal load.
+        weight_share: of static friction, what the object's weight takes while it is in the air: the
+            first stroke that moves ``"both"`` lifts it off a surface, the next one puts it down,
+            and so on. 0: it is never put down, and its weight is no change.
+        lift_s: how long the weight takes to come and to go, from the begin of the stroke.
         taps_per_s: knocks of the object on the hand a second, at rest and in strokes that move
             ``"both"``, never while the contact slides.
         tap_n: range of a tap's peak force on an element of relative load 1; log-uniform.
@@ -321,6 +325,8 @@ class Handling(_Parameters):
     """
 
     carried_kg: float = 0.2
+    weight_share: float = 0.0
+    lift_s: float = 0.05
     taps_per_s: float = 0.0
     tap_n: tuple[float, float] = (0.2, 2.0)
     tap_ms: tuple[float, float] = (5.0, 40.0)
@@ -333,6 +339,8 @@ class Handling(_Parameters):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require("loosening_share", self.loosening_share[1] < 1, "below 1")
+        self._require("weight_share", self.weight_share < 1, "below 1")
+        self._require("lift_s", self.lift_s > 0, "positive")
 
 
 @dataclass(frozen=True)

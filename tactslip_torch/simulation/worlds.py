@@ -51,7 +51,7 @@ def _between(rng: Rng, low: float, high: float) -> float:
 
 
 def _strokes_that_carry(rng: Rng, duration_s: float) -> list[dict[str, Any]]:
-    """Of an arm that starts, carries and stops, for about so long."""
+    """Of an arm that starts, carries or lifts, and stops, for about so long."""
     strokes, now_s = list[dict[str, Any]](), 0.0
     while now_s < duration_s:
         speed, distance = _between(rng, 10, 100), float(rng.uniform(10, 50))
@@ -92,6 +92,11 @@ CONFOUNDERS: Mapping[str, Callable[[Rng], dict[str, Any]]] = {
         "tap_n": (0.2, 4.0),
     },
     "arm": lambda rng: {"carried_kg": _between(rng, 0.05, 1.0)},
+    "lifted": lambda rng: {
+        "carried_kg": _between(rng, 0.05, 0.5),
+        "weight_share": float(rng.uniform(0.1, 0.85)),
+        "lift_s": _between(rng, 0.01, 0.2),
+    },
     "creeping_finger": lambda rng: {"partial_slips_per_s": float(rng.uniform(0.1, 0.5))},
 }
 """Kinds of recordings without slip of the hand, and what is drawn of each beside the ranges."""
@@ -233,7 +238,7 @@ class WorldRecordings(SimulatedRecordings):
 
     def _without(self, rng: Rng, kind: str) -> dict[str, Any]:
         values = {"strokes": [], "tail_s": self._tail_s} | CONFOUNDERS[kind](rng)
-        if kind == "arm":
+        if kind in ("arm", "lifted"):
             values |= {"strokes": _strokes_that_carry(rng, self._tail_s), "tail_s": 0.5}
             values["acceleration_m_s2"] = _between(rng, 0.2, 3)
         return values
