@@ -196,7 +196,8 @@ class Benchmark(ABC):
             for left in Path(numbers.get("folder", path / "none")).glob(pattern):
                 with whole_file(path.with_stem(f"{path.stem}{ending}")) as temporary:
                     shutil.copy(left, temporary)
-        simulated = ", simulated" if report["simulated"] else ""
+        says_so = "simulated" in self.title.lower()
+        simulated = ", simulated" if report["simulated"] and not says_so else ""
         quick = "; QUICK, means nothing" if report["quick"] else ""
         titles = self.tables(numbers)
         for ending, panels in self.charts.items():

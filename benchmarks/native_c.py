@@ -12,7 +12,7 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -43,15 +43,16 @@ from tactslip_torch.pretrained import NAME
 
 HOST = ROOT / "export" / "native"
 SOURCES = ("export/native/*", "export/native/board/*", "export/c/*.c", "export/c/*.h")
-TOOLS = ("make", "arm-none-eabi-g++", "qemu-system-arm", "aarch64-linux-gnu-g++", "qemu-aarch64")
+BOARD_TOOLS = ("make", "arm-none-eabi-g++", "qemu-system-arm")
+TOOLS = (*BOARD_TOOLS, "aarch64-linux-gnu-g++", "qemu-aarch64")
 BOARDS = {"m7": "Cortex-M7 (mps2-an500)", "m4": "Cortex-M4F (mps2-an386)"}
 MARGIN_SD: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-3}  # as deploy/check.py allows
 _FULL_SCALE = 32000  # counts of the largest sample
 
 
-def missing_tools() -> list[str]:
-    """Of those that the boards and the other machine need."""
-    return [name for name in TOOLS if shutil.which(name) is None]
+def missing_tools(wanted: Sequence[str] = TOOLS) -> list[str]:
+    """Of those that the boards and, by default, the other machine need."""
+    return [name for name in wanted if shutil.which(name) is None]
 
 
 def make(folder: Path, target: str, *words: str, where: Path = HOST) -> str:

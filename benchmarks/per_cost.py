@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 from benchmarks.costs import RUNS, decision_cost
 from benchmarks.harness import Benchmark, Job
-from benchmarks.native_c import missing_tools
+from benchmarks.native_c import BOARD_TOOLS, missing_tools
 from benchmarks.subjects import loaded
 from benchmarks.tables import Report, Table, by, mean_sd
 from benchmarks.trainings import trained
@@ -28,37 +28,46 @@ WAYS = {
 
 @dataclass(frozen=True)
 class PerCost(Benchmark):
-    """Detectors of few columns, chosen in three ways.
+    """Detectors of few columns, chosen in several ways.
 
     Args:
         seeds: of simulated sets.
-        columns: of each view.
+        columns: of the view ``pooled``, the only one.
         ways: values of ``recipe.per_cost``.
     """
 
     title = "Columns by gain for their cost"
     about = (
-        "`+exp=unseen4` with `recipe.num_features` and `recipe.per_cost`; a decision in float32 on "
+        "`+exp=unseen4` with pooled columns, by `recipe.per_cost`; a decision in float32 on "
         "a Cortex-M7 that QEMU emulates, and in float64 on this machine, on one thread; computed: "
         "from the table of costs"
     )
     page = "docs/speed.md"
-    quick = "seeds=[0] ways=['null'] overrides=[data.cycles=2,recipe.sample_bins=20,num_workers=0]"
+    quick = (
+        "seeds=[0] columns=[4] ways=['null'] "
+        "overrides=[data.cycles=2,recipe.sample_bins=20,num_workers=0]"
+    )
     charts: ClassVar = {"": (("Means", "M7"),)}
     seeds: tuple[int, ...] = (0, 1)
-    columns: tuple[int, ...] = (20,)
-    ways: tuple[str, ...] = ("null", "m7", "x86")
+    columns: tuple[int, ...] = (20, 120)
+    ways: tuple[str, ...] = ("null", "m7")
     overrides: tuple[str, ...] = ()
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Each number of columns, way and seed."""
-        if missing := missing_tools():
+        if missing := missing_tools(BOARD_TOOLS):
             raise ValueError(f"not installed: {', '.join(missing)}; run .ci/boards")
         rows, detectors = list[dict[str, Any]](), []
         for num, way, seed in product(self.columns, self.ways, self.seeds):
             folder = job.folder / f"{num}-{way}-{seed}"
             words = [f"recipe.num_features={num}", f"recipe.per_cost={way}", f"seed={seed}"]
-            words += ["+exp=unseen4", "baselines=false", *self.overrides, *job.overrides]
+            words += [
+                "+exp=unseen4",
+                "baselines=false",
+                "recipe.views=[pooled]",
+                *self.overrides,
+                *job.overrides,
+            ]
             metrics = trained(words, folder, job.folder / "cache")
             detectors.append(loaded(folder / "detector.pt"))
             found = {"num": num, "way": way, "seed": seed}
@@ -77,7 +86,7 @@ class PerCost(Benchmark):
             of = {key: [row[key] for row in own] for key in own[0]}
             shown.append(
                 {
-                    "columns by": f"{WAYS[way]}, {num} a view",
+                    "columns by": f"{WAYS[way]}, {num} columns",
                     "test %": mean_sd(of["test"]),
                     "held-out materials %": mean_sd(of["unseen"]),
                     "M7, M instructions": f"{mean(of['m7']) / 1e6:.2f}",

@@ -143,6 +143,8 @@ def _markdown(path: str) -> str:
             if "image/png" in data:
                 parts.append(f"![Output](data:image/png;base64,{data['image/png'].strip()})")
             elif told := "".join(data["text/plain"]).rstrip():
-                parts.append(f"```text\n{told}\n```")
-    parts.insert(1, parts.pop(0))  # below the title
-    return "\n\n".join(parts)
+                follows = parts[-1].startswith("```text")
+                above = parts.pop().removesuffix("```") if follows else "```text\n"
+                parts.append(f"{above}{told}\n```")
+    title, _, rest = parts[1].partition("\n")
+    return "\n\n".join([title, parts[0], rest.strip(), *parts[2:]])

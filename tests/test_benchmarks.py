@@ -11,7 +11,7 @@ import torch
 from test_real_sets import write_osu
 
 from benchmarks.harness import Benchmark, between_markers
-from benchmarks.native_c import missing_tools
+from benchmarks.native_c import BOARD_TOOLS, TOOLS, missing_tools
 from benchmarks.paper_tables import RIDGE, forward_order
 from benchmarks.real_sets import RealSet
 from benchmarks.tables import Table
@@ -44,7 +44,8 @@ def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path, monkeypa
     monkeypatch.chdir(ROOT)
     if name == "closed_loop":
         pytest.importorskip("mujoco")
-    if name == "native_c" and (missing := missing_tools()):
+    needed = {"native_c": TOOLS, "per_cost": BOARD_TOOLS}.get(name, ())
+    if missing := missing_tools(needed):
         pytest.skip(f"not installed: {', '.join(missing)}; run .ci/boards")
     arguments = ["--quick", "--out", str(tmp_path)]
     if name == "real":

@@ -114,6 +114,7 @@ export class Scope {
     this.#drawTraces(context);
     this.#drawAxis(context, startS);
     this.#drawMarks(context, startS, endS);
+    this.#drawTitles(context);
     context.restore();
   }
 
@@ -228,10 +229,7 @@ export class Scope {
 
   #drawLanes(context) {
     const { facts, colours, panels, scales, size, used } = this;
-    for (const { members, name, top, lane } of panels.groups) {
-      const numUsed = members.filter((channel) => used[channel]).length;
-      const counts = `${numUsed} of ${members.length} in use`;
-      write(context, TITLE, colours.ink, "left", `${name}: ${counts}`, size.left, top - 9);
+    for (const { members, top, lane } of panels.groups) {
       write(context, FONT, colours.muted, "right", "lane height", size.width - 2, top - 9);
       members.forEach((channel, i) => {
         const y = panels.centre[channel];
@@ -333,6 +331,21 @@ export class Scope {
       if (alarmS > endS) continue;
       mark(history.get("onset_s", history.alarms[k]), colours.alarm, [2, 3], 14);
       mark(alarmS, colours.alarm, [], 10);
+    }
+  }
+
+  /** Names of kinds, outlined, so that marks that cross them leave them legible. */
+  #drawTitles(context) {
+    const { colours, panels, size, used } = this;
+    for (const { members, name, top } of panels.groups) {
+      const numUsed = members.filter((channel) => used[channel]).length;
+      const text = `${name}: ${numUsed} of ${members.length} in use`;
+      context.strokeStyle = colours.panel;
+      context.lineWidth = 4;
+      context.font = TITLE;
+      context.textAlign = "left";
+      context.strokeText(text, size.left, top - 9);
+      write(context, TITLE, colours.ink, "left", text, size.left, top - 9);
     }
   }
 }
