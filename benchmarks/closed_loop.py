@@ -58,27 +58,34 @@ class ClosedLoop(Benchmark):
         delays_ms: of the actuator.
         calibration: lifts of lighter objects of seen materials, which do not slip, with a grip
             raised by nobody's alarm, in which neither energy nor CUSUM may reach its threshold.
-        detector: shipped one or file, trained on ``SEEN_MATERIALS``.
+        detector: shipped one or file, trained on ``SEEN_MATERIALS``; empty: the one whose alarm
+            ``python -m benchmarks.alarms`` has set with its first seed.
     """
 
     title = "A grip that an alarm tightens"
     about = "lifts in MuJoCo, in a closed loop: dropped, slid, and how much force it took"
     page, markers, has_headings = "docs/onset.md", "closed_loop", False
-    quick = "lifts=2 delays_ms=[10] calibration=1"
+    quick = "lifts=2 delays_ms=[10] calibration=1 detector=paper24-sim"
     libraries = ("mujoco",)
     charts: ClassVar = {"": []}
     lifts: int = 240
     delays_ms: tuple[int, ...] = (10, 40)
     calibration: int = 20
-    detector: str = "paper24-sim"
+    detector: str = ""
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Rows of all lifts together, and of each kind at the first delay."""
         torch.set_num_threads(1)  # an actor hears one hop at a time
-        is_file = Path(self.detector).suffix == ".pt"
+        path = self.detector or str(job.folder.parent / "alarms" / "seed-0" / "detector.pt")
+        if not self.detector and not Path(path).exists():
+            raise SystemExit(
+                f"there is no {path}: run python -m benchmarks.alarms first, or give "
+                "sizes.detector=paper24-sim"
+            )
+        is_file = Path(path).suffix == ".pt"
         load = SlipDetector.load if is_file else SlipDetector.pretrained
-        detector = load(self.detector)
-        key = [self.detector, repr(AlarmSettings.of(detector))]
+        detector = load(path)
+        key = [path, repr(AlarmSettings.of(detector))]
         set_by = resumed(
             job.folder / "thresholds.json",
             [*key, f"{self.calibration}"],
