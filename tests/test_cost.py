@@ -2,7 +2,6 @@
 
 import ctypes
 from collections import defaultdict
-from dataclasses import replace
 
 import pytest
 import torch
@@ -145,4 +144,3 @@ def test_a_machine_that_is_none_or_no_number_of_columns_is_refused():
         General(per_cost="m33", num_features=5)
     with pytest.raises(ValueError, match=r"give recipe\.num_features"):
         General(per_cost="m7")
-    assert replace(General(num_features=5), per_cost="x86").settings().per_cost == "x86"

@@ -513,7 +513,7 @@ def _hand_settings(command: str, folder: Path, rest: Sequence[str]) -> dict[str,
         if "data" in info:
             data = {**info["data"], "reading": info.get("reading", {})}
             if "pattern" not in data and not (folder / _MANIFEST).is_file():
-                data["pattern"] = _pattern(folder)
+                data["pattern"] = "auto"
             return {"data": data, "labels": info.get("labels", {})}
     if (folder / _MANIFEST).is_file():
         return {}
@@ -521,15 +521,6 @@ def _hand_settings(command: str, folder: Path, rest: Sequence[str]) -> dict[str,
         f"{folder} has neither {HAND_FILE} nor {_MANIFEST}, so it is not known how it is read; "
         f"tactslip setup {shlex.quote(str(folder))} looks at it and writes {HAND_FILE}"
     )
-
-
-def _pattern(folder: Path) -> str:
-    """How the names of a folder's recordings are read, where nothing says it."""
-    from tactslip_torch.data.file_names import name_pattern  # of no need for --help
-    from tactslip_torch.data.folder import recording_files
-
-    paths = recording_files(folder, in_folders=True)
-    return name_pattern([path.relative_to(folder).as_posix() for path in paths]).pattern
 
 
 def _read_hand(path: Path) -> dict[str, Any]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+from tactslip_torch.data.file_names import name_pattern
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.folder import guessed, recording_files
 from tactslip_torch.data.labels import label_of
@@ -53,7 +55,7 @@ def named_recordings(
         root: the folder.
         pattern: of a file's name, or of the end of its path, as ``folder.guessed`` reads it; it
             names ``{material}``, and may name ``{trial}``, ``{scene}``, ``{session}`` and
-            ``{label}``.
+            ``{label}``; ``"auto"``: what ``tactslip setup`` would propose.
         labels: ``slip`` or ``non-slip`` for each text of ``{label}``, or of ``{scene}`` if
             the pattern has no label; ``None``: the text is one of the two, or nothing is known.
         rename: materials that names spell otherwise, in capitals or not.
@@ -138,6 +140,9 @@ def _listed(
 
     Arguments and errors as of ``named_recordings``.
     """
+    files = {p.relative_to(root).as_posix(): p for p in recording_files(root, in_folders=True)}
+    if pattern == "auto":
+        pattern = name_pattern(list(files)).pattern
     if "{material" not in pattern:
         raise ValueError(f"data.pattern must name {{material}}, got {pattern!r}")
     if wrong := [word for word in (labels or {}).values() if label_of(word) is None]:
@@ -146,8 +151,7 @@ def _listed(
     entries: list[Entry] = []
     problems: list[Problem] = []
     counts: Counter[tuple[str, str, str]] = Counter()
-    for path in sorted(recording_files(root, in_folders=True)):
-        file = path.relative_to(root).as_posix()
+    for file, path in sorted(files.items(), key=itemgetter(1)):
         found = guessed(file, pattern)
         if not found:
             continue

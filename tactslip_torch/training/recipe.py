@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.data.recording import PAPER_SCENE
-from tactslip_torch.features.cost import MACHINES
+from tactslip_torch.features.cost import MACHINES, WorkCosts
 from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
 from tactslip_torch.features.pool import FeaturePool, is_rounding, is_simple_of
 from tactslip_torch.features.selection import (
@@ -423,8 +423,12 @@ class General(_Recipe):
             self.threshold,
             self.num_features,
             self.pooling,
-            self.per_cost,
         )
+
+    def _base_views(self, bins: ViewBins, pool: FeaturePool) -> list[View]:
+        """Views with all of their columns and, where cost counts, what each column costs."""
+        costs = None if self.per_cost is None else WorkCosts.measured(pool, self.per_cost).table
+        return base_views(bins, pool, self.allowed_by_view(pool), self.settings(), costs)
 
     def fit(self, bins: Iterable[RecordingBins], pool: FeaturePool, *, show: bool = False) -> Fit:
         """As ``_Recipe`` has it."""
@@ -435,9 +439,7 @@ class General(_Recipe):
         sample = _merged(found).bins()
         weights = self.weights(sample)
         drawn, group_of = self._drawn(sample, weights, pool)
-        views: list[View] = from_first_process(
-            lambda: base_views(drawn, pool, self.allowed_by_view(pool), self.settings())
-        )
+        views: list[View] = from_first_process(lambda: self._base_views(drawn, pool))
         sums = {view.name: sums_by_group(view, drawn) for view in views if view.degree == 1}
         with one_thread():
             for some in bins:
@@ -485,7 +487,7 @@ class General(_Recipe):
         score; features and factorisations are shared by all machines.
         """
         settings = self.settings()
-        views = base_views(bins, pool, self.allowed_by_view(pool), settings)
+        views = self._base_views(bins, pool)
         choice = choose_views(bins, views, settings)
         selection, heads = merged(choice, choice.parts(bins))
         assert selection.fill is not None  # of views

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.cost import WorkCosts
+from tactslip_torch.features.descriptors import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import forward_selection
 from tactslip_torch.features.sensing import SpanFeatures
@@ -191,6 +191,9 @@ class Choice:
         return replace(self, views=tuple(replace(v, held_out=none, sums=None) for v in self.views))
 
 
+Costs = Callable[[Sequence[FeatureName]], tuple[Tensor, Tensor, float]]
+
+
 @dataclass(frozen=True)
 class ViewSettings:
     """How views are chosen; as ``recipe.General`` has them.
@@ -202,7 +205,6 @@ class ViewSettings:
         threshold: one of ``THRESHOLDS``.
         num_features: columns of each view, by forward selection; ``None``: all.
         pooling: statistics over channels.
-        per_cost: the machine of whose costs a column's gain is taken; ``None``: columns cost alike.
     """
 
     views: Sequence[str]
@@ -211,11 +213,14 @@ class ViewSettings:
     threshold: str
     num_features: int | None = None
     pooling: str | Sequence[str] | None = None
-    per_cost: str | None = None
 
 
 def base_views(
-    bins: ViewBins, pool: FeaturePool, allowed: Mapping[str, Tensor], settings: ViewSettings
+    bins: ViewBins,
+    pool: FeaturePool,
+    allowed: Mapping[str, Tensor],
+    settings: ViewSettings,
+    costs: Costs | None = None,
 ) -> list[View]:
     """Views with all of their columns, standardised, before anything is chosen.
 
@@ -224,6 +229,8 @@ def base_views(
         pool: of their features.
         allowed: which features each view may use, ``[F]``, bool.
         settings: which views.
+        costs: of columns by their names, as ``forward_selection`` takes them; ``None``: columns
+            cost alike.
     """
     made, spans = list[View](), SpanFeatures(pool.hand, pool.names, pool.bin_samples)
     for name in settings.views:
@@ -231,9 +238,8 @@ def base_views(
         selection = view_columns(name, pool.hand, pool.names, spans, *args)
         center, gain = _standard(name, selection.in_parts(bins.features), bins.weights)
         view = View(name, selection, center, gain, gain.new_zeros(0))
-        if settings.per_cost is not None:
-            costs = WorkCosts.measured(pool, settings.per_cost).table(selection.column_names)
-            view = replace(view, costs=costs)
+        if costs is not None:
+            view = replace(view, costs=costs(selection.column_names))
         made.append(view)
     return made
 
