@@ -139,14 +139,6 @@ def on_x86(detectors: Sequence[SlipDetector]) -> list[float]:
 RUNS: dict[str, Callable[[Sequence[SlipDetector]], list[float]]] = {"m7": on_m7, "x86": on_x86}
 
 
-def decision_cost(detector: SlipDetector, machine: str) -> float:
-    """Of a detector by the table of costs."""
-    costs, head = WorkCosts.measured(detector.pool, machine), detector.head
-    num = len(detector.scaler.minimum)
-    whole = costs.decision(detector.selected_names, num, head.cost.multiply_adds)
-    return costs.cost([whole])
-
-
 def main(machines: Sequence[str]) -> None:
     """Measure some machines, and keep what is known of others."""
     base = SlipDetector.pretrained()

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from tactslip_torch.features.cost import WorkCosts
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.report import style
 from tactslip_torch.runtime import one_thread
@@ -75,6 +76,13 @@ def time_in_fresh_process(path: str | os.PathLike[str], calls: int) -> Timing:
 
 def _time_saved(path: str | os.PathLike[str], calls: int) -> Timing:
     return _time_detector(SlipDetector.load(path), calls)
+
+
+def decision_cost(detector: SlipDetector, machine: str) -> float:
+    """What a decision costs on one of ``features.cost.MACHINES``, computed by its table."""
+    costs, num_scaled = WorkCosts.measured(detector.pool, machine), len(detector.scaler.minimum)
+    products = detector.head.cost.multiply_adds
+    return costs.cost([costs.decision(detector.selected_names, num_scaled, products)])
 
 
 @dataclass(frozen=True)

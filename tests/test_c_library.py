@@ -190,7 +190,7 @@ def test_c_and_graph_decide_alike(detector, native):
         assert_same(native.push(samples), {name: wanted[name] for name in names}, 1e-9)
 
 
-OUT_OF_FLOAT32 = ("huge",)  # docs/deploy.md says so
+OUT_OF_FLOAT32 = ("huge",)  # export/native/README.md says so
 
 
 def test_in_float32_scores_are_near_and_decisions_alike():
@@ -370,6 +370,15 @@ def test_where_float32_is_off_the_default_is_float64_and_says_why(typed, tmp_pat
     assert status == 2
     assert err.strip().endswith("give precision=float64 or auto")
     assert not (tmp_path / FILE).exists()
+
+
+@pytest.mark.parametrize("graph", ["native", "stream"])
+def test_another_precision_is_refused_with_all_that_there_are(graph, typed, tmp_path):
+    model = tmp_path / "detector.pt"
+    alarming_detector().save(model)
+    status, _, err = typed(export, f"graph={graph}", "precision=double", f"model={model}")
+    assert status == 2
+    assert "precision must be one of auto, float32, float64, got 'double'" in err
 
 
 def test_without_an_alarm_there_is_no_file():

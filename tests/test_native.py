@@ -154,6 +154,40 @@ def test_columns_of_a_narrow_range_keep_their_digits_in_float32(
     np.testing.assert_allclose(machine.columns(values), expected.astype(np.float64), 0, 1e-5)
 
 
+@needs_engine
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("num", [1, 20])
+def test_wide_columns_are_scaled_as_well_and_alike_beside_a_narrow_one(
+    level, num, rng, monkeypatch
+):
+    """Of values far below and far above the scale of their compression, in float32."""
+    monkeypatch.setenv(native.SWITCH, level)
+    size, scales = 10 ** rng.uniform(-25, 25, 33), np.ones(33)
+    values = np.float32(size * rng.uniform(-1, 1, (num, 33)))
+
+    def machine(low, high):
+        return native.Machine(
+            num_channels=1,
+            num_inputs=33,
+            num_columns=33,
+            singles=[(i, i) for i in range(33)],
+            scaling=(low, high, scales, None),
+            dtype=np.float32,
+        )
+
+    high, x = np.log1p(size), values.astype(np.float64)
+    alone = machine(-high, high)
+    assert alone.of.centre is None  # which would be paid for by every column
+    found = alone.columns(values)
+    expected = np.sign(x) * np.log1p(np.abs(x)) / high
+    np.testing.assert_allclose(found, expected, 0, 1e-6)
+    low, high[-1] = -high, 10.001
+    low[-1] = 9.999
+    beside = machine(low, high)
+    assert beside.of.centre
+    np.testing.assert_array_equal(beside.columns(values)[:, :-1], found[:, :-1])
+
+
 @pytest.mark.parametrize("num", [1, 20])
 @pytest.mark.parametrize(
     ("wanted", "read"),

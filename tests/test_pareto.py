@@ -11,12 +11,12 @@ from contract.recordings import of_set, split_of_set
 from tactslip_torch import SlipDetector
 from tactslip_torch.commands.configuration import compose_config
 from tactslip_torch.commands.pareto import pareto
-from tactslip_torch.features.cost import WorkCosts
 from tactslip_torch.pareto import (
     Candidate,
     Timing,
     _time_detector,
     choose,
+    decision_cost,
     nondominated,
     pareto_table,
 )
@@ -78,10 +78,7 @@ def test_the_detector_that_is_left_keeps_its_deadline(recordings, cache, tmp_pat
     best = max(row["accuracy"] for row in found["candidates"])
     assert found["chosen"]["accuracy"] == best
     detector = SlipDetector.load(tmp_path / "detector.pt")
-    costs = WorkCosts.measured(detector.pool, "m7")
-    num, products = len(detector.selected_names), detector.head.cost.multiply_adds
-    cost = costs.cost([costs.decision(detector.selected_names, num, products)])
-    assert found["chosen"]["m7_instructions"] == pytest.approx(cost)
+    assert found["chosen"]["m7_instructions"] == decision_cost(detector, "m7")
     assert len(detector.selected_names) == found["chosen"]["size"]
     assert "chosen" in capsys.readouterr().out
     again = tmp_path / "again"

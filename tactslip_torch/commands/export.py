@@ -12,6 +12,7 @@ from tactslip_torch.deploy.bins import Precision
 from tactslip_torch.deploy.export import export_detector, summary, wanted_graphs
 from tactslip_torch.deploy.native import NativeFile
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.runtime import check_choice
 
 
 def export(config: DictConfig, results: Path) -> None:
@@ -27,6 +28,7 @@ def export(config: DictConfig, results: Path) -> None:
     folder = Path(config.output or (source.parent if is_here else results))
     if folder.suffix == ".onnx" or folder.is_file():
         raise ValueError(f"output must be a folder, got {folder}; the files have their names")
+    check_choice("precision", config.precision, ("auto", "float32", "float64"))
     if config.graph == "native":
         given: Any = OmegaConf.to_container(config.native)
         with_source = given.pop("source")

@@ -21,11 +21,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.commands.train import train
-from tactslip_torch.features.cost import WorkCosts
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.pareto import (
     Candidate,
     choose,
+    decision_cost,
     nondominated,
     pareto_figure,
     pareto_table,
@@ -112,9 +112,6 @@ def _trained(
     detector = SlipDetector.load(folder / "detector.pt")
     rate, bin_samples = detector.pool.sample_rate_hz, detector.pool.bin_samples
     timing = time_in_fresh_process(folder / "detector.pt", config.calls)
-    costs = WorkCosts.measured(detector.pool, "m7")
-    num_scaled, products = len(detector.scaler.minimum), detector.head.cost.multiply_adds
-    m7_instructions = costs.cost([costs.decision(detector.selected_names, num_scaled, products)])
     return [
         Candidate(
             recipe,
@@ -125,7 +122,7 @@ def _trained(
             1000 * detector.look_ahead / rate,
             1000 * bin_samples / rate,
             timing,
-            m7_instructions,
+            decision_cost(detector, "m7"),
             str(folder),
         )
         for hop_ms in config.hops_ms

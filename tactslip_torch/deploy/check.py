@@ -32,7 +32,7 @@ GraphKind = Literal["bin", "stream"]
 Arrays = Mapping[str, NDArray[Any]]
 Run = Callable[[Arrays], dict[str, NDArray[Any]]]
 
-_WORST = {"float32": 1e-3, "float64": 1e-9}
+_WORST: dict[Precision, float] = {"float32": 1e-3, "float64": 1e-9}
 """Largest error of a score in its standard deviations, and of a statistic in its range."""
 _WORST_PROBABILITY = {"float32": 1e-5, "float64": 1e-9}  # beside that of the score given
 _LOSSES = 10.0  # by which errors may be larger where channels are lost

@@ -294,10 +294,14 @@ class QuadraticForm(nn.Module):
 
     @property
     def cost(self) -> _Cost:
-        """Multiply-adds a bin and bytes, whatever the number of training bins."""
-        num_values = self.num_features + self.quadratic.numel()
+        """Multiply-adds a bin and bytes, whatever the number of training bins.
+
+        The native engine multiplies one triangle of a symmetric ``Q``; a file keeps it whole.
+        """
+        num_values, num = self.num_features + self.quadratic.numel(), len(self.quadratic)
         num_values += 0 if self.signs is None else len(self.signs)
-        return _Cost(num_values, (num_values + 1) * self.linear.element_size())
+        products = num_values - (num * (num - 1) // 2 if self.signs is None else 0)
+        return _Cost(products, (num_values + 1) * self.linear.element_size())
 
     def forward(self, z: Tensor) -> Tensor:
         """The score.

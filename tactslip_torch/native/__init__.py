@@ -466,7 +466,8 @@ class Machine(_Kept):
         if minimum is not None and maximum is not None:
             if dtype is np.float32:
                 centre, minimum, maximum = _centred(minimum, maximum, compression)
-                self.of.centre = self._filled_up(centre, 0.0)
+                if centre.any():
+                    self.of.centre = self._filled_up(centre, 0.0)
             self.of.minimum = self._filled_up(minimum, 0.0)
             self.of.width = self._filled_up(maximum - minimum, 0.0)
         if compression is not None:

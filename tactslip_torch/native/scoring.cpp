@@ -9,7 +9,7 @@
 
 namespace {
 
-// log(1 + x) for x > -1, as fdlibm has it: an error below 1 ulp. Of f, less than the square root of 2
+// log(1 + x) for x > -1, as fdlibm has it: an error of about 1 ulp. Of f, less than the square root of 2
 // over 1, it is a series in the squares of s = f / (2 + f).
 template <class E> struct Series;
 template <> struct Series<double> {
@@ -17,7 +17,6 @@ template <> struct Series<double> {
   static constexpr uint64_t ONE = 0x3ff0000000000000, LOWEST = 0x3fe6a09e00000000;  // sqrt(1/2)
   static constexpr double LN2_HIGH = 6.93147180369123816490e-01, LN2_LOW = 1.90821492927058770002e-10;
   static constexpr double LN_LARGEST = 0x1.62e42fefa39efp9;
-  static constexpr uint64_t INVERSE = 0x7fde623822fc16e6;  // less a number's bits: about 1 over it
   template <class V> INLINE V at(V z) {
     return z * (6.666666666666735130e-01 + z * (3.999999999940941908e-01 +
            z * (2.857142874366239149e-01 + z * (2.222219843214978396e-01 +
@@ -30,7 +29,6 @@ template <> struct Series<float> {
   static constexpr uint32_t ONE = 0x3f800000, LOWEST = 0x3f3504f3;
   static constexpr float LN2_HIGH = 6.9313812256e-01f, LN2_LOW = 9.0580006145e-06f;
   static constexpr float LN_LARGEST = 0x1.62e43p6f;
-  static constexpr uint32_t INVERSE = 0x7ef311c7;
   template <class V> INLINE V at(V z) {
     return z * (6.6666662693e-01f + z * (4.0000972152e-01f +
            z * (2.8498786688e-01f + z * 2.4279078841e-01f)));
@@ -45,11 +43,9 @@ template <class E> INLINE typename Lanes<E>::V log1p_of(typename Lanes<E>::V x) 
   V u = 1 + x, lost = x < 1 ? x - (u - 1) : 1 - (u - x);
   Bits bits = (Bits)u + (Own::ONE - Own::LOWEST);
   V k = (V)((bits >> Own::DIGITS) + ((Bits)(V{} + whole) - Own::BIAS)) - whole;
-  auto is_near = (u >= (E)0.75) & (u < (E)1.4);  // k = 0: nothing is lost, however small x is
-  V f = is_near ? x : (V)((bits & digits) + Own::LOWEST) - 1;
-  lost = is_near ? V{} : lost;
+  V f = (V)((bits & digits) + Own::LOWEST) - 1;
   V s = f / (2 + f), z = s * s, half = (E)0.5 * f * f;
-  V about = (V)(Own::INVERSE - (Bits)smaller(u, V{} + (E)0x1p60));  // to an eighth: enough
+  V about = (V)(2 * Own::ONE - (Bits)smaller(u, V{} + (E)0x1p60));  // 1 / u to an eighth; 1 at 1
   return k * Own::LN2_HIGH - ((half - (s * (half + Own::at(z)) + (k * Own::LN2_LOW + lost * about))) - f);
 }
 
@@ -58,13 +54,8 @@ template <class V> INLINE V inverse_of(V scale) {
   return smaller(1 / scale, V{} + Limits<E>::LARGEST);
 }
 
-// sign(x) scale log(1 + |x| / scale), less the same of a centre. Near the centre it is the log of one
-// ratio, so that what lies close together stays apart.
-template <class E, class V> INLINE V signed_log(V x, V scale, V centre) {
-  V turned = centre < 0 ? -x : x, middle = magnitude(centre);
-  auto is_beside = 2 * turned >= middle;
-  V away = is_beside ? turned - middle : magnitude(turned);
-  V whole = is_beside ? scale + middle : scale, inverse = inverse_of(whole);
+// scale log(1 + away / whole), the inverse being that of `whole`.
+template <class E, class V> INLINE V log_part(V away, V scale, V whole, V inverse) {
   V ratio = away * inverse, bent = scale * log1p_of<E>(ratio);
   auto is_far = ratio > Limits<E>::LARGEST;
   if (any(is_far))
@@ -73,12 +64,29 @@ template <class E, class V> INLINE V signed_log(V x, V scale, V centre) {
         E far = log_of(away[k] > whole[k] ? away[k] : whole[k]) - log_of(whole[k]);
         bent[k] = scale[k] * (far > Series<E>::LN_LARGEST ? far : Series<E>::LN_LARGEST);
       }
-  bent = magnitude(ratio) < Limits<E>::SMALLEST ? away : bent;  // a denormal ratio has lost digits
+  return magnitude(ratio) < Limits<E>::SMALLEST ? away : bent;  // a denormal ratio has lost digits
+}
+
+// sign(x) scale log(1 + |x| / scale)
+template <class E, class V> INLINE V signed_log(V x, V scale, V inverse) {
+  V bent = log_part<E>(magnitude(x), scale, scale, inverse);
+  return x < 0 ? -bent : bent;
+}
+
+// The same, less that of a centre. Near the centre it is the log of one ratio, so that what lies close
+// together stays apart.
+template <class E, class V> INLINE V signed_log_less(V x, V scale, V centre) {
+  auto is_turned = (centre < 0) | ((centre == 0) & (x < 0));
+  V turned = is_turned ? -x : x, middle = magnitude(centre);
+  auto is_beside = 2 * turned >= middle;
+  V away = is_beside ? turned - middle : magnitude(turned);
+  V whole = is_beside ? scale + middle : scale, inverse = inverse_of(whole);
+  V bent = log_part<E>(away, scale, whole, inverse);
   if (any(~is_beside)) {
     V own = turned < 0 ? -bent : bent;
     bent = is_beside ? bent : own - scale * log1p_of<E>(middle * inverse);
   }
-  return centre < 0 ? -bent : bent;
+  return is_turned ? -bent : bent;
 }
 
 enum Across { BINS, ONE_BIN };
@@ -185,9 +193,9 @@ template <class E> struct Scorer {
     }
     for (int32_t r = 0; r < p.num_families; r += step<ACROSS>()) {
       V mean = {}, square = {}, low = {}, high = {}, last = {};
-      V scale = constants<ACROSS>(p.scales + r);
+      V scale = constants<ACROSS>(p.scales + r), inverse = inverse_of(scale);
       for (int32_t c = 0; c < p.num_channels; ++c) {
-        V value = signed_log<E>(gathered<ACROSS>(x, p.inputs + c * stride + r), scale, V{});
+        V value = signed_log<E>(gathered<ACROSS>(x, p.inputs + c * stride + r), scale, inverse);
         values[c] = in_use[c] > 0 ? value : V{};
         mean += values[c];
         last = larger(last, values[c]);
@@ -233,10 +241,13 @@ template <class E> struct Scorer {
     const Machine<E>& m = machine;
     V value = gathered<ACROSS>(y, m.sources + i);
     V centre = m.centre ? constants<ACROSS>(m.centre + i) : V{};
-    if (m.compression)
-      value = signed_log<E>(value, constants<ACROSS>(m.compression + i), centre);
-    else
+    V scale = m.compression ? constants<ACROSS>(m.compression + i) : V{};
+    if (!m.compression)
       value -= centre;
+    else if (m.centre)
+      value = signed_log_less<E>(value, scale, centre);
+    else
+      value = signed_log<E>(value, scale, inverse_of(scale));
     if (m.minimum) {
       V low = constants<ACROSS>(m.minimum + i), width = constants<ACROSS>(m.width + i);
       V scaled = clamped<E>(2 * ((value - low) / width) - 1, 1);
