@@ -548,7 +548,8 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def detector_(self) -> SlipDetector:
         """The ``SlipDetector``, for streams, ONNX and the commands; of two labels only.
 
-        Its alarm is raised where two of three decisions say slip, half a window apart.
+        As ``fit`` sets it, its alarm is raised where two of three decisions say slip, half a bin
+        apart; after ``load`` and ``from_detector`` it has the alarm of the file or detector.
         """
         return self._whole()
 
