@@ -13,6 +13,7 @@ seed gave is kept, so a run that was stopped resumes. Puts its tables into docs/
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -33,7 +34,7 @@ from benchmarks.trainings import composed, resumed, say
 from tactslip_torch import AlarmSettings, SlipDetector
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
+from tactslip_torch.onset.baselines import BaselineDetector
 from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.onset.events import first_releases
 from tactslip_torch.onset.rules import Budget
@@ -58,10 +59,8 @@ SOURCES = (
 FOUND_S, EARLY_S, HINT_S = 0.25, 0.2, 0.1
 """Of the first release: an alarm until then finds a slip, before it is early; a hint is in time."""
 HINT, BINS, EARLIER = "hint", "bins", "0.2.0"
-DETAIL: BaselineName = "largest_detail"
-GRIPS_PER_S = 0.8
-"""Of recordings of reflex grips, in the mean."""
-GRIPS_PER_S = 0.8
+DETAIL = "largest_detail"
+GRIPS_PER_S = KINDS["reflex_grips"](np.random.default_rng(0))["grips_per_s"]
 """Of recordings of reflex grips, in the mean."""
 
 
@@ -122,7 +121,7 @@ OVERRIDES = (
     "onset.streams.slips=60",
     "onset.streams.confounders.held=600",
     *(f"onset.streams.confounders.{kind}=60" for kind in KINDS if kind != "held"),
-    "onset.hours={held:1.5,slip:0.06,others:0.15}",
+    "onset.hours={held:3,slip:0.06,others:0.15}",
     "onset.check_hours={held:2,slip:0,others:0.2}",
 )
 """Of ``+exp=onset``: fewer hours than by default set the threshold, so at the point estimate."""
@@ -187,13 +186,13 @@ class Alarms(Benchmark):
             for seed, own in zip(self.seeds, given, strict=True)
         ]
         first = self.seeds[0]
-        earlier = json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
+        earlier = self._earlier(given[0])
         quiet += [{"method": EARLIER} | row for row in earlier.get("quiet", [])]
         without = [*given[0], "onset.worlds.bristles=0"]
         others = replace(self, worlds=tuple(w for w in self.worlds if "bristles" in w))
         unknown = list[dict[str, Any]]()
         if others.worlds:
-            others._seed(job.folder / "without bristles", first, without, unknown, [])
+            others._seed(job.folder / "without bristles", first, without, unknown)
         before = earlier.get("slips", {})
         rows = [
             _world_row(world, own, before.get(world, []))
@@ -208,7 +207,7 @@ class Alarms(Benchmark):
                 "before it. *Hint*: within 100 ms. *Bins*: the detector of bins behind its "
                 "rule, *detail*: the largest wavelet detail of a fast channel, under the same "
                 f"budgets; detail of seed {first} alone. *0.2.0*: the alarm of that version, as "
-                f"its own training set it, seed {first}. "
+                f"its own training set it, seed {first}; its hours are whole recordings. "
                 f"Heads: {', '.join(alarm['classifier']['head'] for alarm in set_by)}.",
             ),
             "False alarms": Table(
@@ -250,10 +249,10 @@ class Alarms(Benchmark):
         seed: int,
         given: Sequence[str],
         slips: list[dict[str, Any]],
-        quiet: list[dict[str, Any]],
+        quiet: list[dict[str, Any]] | None = None,
     ) -> dict[str, Any]:
         """How the alarm of a seed was set; what became of slips and of the rest is added."""
-        given, has_detail = ["+exp=onset", *given], seed == self.seeds[0]
+        given, has_detail = ["+exp=onset", *given], seed == self.seeds[0] and quiet is not None
         made_by = [*given, f"detail={has_detail}"]
         say(f"the alarm in {folder.name}")
         fit = partial(_fitted, given, folder / "detector.pt", has_detail)
@@ -263,9 +262,27 @@ class Alarms(Benchmark):
         of_worlds = [*made_by, *self.worlds, f"sessions={self.sessions}"]
         run = partial(_slips, methods, alarm["held_out"], self, seed)
         slips += resumed(folder / "worlds.json", of_worlds, run)
-        say(f"recordings without slip of {folder.name}")
-        quiet += resumed(folder / "quiet.json", made_by, partial(_quiet, methods, given))
+        if quiet is not None:
+            say(f"recordings without slip of {folder.name}")
+            quiet += resumed(folder / "quiet.json", made_by, partial(_quiet, methods, given))
         return alarm
+
+    def _earlier(self, given: Sequence[str]) -> dict[str, Any]:
+        """What 0.2.0 made of the recordings of the first seed; empty if it heard others."""
+        kept: dict[str, Any] = json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
+        if kept.get("digest") == self.digest(given):
+            return kept
+        say("0.2.0 has not heard these recordings: benchmarks.earlier")
+        return {}
+
+    def digest(self, given: Sequence[str]) -> str:
+        """Of the recordings of the first seed."""
+        source, groups, materials = quiet_recordings(["+exp=onset", *given])
+        keys = [source.key(recording) for own in groups.values() for recording in own]
+        for world in self.worlds:
+            own = world_recordings(world, materials, self.sessions, self.seeds[0])
+            keys += [own.key(recording) for recording in own.ids]
+        return hashlib.sha256(json.dumps(keys, default=str).encode()).hexdigest()[:16]
 
     def section(self, report: Report) -> str:
         """The tables, and their figure."""
@@ -303,7 +320,7 @@ def _scorers(detector: SlipDetector, has_detail: bool) -> dict[str, Scorer]:
         return {OURS: detector}
     return {
         OURS: detector,
-        DETAIL: BaselineDetector(DETAIL, detector.pool, detector.channel_filter),
+        DETAIL: BaselineDetector(detector.pool, detector.channel_filter),
     }
 
 

@@ -57,7 +57,8 @@ def store(folder: Path) -> None:
                 "strokes": len(times.arm_s),
             }
         )
-    (folder / "index.json").write_text(json.dumps(index), encoding="utf-8")
+    made = {"digest": sizes.digest(given), "recordings": index}
+    (folder / "index.json").write_text(json.dumps(made), encoding="utf-8")
 
 
 def hear(folder: Path, detector: Path) -> None:
@@ -68,7 +69,7 @@ def hear(folder: Path, detector: Path) -> None:
 
     torch.set_num_threads(1)
     loaded = SlipDetector.load(detector)
-    for own in json.loads((folder / "index.json").read_text(encoding="utf-8")):
+    for own in json.loads((folder / "index.json").read_text(encoding="utf-8"))["recordings"]:
         samples = torch.from_numpy(np.load(folder / own["file"]))
         stream = StreamingDetector(loaded)
         parts = [stream.push(samples), stream.flush()]
@@ -86,7 +87,8 @@ def count(folder: Path) -> None:
     from benchmarks.alarms import delays
 
     slips, quiet = dict[str, list[float | str]](), dict[str, dict[str, Any]]()
-    for own in json.loads((folder / "index.json").read_text(encoding="utf-8")):
+    index = json.loads((folder / "index.json").read_text(encoding="utf-8"))
+    for own in index["recordings"]:
         found = np.load(folder / own["file"].replace(".npy", ".npz"))
         made = SimpleNamespace(**{name: torch.from_numpy(found[name]) for name in found.files})
         if own["role"] == "world":
@@ -99,7 +101,7 @@ def count(folder: Path) -> None:
         row["hours"] += own["hours"]
         row["strokes"] += own["strokes"]
     KEPT.write_text(
-        json.dumps({"version": "0.2.0", "slips": slips, "quiet": list(quiet.values())}, indent=1)
+        json.dumps({"digest": index["digest"], "slips": slips, "quiet": list(quiet.values())})
         + "\n",
         encoding="utf-8",
     )

@@ -35,9 +35,10 @@ from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, 
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.calibration import Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
+from tactslip_torch.onset.decisions import KEY, AlarmSettings
+from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import Align, ChannelFilter
-from tactslip_torch.training.alarm import DebouncedAlarm
 from tactslip_torch.training.bins import RecordingBins, join_groups
 from tactslip_torch.training.recipe import POOLING, ClassFit, Fit, General
 from tactslip_torch.training.views import ViewBins
@@ -396,7 +397,9 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
                 is_slip = torch.from_numpy(np.asarray(y == self.slip_label_))
                 fit = _fitted(recipe, pool, x, is_slip, group, names)
                 detector = fit.detector(pool, features._filter, self._calibrated(fit, recipe))
-                DebouncedAlarm()(detector)
+                hop = max(pool.bin_samples // 2, 1)
+                settings = AlarmSettings(hop, self._slope, KOfN(2, 3), 0.0, None)
+                detector.info[KEY] = settings.to_dict()  # as onset=debounced
             else:
                 labels = torch.from_numpy(np.searchsorted(self.classes_, y))
                 fits = _fitted_to_classes(recipe, pool, x, labels, group, names)
@@ -548,7 +551,8 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def detector_(self) -> SlipDetector:
         """The ``SlipDetector``, for streams, ONNX and the commands; of two labels only.
 
-        Its alarm is raised where two of three decisions say slip, half a window apart.
+        As ``fit`` sets it, its alarm is raised where two of three decisions say slip, half a bin
+        apart; after ``load`` and ``from_detector`` it has the alarm of the file or detector.
         """
         return self._whole()
 

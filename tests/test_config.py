@@ -5,7 +5,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 from torch.utils.data import DataLoader, Dataset
 
-from tactslip_torch.commands import configuration
+from tactslip_torch import commands
 from tactslip_torch.commands.configuration import conf_dir
 from tactslip_torch.commands.stopping import errors_in_one_line, one_line
 
@@ -13,7 +13,7 @@ from tactslip_torch.commands.stopping import errors_in_one_line, one_line
 def test_conf_inside_the_package_comes_first_and_none_is_an_error(monkeypatch, tmp_path, request):
     assert conf_dir() == request.config.rootpath / "conf"
     package = tmp_path / "site-packages" / "tactslip_torch"
-    monkeypatch.setattr(configuration, "_PACKAGE", package)
+    monkeypatch.setattr(commands, "_PACKAGE", package)
     with pytest.raises(FileNotFoundError, match="reinstall"):
         conf_dir()
     for folder in (package.parent / "conf", package / "conf"):

@@ -5,6 +5,8 @@ from collections import defaultdict
 
 import pytest
 import torch
+from test_views import POOL as SMALL_POOL
+from test_views import drawn
 
 from tactslip_torch import FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.features.cost import MACHINES, WorkCosts
@@ -137,6 +139,17 @@ def test_costs_decide_nothing_where_all_columns_cost_alike(rng):
     assert forward_selection(columns, targets, ones, 5, costs=alike) == forward_selection(
         columns, targets, ones, 5
     )
+
+
+def test_a_recipe_that_counts_costs_takes_a_cheaper_set():
+    bins, costs = drawn(num=40, num_groups=3), WorkCosts.measured(SMALL_POOL, "m7")
+    taken = {}
+    for machine in (None, "m7"):
+        recipe = General(views=["channel"], num_features=4, per_cost=machine)
+        names = recipe.fit_classes(bins, SMALL_POOL).selection.column_names
+        assert len(names) == 4
+        taken[machine] = costs.cost([costs.parts(name) for name in names])
+    assert taken["m7"] < taken[None]
 
 
 def test_a_machine_that_is_none_or_no_number_of_columns_is_refused():

@@ -170,9 +170,6 @@ def test_a_file_that_is_damaged_in_its_samples_is_a_problem(root, capsys, monkey
     assert run("check", root, ROWS, "samples=false") == 0
 
 
-# summary -------------------------------------------------------------------------------------
-
-
 # convert -------------------------------------------------------------------------------------
 
 

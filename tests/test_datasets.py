@@ -618,6 +618,23 @@ def test_paths_say_what_recordings_are(folder):
     assert (other.onsets_s, other.slip_s) == ((), ((0.5, 1.5),))
 
 
+@pytest.mark.parametrize("form", ["{label}_{material}_{n}", "{label}/{material}_{n}"])
+@pytest.mark.parametrize("words", [("slip", "noslip"), ("Slip", "stick")])
+def test_names_that_are_read_by_themselves_have_their_labels(tmp_path, form, words):
+    for label in words:
+        for material in ("cup", "box", "can"):
+            for n in (1, 2):
+                name = form.format(label=label, material=material, n=n)
+                table(tmp_path / f"{name}.csv", samples(n))
+    found = named_recordings(tmp_path, pattern="auto")
+    assert {one.material for one in found.ids} == {"cup", "box", "can"}
+    assert {one.scene for one in found.ids} == {RecordingId.scene}
+    for one in found.ids:
+        is_slip = found.entry(one).file.startswith(words[0])
+        times = found.timeline(one)
+        assert (bool(times.slip_s), bool(times.non_slip_s)) == (is_slip, not is_slip)
+
+
 def test_a_trial_of_each_session_is_a_recording_of_its_own(folder):
     pattern = "{session}/{material:pen}{trial}"
     found = named_recordings(folder, pattern=pattern, reading=NAMED["reading"])

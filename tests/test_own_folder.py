@@ -81,7 +81,7 @@ def test_a_folder_of_which_nothing_is_known_asks_for_setup(folder):
 def test_a_detector_of_a_manifest_reads_a_folder_without_one(folder, monkeypatch):
     for name in ("hand.yaml", "manifest.csv"):
         (folder / name).unlink()
-    (folder / "slips.csv").write_text("file,start,end\nA_1,1,2\n")  # is no recording
+    (folder / "slips.csv").write_text("\nfile,start,end\nA_1,1,2\n")  # is no recording
     model = folder / "detector.pt"
     model.touch()
     known = SimpleNamespace(info={"data": {"channels": CHANNELS}})

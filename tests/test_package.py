@@ -34,6 +34,22 @@ def test_importing_the_package_loads_little() -> None:
     assert (loaded.returncode, loaded.stdout, loaded.stderr) == (0, "\n", "")
 
 
+def test_copying_a_host_loads_no_more_than_paths() -> None:
+    code = (
+        "import sys; from tactslip_torch.commands import demo, hosts; hosts.hosts_dir(); "
+        f"print(*set('torch {HEAVY}'.split()) & set(sys.modules))"
+    )
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (loaded.returncode, loaded.stdout, loaded.stderr) == (0, "\n", "")
+
+
+def test_a_classifier_loads_neither_training_nor_figures() -> None:
+    code = "import sys; from tactslip_torch import SlipClassifier\n"
+    code += "print(*{'lightning', 'hydra', 'matplotlib', 'tensorboard'} & set(sys.modules))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (loaded.returncode, loaded.stdout) == (0, "\n"), loaded.stderr
+
+
 @pytest.mark.parametrize("name", tactslip_torch.__all__)
 def test_every_public_name_is_there(name: str) -> None:
     assert getattr(tactslip_torch, name).__doc__

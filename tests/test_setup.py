@@ -210,6 +210,7 @@ def test_a_table_of_intervals_becomes_a_manifest(tmp_path):
     assert rows["box_2.csv"]["slip_s"] == "0-0.5"  # begun before the recording
     assert rows["cup_1.csv"]["non_slip_s"] == "0-1; 2.5005-3; 3.5-end"
     assert rows["box_2.csv"]["non_slip_s"] == "0.5-end"
+    assert not any(row["unlabelled_s"] for row in rows.values())
     assert rows["cup_2.csv"]["slip_s"] == rows["cup_2.csv"]["non_slip_s"] == ""  # nobody says
     assert (rows["box_2.csv"]["material"], rows["box_2.csv"]["trial"]) == ("box", "2")
     (tmp_path / "manifest.csv").write_text("file,material,slip_s\ncup_1.csv,cup,0-1\n")
@@ -222,9 +223,52 @@ def test_a_table_that_is_not_understood_is_named(tmp_path):
     (tmp_path / "slips.csv").write_text("Datei;Beginn;Ende\ncup_1;1;2\n")
     question, *_ = propose(look(tmp_path)).questions
     assert "slips.csv is none" in question.text
-    (tmp_path / "slips.csv").write_text("file;start;end\ncup_1;1;2 s\n")
-    with pytest.raises(ValueError, match=r"slips\.csv: end '2 s' is no number"):
+
+
+WRONG_TIMES = [
+    ("start;end\n\ncup_1;1;2 s", r"line 3: end '2 s' is no number; give seconds, or .*start_ms"),
+    ("start;end\ncup_1;0;1\ncup_1;nan;2", "line 3: start 'nan' is no number"),
+    ("start;end\ncup_1;1;1.#INF", "line 2: end '1.#INF' is no number"),
+    ("start_ms;end_s\ncup_1;1;2", "times are in ms and s; give all in one unit"),
+]
+
+
+@pytest.mark.parametrize(("rows", "said"), WRONG_TIMES)
+def test_times_that_cannot_be_are_named_with_line_and_remedy(tmp_path, rows, said):
+    write(tmp_path / "cup_1.csv", ["a", "b"])
+    (tmp_path / "slips.csv").write_text(f"file;{rows}\n")
+    with pytest.raises(ValueError, match=rf"slips\.csv: {said}"):
         look(tmp_path)
+
+
+def test_a_unit_at_one_of_both_columns_is_that_of_both(tmp_path):
+    write(tmp_path / "cup_1.csv", ["a", "b"])
+    (tmp_path / "slips.csv").write_text("file,start,end_time_ms\ncup_1,500,2000\n")
+    (row,) = look(tmp_path).intervals
+    assert (row["start"], row["end"]) == ("0.5", "2")
+
+
+def test_a_slip_that_begins_where_non_slip_ends_has_an_onset(tmp_path):
+    for name in ("cup_1", "cup_2"):
+        write(tmp_path / f"{name}.csv", ["a", "b"])
+    (tmp_path / "slips.csv").write_text(
+        "file,start,end,state\ncup_1,0.7,1,hold\ncup_1,1,2,slip\ncup_1,2.5,3,slip\n"
+    )
+    row, _ = propose(look(tmp_path)).manifest
+    assert (row["sliding_s"], row["slip_s"], row["non_slip_s"]) == ("1-2", "2.5-3", "0.7-1")
+    assert row["unlabelled_s"] == "0-0.7; 2-2.5; 3-end"  # not non-slip from 0 s on
+
+
+def test_what_is_called_a_table_and_is_none_is_told_where_it_is_read(tmp_path):
+    for name in ("cup_1", "cup_2"):
+        write(tmp_path / f"{name}.csv", ["a", "b"])
+    (tmp_path / "away.csv").symlink_to(tmp_path / "nowhere.csv")
+    (tmp_path / "folder.csv").mkdir()
+    (tmp_path / "slips.csv").write_text("file,start,end\ncup_1,1,2\n")
+    found = look(tmp_path)
+    assert found.table_of_intervals == "slips.csv"
+    assert found.files == ("cup_1.csv", "cup_2.csv")
+    assert set(found.problems) == {"away.csv"}  # a folder is looked into
 
 
 def test_files_that_are_no_recordings_are_told_and_do_not_change_how_names_are_read(tmp_path):

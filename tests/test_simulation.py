@@ -223,6 +223,7 @@ SOFT = Contact(presliding_mm=(0.3, 0.3), touching=("PVDF7", "PVDF9"), **RELAXED)
 LOOSE = Contact(touching=("SG1",), finger_loads=(("little", 0.0),))
 HEAVY, TAPPED, GRIPPED = Handling(carried_kg=50.0), Handling(taps_per_s=1), Handling(grips_per_s=1)
 LIFTED = Handling(carried_kg=1.0, weight_share=0.94)
+SOON, AIRBORNE = (Stroke(40.0, 20.0, 0.5), CARRY[0]), Handling(0.0, weight_share=0.9)
 AT_ONCE = (Stroke(40.0, 20.0, 0.5), Stroke(40.0, 20.0, 0.0, "both"))
 
 
@@ -281,6 +282,7 @@ REFUSED = [
     (surface, {"mu_s": -1, "mu_ratio": (0.8, 0.9)}, r"x: expected mu_s > 0 .* -1 and \(0\.8, 0\.9"),
     (truth, {"strokes": CARRY, "handling": HEAVY}, r"50 kg at 0\.5 m/s2 takes 25 N, more than"),
     (truth, {"strokes": CARRY, "handling": LIFTED}, r"weight 0\.94 of .*, together more"),
+    (truth, {"strokes": SOON, "handling": AIRBORNE}, r"stroke 2, and up to .* may be left"),
     (truth, {"strokes": AT_ONCE}, r"stroke 2, and up to 1 may be left of the slide before: pause"),
     (truth, {"strokes": (Stroke(40.0, 20.0, 0.2),), "handling": TAPPED}, r"rest long .* 0\.1 s to"),
     (truth, {"strokes": (Stroke(40.0, 20.0, 1.1),), "handling": GRIPPED}, "grips of up to 1 s"),

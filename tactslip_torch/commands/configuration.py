@@ -24,6 +24,8 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from tactslip_torch.commands import packaged_folder
+
 _COMMENTED = re.compile(r"( *)(?:- )?([\w@/]+):(?: +([^#\s].*?))?(?: +# (.*))?$")
 _WIDTH, _INDENT = 100, 34
 _HELP = """
@@ -33,8 +35,6 @@ every command also takes:
   --cfg job                       print the configuration and stop
   --config-dir FOLDER             a folder with configuration of your own
   TACTSLIP_TRACEBACK=1            environment variable: errors show where they were raised"""
-
-_PACKAGE = Path(__file__).resolve().parents[1]
 
 HAND_FILE = "hand.yaml"
 """How the recordings of its folder are read and labelled; written by ``tactslip setup``."""
@@ -81,14 +81,6 @@ class Key(NamedTuple):
     name: str
     value: Any
     description: str
-
-
-def packaged_folder(name: str, hint: str) -> Path:
-    """A folder inside the package (wheel) or beside it (checkout); ``hint`` is a file in it."""
-    for folder in (_PACKAGE / name, _PACKAGE.parent / name):
-        if (folder / hint).is_file():
-            return folder
-    raise FileNotFoundError(f"no {name} folder with {hint} in or beside {_PACKAGE}; reinstall")
 
 
 def conf_dir() -> Path:

@@ -6,7 +6,7 @@ import argparse
 import shutil
 from pathlib import Path
 
-from tactslip_torch.commands.configuration import packaged_folder
+from tactslip_torch.commands import packaged_folder
 
 _SHARED = {"web": ("web", "node"), "native": ("native", "c")}
 """Hosts of several folders: the page shares the reader and the stream of ``node``, the C library

@@ -106,7 +106,8 @@ def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "tim
         raise ValueError(
             f"{name}: its times are {1 / step_s:.6g} Hz, but {stated_hz:g} Hz is stated; "
             f"{_unit_hint(stated_hz * step_s)}"
-            f"correct it, or go without the times: {setting('reading.time')}=null"
+            f"correct it where it is stated: in {setting('reading.sample_rate_hz')} (null takes "
+            "the rate of the times), the manifest or the file"
         )
     late = _Lateness(times, step_s)
     gaps, jitter = _gaps_in(late, step_s, unit_s / step_s, name)

@@ -23,9 +23,9 @@ from tactslip_torch.data.labels import label_of
 from tactslip_torch.data.manifest import MANIFEST, write_table
 from tactslip_torch.data.recording import TIMES, RecordingId, RecordingSource
 
-_STARTS = re.compile(r"(start|begin|from|onset)(_?(s|ms|sec|seconds|time))*", re.IGNORECASE)
-_ENDS = re.compile(r"(end|stop|to|until)(_?(s|ms|sec|seconds|time))*", re.IGNORECASE)
-_MOST_ROWS_BYTES = 2**20
+_STARTS = re.compile(r"(start|begin|from|onset)(?P<unit>(_?(s|ms|sec|seconds|time))*)", re.I)
+_ENDS = re.compile(r"(end|stop|to|until)(?P<unit>(_?(s|ms|sec|seconds|time))*)", re.I)
+_MOST_BYTES = 2**20  # of a table of intervals
 
 
 def recording_files(place: Path, *, in_folders: bool = False) -> list[Path]:
@@ -70,40 +70,64 @@ def interval_rows(folder: Path, paths: Sequence[Path]) -> tuple[str, list[dict[s
     """A table in the folder that names recordings, with starts and ends; ``""`` if none is there.
 
     Returns:
-        Its name, and of each row ``file``, ``start`` and ``end`` as they stand there, ``unit``
-        (``s`` or ``ms``) and ``label``, which is ``slip`` where no column says it.
+        Its name, and of each row ``file``, ``line``, ``start`` and ``end`` as they stand there,
+        ``unit`` (``s`` or ``ms``; ``ms and s`` if they differ) and ``label``, which is ``slip``
+        where no column says it.
     """
     known = {name: path for path in paths for name in (path.stem, path.name)}
     known |= {path.relative_to(folder).as_posix(): path for path in paths}
     for path in sorted(folder.glob("*.csv")):
-        if path.stat().st_size > _MOST_ROWS_BYTES or path.name == MANIFEST:
-            continue
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            first = file.readline()
-            delimiter = max(";,\t", key=first.count)
-            names = cells_of(first.rstrip("\n"), delimiter)
-            starts = [n for n, name in enumerate(names) if _STARTS.fullmatch(name)]
-            ends = [n for n, name in enumerate(names) if _ENDS.fullmatch(name)]
-            if not (starts and ends):
+        try:
+            if path.name == MANIFEST or not path.is_file() or path.stat().st_size > _MOST_BYTES:
                 continue
-            rows = [cells_of(line.rstrip("\n"), delimiter) for line in file if line.strip()]
-        rows = [row for row in rows if len(row) == len(names)]
+            names, starts, ends, numbered = _interval_cells(path)
+        except OSError:
+            continue  # which is told where the file is read
+        rows = list(numbered.values())
         named = [n for n in range(len(names)) if rows and all(row[n] in known for row in rows)]
         if not named:
             continue
         used = (starts[0], ends[0], named[0])
         others = [n for n in range(len(names)) if n not in used]
         labels = [n for n in others if all(label_of(row[n]) for row in rows)]
-        unit = "ms" if "ms" in re.split(r"[\W_]+", names[starts[0]].lower()) else "s"
+        units = {_unit_of(_STARTS, names[starts[0]]), _unit_of(_ENDS, names[ends[0]])} - {""}
+        unit = " and ".join(sorted(units)) or "s"
         table = []
-        for row in rows:
+        for number, row in numbered.items():
             start, end, name = (row[n] for n in used)
             label = (label_of(row[labels[0]]) if labels else None) or "slip"
             place = known[name].relative_to(folder).as_posix()
-            times = {"start": start, "end": end, "unit": unit}
+            times = {"line": str(number), "start": start, "end": end, "unit": unit}
             table.append({"file": place, **times, "label": label})
         return path.name, table
     return "", []
+
+
+def _interval_cells(path: Path) -> tuple[list[str], list[int], list[int], dict[int, list[str]]]:
+    """The names of a table, the places of starts and of ends, and its rows by line.
+
+    There are no rows if there is no start or no end: then only the names are read.
+    """
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        lines = ((number, line) for number, line in enumerate(file, 1) if line.strip())
+        _, first = next(lines, (0, ""))
+        delimiter = max(";,\t", key=first.count)
+        names = cells_of(first.rstrip("\n"), delimiter)
+        starts = [n for n, name in enumerate(names) if _STARTS.fullmatch(name)]
+        ends = [n for n, name in enumerate(names) if _ENDS.fullmatch(name)]
+        if not (starts and ends):
+            return names, starts, ends, {}
+        rows = {number: cells_of(line.rstrip("\n"), delimiter) for number, line in lines}
+    return names, starts, ends, {n: row for n, row in rows.items() if len(row) == len(names)}
+
+
+def _unit_of(column: re.Pattern[str], name: str) -> str:
+    """The unit of times that the name of their column says: ``s``, ``ms`` or ``""``."""
+    match = column.fullmatch(name)
+    said = match["unit"].lower() if match else ""
+    if "ms" in said:
+        return "ms"
+    return "s" if re.search(r"_s(ec|econds)?(_|$)", said) else ""
 
 
 def file_metadata(path: Path, archived: Archived | None) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from tactslip_torch.data.formats._inference import (
     TimeUnit,
     is_time,
     no_channels,
+    number_in,
     seconds_and_nanoseconds,
     text_layout,
     time_unit_in,
@@ -343,16 +344,23 @@ def _intervals(folder: Path, paths: Sequence[Path]) -> tuple[str, list[Mapping[s
     """The table of intervals of a folder, and its rows with times in seconds.
 
     Raises:
-        ValueError: if a time is no number.
+        ValueError: if a time is no number, or starts are of another unit than ends.
     """
     name, rows = interval_rows(folder, paths)
     table: list[Mapping[str, str]] = []
     for row in rows:
+        if row["unit"] not in ("s", "ms"):
+            raise ValueError(f"{folder / name}: times are in {row['unit']}; give all in one unit")
         times = {}
         for end in ("start", "end"):
-            if not NUMBER.fullmatch(cell := row[end].replace(",", ".")):
-                raise ValueError(f"{folder / name}: {end} {row[end][:40]!r} is no number")
-            times[end] = f"{float(cell) * (1e-3 if row['unit'] == 'ms' else 1.0):.10g}"
+            cell = row[end].replace(",", ".")
+            seconds = number_in(cell) if NUMBER.fullmatch(cell) else math.nan
+            if not math.isfinite(seconds):
+                raise ValueError(
+                    f"{folder / name}: line {row['line']}: {end} {row[end][:40]!r} is no number; "
+                    "give seconds, or name the columns start_ms and end_ms"
+                )
+            times[end] = f"{seconds * (1e-3 if row['unit'] == 'ms' else 1.0):.10g}"
         table.append({**row, **times})
     return name, table
 
@@ -362,8 +370,8 @@ def _manifest_rows(
 ) -> list[dict[str, str]]:
     """Rows of a manifest: of each file its intervals; what lies between slips is non-slip.
 
-    So it is known when such a slip begins. If intervals of non-slip are given as well, what lies
-    between is not labelled. Files without an interval have no label.
+    If intervals of non-slip are given as well, what lies between is not labelled. The start of a
+    slip is an onset where non-slip ends. Files without an interval have no label.
     """
     spans_of: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for row in rows:
@@ -373,17 +381,23 @@ def _manifest_rows(
     for file, known in fields.items():
         slips, rest = sorted(spans_of[file, "slip"]), sorted(spans_of[file, "non-slip"])
         if slips and not has_both:
-            edges = [0.0, *(edge for span in slips for edge in span), math.inf]
-            pairs = zip(edges[::2], edges[1::2], strict=True)
-            rest = [(start, end) for start, end in pairs if start < end]
-        starts = {end for _, end in rest} if not has_both else set()
+            rest = _between(slips)
+        starts = {end for _, end in rest}
         sliding = [span for span in slips if span[0] in starts]  # the others began unseen
         slip = [span for span in slips if span not in sliding]
-        spans = {"sliding_s": sliding, "slip_s": slip, "non_slip_s": rest}
+        unknown = _between([*slips, *rest]) if sliding else []  # else a second before is non-slip
+        spans = {"sliding_s": sliding, "slip_s": slip, "non_slip_s": rest, "unlabelled_s": unknown}
         texts = {name: "; ".join(map(_span_text, each)) for name, each in spans.items()}
         columns = {name: known.get(name, "") for name in ("material", "trial", "scene", "session")}
         found.append({"file": file, **columns, **texts})
     return found
+
+
+def _between(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """What lies before, between and behind spans."""
+    edges = [0.0, *(edge for span in sorted(spans) for edge in span), math.inf]
+    pairs = zip(edges[::2], edges[1::2], strict=True)
+    return [(start, end) for start, end in pairs if start < end]
 
 
 def _span_text(span: tuple[float, float]) -> str:

@@ -9,7 +9,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from tactslip_torch.data.file_names import name_pattern
+from tactslip_torch.data.file_names import name_pattern, word_choices
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.folder import guessed, recording_files
 from tactslip_torch.data.labels import label_of
@@ -142,7 +142,10 @@ def _listed(
     """
     files = {p.relative_to(root).as_posix(): p for p in recording_files(root, in_folders=True)}
     if pattern == "auto":
-        pattern = name_pattern(list(files)).pattern
+        names = sorted(files)
+        both = {"slip", "non-slip"}
+        choices = (words for words in word_choices(names) if set(map(label_of, words)) == both)
+        pattern = name_pattern(names, next(choices, ())).pattern
     if "{material" not in pattern:
         raise ValueError(f"data.pattern must name {{material}}, got {pattern!r}")
     if wrong := [word for word in (labels or {}).values() if label_of(word) is None]:

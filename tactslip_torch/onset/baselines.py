@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -19,14 +18,12 @@ from tactslip_torch.features.bank import power_of_two_below
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.sensing import LARGEST_SAMPLE, Sensing, is_alive
 from tactslip_torch.model.prediction import Prediction
-from tactslip_torch.runtime import check_choice
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.wavelet import (
     Wavelet,
     branch_matrix,
 )
 
-BaselineName = Literal["largest_detail"]
 FLOOR_V = 1e-6
 """Amplitudes below it count as it, so that a dead hand has a score (ours; 16 bits at +-5 V resolve
 150 times as much)."""
@@ -69,23 +66,20 @@ def largest_detail(
 
 @dataclass(frozen=True)
 class BaselineDetector:
-    """A baseline where ``score_stream`` takes a ``SlipDetector``: the same hand, filter and bins.
+    """The largest detail as a detector: of the same hand, filter and bins as another.
 
     Args:
-        name: which score.
         pool: of the detector that it stands beside.
         channel_filter: of that detector.
 
     Raises:
-        ValueError: if there is no such baseline, or the hand has no fast channel.
+        ValueError: if the hand has no fast channel.
     """
 
-    name: BaselineName
     pool: FeaturePool
     channel_filter: ChannelFilter
 
     def __post_init__(self) -> None:
-        check_choice("baseline", self.name, get_args(BaselineName))
         if not self.pool.hand.fast:
             raise ValueError(_NO_FAST)
 

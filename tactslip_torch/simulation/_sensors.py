@@ -689,9 +689,9 @@ class Handled:
         carried: strokes in which an object of some mass moves with the hand.
 
     Raises:
-        ValueError: if the carried object would take more than half of static friction, or more
-            than a slide before has left of it, or there is no rest long enough for a tap or grip
-            that is asked for.
+        ValueError: if the carried object's inertia would take more than half of static friction,
+            inertia and weight together more than .95, or more than a slide before has left of it;
+            or if there is no rest long enough for a tap or grip that is asked for.
     """
 
     def __init__(self, scene: Scene, grasp: Grasp) -> None:
@@ -833,7 +833,7 @@ class Handled:
 
 
 def _require_carriable(scene: Scene, grasp: Grasp) -> None:
-    """Refuse an object whose inertia comes near to making the contact slide."""
+    """Refuse an object whose inertia and weight come near to making the contact slide."""
     force_n = scene.handling.carried_kg * scene.acceleration_m_s2
     friction_n = (1.0 - scene.contact.runout) * float(grasp.friction_n.sum())
     what = f"carrying {scene.handling.carried_kg:g} kg at {scene.acceleration_m_s2:g} m/s2 takes"
@@ -848,7 +848,7 @@ def _require_carriable(scene: Scene, grasp: Grasp) -> None:
             f"{friction_n:.3g} N of static friction, together more than {_MOST_LIFTED:g}: lower "
             "weight_share or carried_kg"
         )
-    fraction = force_n / friction_n
+    fraction = force_n / friction_n + scene.handling.weight_share
     for number, stroke in enumerate(scene.arm, 1):
         stops_s = [slide.stop_s for slide in scene.slides if slide.stop_s <= stroke.start_s]
         if stroke.slides or not stops_s:
@@ -857,7 +857,7 @@ def _require_carriable(scene: Scene, grasp: Grasp) -> None:
         if left + fraction > 1.0:
             raise ValueError(
                 f"{what} {fraction:.3g} of static friction in stroke {number}, and up to {left:.3g}"
-                " may be left of the slide before: pause longer or lower carried_kg"
+                " may be left of the slide before: pause longer or lower carried_kg or weight_share"
             )
 
 

@@ -53,7 +53,7 @@ SETTLED_S = 0.25
 FOUND_S = 0.25
 """Behind the first release, within which an alarm counts as found."""
 BEFORE, BEFORE_S = "before", 0.3
-"""A kind of hops: so long before a first release, which are negative."""
+"""A kind of hops where it has a weight: so long before a first release; they are negative."""
 _POSITIVE_WEIGHT = 0.5  # of all positive hops, over that of all others
 _TAIL = 0.001  # of hops whose columns are clipped at either end
 _SCALED_ROWS = 200_000  # of which ranges are taken
@@ -76,8 +76,8 @@ class OnsetTraining:
             fitted without it.
         comb_periods: of the mains, over which the comb takes the mean.
         mains_hz: nominal.
-        weights: of kinds of recordings without slip, in place of 1; ``"before"`` of hops before
-            slips.
+        weights: of kinds of recordings without slip, in place of 1. With ``"before"``, hops just
+            before slips are a kind of their own.
         seed: of a network's weights and batches.
 
     Raises:
@@ -391,7 +391,9 @@ class _Batches(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
         self._hops, self._known, self._lags = hops, known, lags
         self._scaler = FeatureScaler(scaler.minimum.float(), scaler.maximum.float())
         self._target = torch.from_numpy((label > 0).astype(np.float32))
-        kinds = np.where(label == -2, BEFORE, hops.kind[hops.recording[known]])
+        kinds = hops.kind[hops.recording[known]]
+        if BEFORE in weights:
+            kinds = np.where(label == -2, BEFORE, kinds)
         self._weight = torch.from_numpy(_weights(kinds, label > 0, weights))
         self._rng = np.random.default_rng(seed)
 
