@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+_QUIET = 8  # recordings of each kind without slip, with imperfections and without
 KEPT = Path(__file__).parent / "peers" / "alarms_0_2_0.json"
 
 
@@ -39,7 +40,7 @@ def store(folder: Path) -> None:
     wanted += [
         ("imperfect" if is_imperfect else "quiet", kind, quiet_source, recording)
         for (kind, is_imperfect), own in groups.items()
-        for recording in own
+        for recording in own[:_QUIET]
     ]
     folder.mkdir(parents=True, exist_ok=True)
     index = list[dict[str, Any]]()

@@ -96,6 +96,7 @@ _HELD_OF_HINTS = 0.05  # of the rate of hints, what recordings without slip may 
 _SETTLE_S = 0.05  # behind what a decision rests on, as EventRules.settle_s
 _LEVEL = 0.95  # of intervals
 _USUAL = torch.tensor([REST_QUANTILE, 1 - REST_QUANTILE], dtype=torch.float64)  # spans
+_ENOUGH = 0.99  # of the hours that are asked for
 _OTHERS = "others"  # scenes without hours of their own
 
 
@@ -645,7 +646,7 @@ class CalibratedAlarm:
             scene, h = recording.scene, hours["calibrate", recording.scene]
             given[scene] = h
         for scene, wanted in self.hours.items():
-            if scene != _OTHERS and given[scene] < wanted:
+            if scene != _OTHERS and given[scene] < _ENOUGH * wanted:
                 log.warning(
                     "%.2f h of %s are left to calibrate on, onset.hours asks for %g: give "
                     "onset.streams more",
