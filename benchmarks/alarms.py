@@ -159,6 +159,7 @@ class Alarms(Benchmark):
             hours set thresholds and are checked.
         worlds: names of ``WORLDS``.
         sessions: mountings of each material and world, each with three slips.
+        without_bristles: whether the first seed learns once more, from no bristles.
     """
 
     title = "The alarm in many worlds"
@@ -176,6 +177,7 @@ class Alarms(Benchmark):
     overrides: tuple[str, ...] = OVERRIDES
     worlds: tuple[str, ...] = tuple(WORLDS)
     sessions: int = 4
+    without_bristles: bool = True
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Slips in every world and false alarms of every kind, seeds together."""
@@ -191,7 +193,7 @@ class Alarms(Benchmark):
         without = [*given[0], "onset.worlds.bristles=0"]
         others = replace(self, worlds=tuple(w for w in self.worlds if "bristles" in w))
         unknown = list[dict[str, Any]]()
-        if others.worlds:
+        if others.worlds and self.without_bristles:
             others._seed(job.folder / "without bristles", first, without, unknown)
         before = earlier.get("slips", {})
         rows = [
