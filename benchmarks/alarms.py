@@ -149,6 +149,20 @@ QUICK = '","'.join(
 )
 
 
+class _Seed(NamedTuple):
+    """What a seed gave.
+
+    Attributes:
+        alarm: how it was set.
+        slips: what became of each, by world and method.
+        quiet: false alarms by kind of recording and method.
+    """
+
+    alarm: dict[str, Any]
+    slips: list[dict[str, Any]]
+    quiet: list[dict[str, Any]]
+
+
 @dataclass(frozen=True)
 class Alarms(Benchmark):
     """Every seed, fitted and evaluated.
@@ -168,7 +182,7 @@ class Alarms(Benchmark):
     quick = f'seeds=[0] overrides=["{QUICK}"] worlds=["pulled","bristles"] sessions=1'
     charts: ClassVar = {
         "": [
-            ("Slips found", ("found", "bins", "detail")),
+            ("Slips found", ("found", "bins", "detail", EARLIER)),
             ("Slips found", ("median", "p95")),
             ("False alarms", ("alarm",)),
         ]
@@ -181,12 +195,14 @@ class Alarms(Benchmark):
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Slips in every world and false alarms of every kind, seeds together."""
-        slips, quiet = list[dict[str, Any]](), list[dict[str, Any]]()
         given = [[f"seed={seed}", *self.overrides, *job.overrides] for seed in self.seeds]
-        set_by = [
-            self._seed(job.folder / f"seed-{seed}", seed, own, slips, quiet)
+        of_seeds = [
+            self._seed(job.folder / f"seed-{seed}", seed, own, with_quiet=True)
             for seed, own in zip(self.seeds, given, strict=True)
         ]
+        set_by = [each.alarm for each in of_seeds]
+        slips = [row for each in of_seeds for row in each.slips]
+        quiet = [row for each in of_seeds for row in each.quiet]
         first = self.seeds[0]
         earlier = self._earlier(given[0])
         quiet += [{"method": EARLIER} | row for row in earlier.get("quiet", [])]
@@ -194,7 +210,7 @@ class Alarms(Benchmark):
         others = replace(self, worlds=tuple(w for w in self.worlds if "bristles" in w))
         unknown = list[dict[str, Any]]()
         if others.worlds and self.without_bristles:
-            others._seed(job.folder / "without bristles", first, without, unknown)
+            unknown = others._seed(job.folder / "without bristles", first, without).slips
         before = earlier.get("slips", {})
         rows = [
             _world_row(world, own, before.get(world, []))
@@ -209,7 +225,7 @@ class Alarms(Benchmark):
                 "before it. *Hint*: within 100 ms. *Bins*: the detector of bins behind its "
                 "rule, *detail*: the largest wavelet detail of a fast channel, under the same "
                 f"budgets; detail of seed {first} alone. *0.2.0*: the alarm of that version, as "
-                f"its own training set it, seed {first}; its hours are whole recordings. "
+                f"its own training set it, seed {first}. "
                 f"Heads: {', '.join(alarm['classifier']['head'] for alarm in set_by)}.",
             ),
             "False alarms": Table(
@@ -219,7 +235,8 @@ class Alarms(Benchmark):
                 "those of them whose channels differ. *Of each*: of reflex grips, of which there "
                 f"are {GRIPS_PER_S:g} a second, and of strokes of the arm. Thresholds of each seed "
                 f"are those of {_hours(set_by[-1]['streams']['calibrate'])} of other materials, "
-                "at the point estimate.",
+                "at the point estimate. 0.2.0 has heard a part of the recordings of the first "
+                "seed; its hours are whole ones.",
             ),
         }
         if unknown:
@@ -250,11 +267,10 @@ class Alarms(Benchmark):
         folder: Path,
         seed: int,
         given: Sequence[str],
-        slips: list[dict[str, Any]],
-        quiet: list[dict[str, Any]] | None = None,
-    ) -> dict[str, Any]:
-        """How the alarm of a seed was set; what became of slips and of the rest is added."""
-        given, has_detail = ["+exp=onset", *given], seed == self.seeds[0] and quiet is not None
+        with_quiet: bool = False,
+    ) -> _Seed:
+        """The alarm of a seed, slips in all worlds and, on request, recordings without slip."""
+        given, has_detail = ["+exp=onset", *given], with_quiet and seed == self.seeds[0]
         made_by = [*given, f"detail={has_detail}"]
         say(f"the alarm in {folder.name}")
         fit = partial(_fitted, given, folder / "detector.pt", has_detail)
@@ -263,11 +279,12 @@ class Alarms(Benchmark):
         say(f"{len(self.worlds)} worlds of {folder.name}")
         of_worlds = [*made_by, *self.worlds, f"sessions={self.sessions}"]
         run = partial(_slips, methods, alarm["held_out"], self, seed)
-        slips += resumed(folder / "worlds.json", of_worlds, run)
-        if quiet is not None:
-            say(f"recordings without slip of {folder.name}")
-            quiet += resumed(folder / "quiet.json", made_by, partial(_quiet, methods, given))
-        return alarm
+        slips = resumed(folder / "worlds.json", of_worlds, run)
+        if not with_quiet:
+            return _Seed(alarm, slips, [])
+        say(f"recordings without slip of {folder.name}")
+        quiet = resumed(folder / "quiet.json", made_by, partial(_quiet, methods, given))
+        return _Seed(alarm, slips, quiet)
 
     def _earlier(self, given: Sequence[str]) -> dict[str, Any]:
         """What 0.2.0 made of the recordings of the first seed; empty if it heard others."""

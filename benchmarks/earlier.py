@@ -1,6 +1,6 @@
 """The alarm of 0.2.0 on recordings of ``benchmarks.alarms``: run once, its numbers are kept.
 
-    python -m benchmarks.earlier store FOLDER             # here: the recordings of seed 0
+    python -m benchmarks.earlier store FOLDER             # here: recordings of seed 0
     python benchmarks/earlier.py hear FOLDER DETECTOR     # in an environment of 0.2.0
     python -m benchmarks.earlier count FOLDER             # here: what became of slips
 
@@ -24,7 +24,7 @@ KEPT = Path(__file__).parent / "peers" / "alarms_0_2_0.json"
 
 
 def store(folder: Path) -> None:
-    """Write samples of slips in all worlds and of held-out materials without slip."""
+    """Write samples of slips in all worlds, and of a few recordings without slip of each kind."""
     from benchmarks.alarms import Alarms, quiet_recordings, world_recordings
     from tactslip_torch.runtime import bar
 

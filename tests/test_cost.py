@@ -11,7 +11,7 @@ from test_views import drawn
 from tactslip_torch import FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.features.cost import MACHINES, WorkCosts
 from tactslip_torch.features.descriptors import FeatureName
-from tactslip_torch.features.selection import forward_selection
+from tactslip_torch.features.selection import ColumnCosts, forward_selection
 from tactslip_torch.native import _Matrix, reason_unavailable
 from tactslip_torch.training.recipe import General
 
@@ -120,7 +120,7 @@ def test_of_columns_of_equal_gain_the_cheaper_is_taken(rng):
     ones = torch.ones(200).double()
 
     def taken(*prices):
-        costs = needs, torch.tensor(prices).double(), 0.1
+        costs = ColumnCosts(needs, torch.tensor(prices).double(), 0.1)
         return forward_selection(columns, targets, ones, 2, costs=costs)
 
     assert forward_selection(columns, targets, ones, 2) == [0, 2]
@@ -135,7 +135,7 @@ def test_costs_decide_nothing_where_all_columns_cost_alike(rng):
     columns = torch.from_numpy(rng.standard_normal((100, 8)))
     targets = columns @ torch.from_numpy(rng.standard_normal((8, 1)))
     ones = torch.ones(100).double()
-    alike = torch.eye(8).double(), 7 * torch.ones(8).double(), 0.5
+    alike = ColumnCosts(torch.eye(8).double(), 7 * torch.ones(8).double(), 0.5)
     assert forward_selection(columns, targets, ones, 5, costs=alike) == forward_selection(
         columns, targets, ones, 5
     )

@@ -24,8 +24,15 @@ from sklearn.pipeline import make_pipeline
 from sklearn.utils import estimator_checks, get_tags
 from small_set import SMALL_HAND
 
-from tactslip_torch import SlipClassifier, SlipDetector, StreamingDetector, TactileFeatures
+from tactslip_torch import (
+    AlarmSettings,
+    SlipClassifier,
+    SlipDetector,
+    StreamingDetector,
+    TactileFeatures,
+)
 from tactslip_torch.estimators import _fitted_to_classes
+from tactslip_torch.training.alarm import DebouncedAlarm
 
 RATE_HZ = 2000.0
 Array = NDArray[Any]
@@ -103,6 +110,11 @@ def test_a_classifier_is_a_detector_before_and_after_it_was_kept(
     says_slip = fitted.detector_.score_raw(torch.from_numpy(X)) >= 0
     np.testing.assert_array_equal(says_slip, fitted.predict(X) == "slip")
     fitted.save(tmp_path / "slip.pt")
+    other = SlipDetector.load(tmp_path / "slip.pt")
+    own = AlarmSettings.of(other).to_dict()
+    DebouncedAlarm()(other)  # as onset=debounced, the default of training
+    calibration = own["calibration"]
+    assert AlarmSettings.of(other).to_dict() | {"calibration": calibration} == own
     stream = StreamingDetector(SlipDetector.load(tmp_path / "slip.pt"))
     slips = np.concatenate(X[y == "slip"][:6], -1).T
     assert stream.push(slips).alarms

@@ -30,7 +30,14 @@ from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence, OnsetStream, Perceptron
 from tactslip_torch.onset.rules import NOTHING_YET, KOfN
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.onset import OnsetTraining, _columns_of, _labels_of, _weights
+from tactslip_torch.training.onset import (
+    OnsetTraining,
+    _Batches,
+    _columns_of,
+    _Hops,
+    _labels_of,
+    _weights,
+)
 
 RATE = 2000.0
 STEP = 1e-3
@@ -716,6 +723,23 @@ def test_kinds_without_slip_weigh_as_they_are_told_to():
     assert of_kind["taps"] == pytest.approx(of_kind["slip"])
     assert weights[is_slip].sum() == pytest.approx(sum(of_kind.values()) / 2)
     assert weights.mean() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("given", [{}, {"before": 3.0}])
+def test_what_comes_before_a_slip_is_a_kind_where_it_has_a_weight(given):
+    label = np.array([-1] * 40 + [-2] * 10 + [1] * 10, np.int8)
+    one, none = np.zeros(60, int), np.zeros((60, 2), np.float16)
+    hops = _Hops(
+        none, label, one, one, one, np.array(["a"]), np.array(["slip"]), [(0.0,)], [(1.0,)]
+    )
+    scaler = FeatureScaler(torch.zeros(2).double(), torch.ones(2).double())
+    batches = _Batches(hops, np.arange(60), scaler, [], given, 0)
+    weight = np.array([batches._weight[batches._known == n].sum() for n in range(60)])
+    usual, before = weight[:40].sum(), weight[40:50].sum()
+    if given:
+        assert before == pytest.approx(3 * usual)
+    else:  # as every other hop
+        assert before / usual == pytest.approx(10 / 40)
 
 
 NOTHING_TO_LEARN = [

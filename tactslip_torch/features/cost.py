@@ -21,6 +21,7 @@ from torch import Tensor
 
 from tactslip_torch.features.descriptors import SORTED, FeatureName
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.selection import ColumnCosts
 from tactslip_torch.signals.wavelet import wavelet_steps
 
 COSTS_PATH = Path(__file__).parent / "costs.json"
@@ -76,13 +77,8 @@ class WorkCosts:
         rest: Parts = {("decision",): 1, ("scaled",): num_scaled, ("multiply-add",): multiply_adds}
         return _union([rest, *map(self.parts, columns)])
 
-    def table(self, columns: Sequence[FeatureName]) -> tuple[Tensor, Tensor, float]:
-        """Which parts each of some scaled columns needs, the cost of each part, and of scaling.
-
-        Shape:
-            - columns: S, of which several may be of one name
-            - output: ``[S, P]``, 0 or 1; ``[P]``; float64
-        """
+    def table(self, columns: Sequence[FeatureName]) -> ColumnCosts:
+        """Costs of some scaled columns, of which several may be of one name; float64."""
         of_name = {name: self.parts(name) for name in dict.fromkeys(columns)}
         union = _union(of_name.values())
         place = {part: index for index, part in enumerate(union)}
@@ -90,7 +86,8 @@ class WorkCosts:
         for row, name in enumerate(columns):
             needs[row, [place[part] for part in of_name[name]]] = 1
         costs = [self.cost([{part: amount}]) for part, amount in union.items()]
-        return needs, torch.tensor(costs, dtype=torch.float64), self.costs["scaled"]
+        of_part = torch.tensor(costs, dtype=torch.float64)
+        return ColumnCosts(needs, of_part, self.costs["scaled"])
 
     def _of_channel(self, name: FeatureName) -> Parts:
         """Of a feature of one channel, which it shares with the channels computed beside it."""

@@ -8,6 +8,7 @@ Moments are gathered in passes over recordings and merge.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -202,13 +203,27 @@ def _attribute(hand: HandLayout, name: FeatureName, attribute: str) -> str:
 _LEFT = 1e-6  # of a column's square; what is below is explained by the columns before
 
 
+class ColumnCosts(NamedTuple):
+    """What columns cost that share parts of the work, each paid once.
+
+    Attributes:
+        needs: which parts each column needs, ``[S, P]``, 0 or 1.
+        of_part: the cost of each part, ``[P]``.
+        of_column: what any column costs itself.
+    """
+
+    needs: Tensor
+    of_part: Tensor
+    of_column: float
+
+
 def forward_selection(
     columns: Tensor,
     targets: Tensor,
     weights: Tensor,
     num: int,
     ridge: float = 1.0,
-    costs: tuple[Tensor, Tensor, float] | None = None,
+    costs: ColumnCosts | None = None,
 ) -> list[int]:
     """Columns that explain targets best together, best first: greedy least squares.
 
@@ -222,13 +237,11 @@ def forward_selection(
         weights: of bins.
         num: of columns to take, at most.
         ridge: added to the square of each column.
-        costs: which parts of the work each column needs, the cost of each part, and what any column
-            costs itself (``cost.WorkCosts``). Then the column is taken whose gain is largest for
-            what it adds to the cost; parts that columns before it need as well add nothing.
+        costs: of the columns (``cost.WorkCosts``). Then the column is taken whose gain is largest
+            for what it adds to the cost; parts that columns before it need as well add nothing.
 
     Shape:
         - columns: ``[N, S]``, float64; targets: ``[N, R]``; weights: ``[N]``
-        - costs: ``[S, P]``, 0 or 1; ``[P]``
 
     Reference:
         Chen, Billings and Luo (1989), International Journal of Control 50(5), 1873-1896.
@@ -244,9 +257,9 @@ def forward_selection(
         gain = torch.where(square > _LEFT * whole, gain, -1.0)
         gain[taken] = -1.0
         if costs is not None:
-            needs, price, own = costs
-            is_paid = needs[taken].amax(0) if taken else 0 * price
-            gain = gain / (own + needs @ (price * (1 - is_paid)))
+            is_paid = costs.needs[taken].amax(0) if taken else 0 * costs.of_part
+            added = costs.needs @ (costs.of_part * (1 - is_paid))
+            gain = gain / (costs.of_column + added)
         best = int(gain.argmax())
         if gain[best] <= 0:
             break

@@ -3,9 +3,9 @@
 A hop is positive from the release of half of the load to 0.3 s behind it, or to the end of the
 slide. Left out are those from the first release to that of half, and the rest of the slide with
 0.25 s behind it. All others are negative; kinds of recordings weigh alike, or as is said, and the
-0.3 s before a first release are a kind of its own: a load grows there, and nothing slips yet. Heads
-are fitted by the logistic loss on all hops; that which finds more slips of materials left out is
-taken.
+0.3 s before a first release may be a kind of their own: a load grows there, and nothing slips yet.
+Heads are fitted by the logistic loss on all hops; that which finds more slips of materials left out
+is taken.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from tactslip_torch.features.descriptors import FeatureName
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.selection import forward_selection
+from tactslip_torch.features.selection import ColumnCosts, forward_selection
 from tactslip_torch.features.sensing import SpanFeatures
 from tactslip_torch.model.calibration import platt_or_none
 from tactslip_torch.model.kernels import (
@@ -107,7 +107,7 @@ class View:
         held_out: score of each bin, and of its second copy if it has one, by the machine without
             its group, for each penalty, ``[1 or 2, P, N, R]``; NaN where there is none.
         sums: of the columns of all training bins, for degree 1; ``None``: those in memory are all.
-        costs: of its columns, as ``forward_selection`` takes them.
+        costs: of its columns; ``None``: they cost alike.
     """
 
     name: str
@@ -116,7 +116,7 @@ class View:
     gain: Tensor
     held_out: Tensor
     sums: ClassSums | None = None
-    costs: tuple[Tensor, Tensor, float] | None = None
+    costs: ColumnCosts | None = None
 
     @property
     def degree(self) -> int:
@@ -191,9 +191,6 @@ class Choice:
         return replace(self, views=tuple(replace(v, held_out=none, sums=None) for v in self.views))
 
 
-Costs = Callable[[Sequence[FeatureName]], tuple[Tensor, Tensor, float]]
-
-
 @dataclass(frozen=True)
 class ViewSettings:
     """How views are chosen; as ``recipe.General`` has them.
@@ -220,7 +217,7 @@ def base_views(
     pool: FeaturePool,
     allowed: Mapping[str, Tensor],
     settings: ViewSettings,
-    costs: Costs | None = None,
+    costs: Callable[[Sequence[FeatureName]], ColumnCosts] | None = None,
 ) -> list[View]:
     """Views with all of their columns, standardised, before anything is chosen.
 
@@ -229,8 +226,7 @@ def base_views(
         pool: of their features.
         allowed: which features each view may use, ``[F]``, bool.
         settings: which views.
-        costs: of columns by their names, as ``forward_selection`` takes them; ``None``: columns
-            cost alike.
+        costs: gives those of columns by their names; ``None``: columns cost alike.
     """
     made, spans = list[View](), SpanFeatures(pool.hand, pool.names, pool.bin_samples)
     for name in settings.views:
@@ -374,7 +370,7 @@ class _Rows:
     groups: Tensor
     weights: Tensor
     num_bins: int
-    costs: tuple[Tensor, Tensor, float] | None
+    costs: ColumnCosts | None
 
     @classmethod
     def of(cls, view: View, bins: ViewBins, z: Tensor, most: int = MOST_CHOICE_BINS) -> _Rows:
