@@ -32,7 +32,7 @@ from benchmarks.timing import interleaved, on_threads
 from benchmarks.trainings import composed, trained
 from tactslip_torch import SlipDetector, StreamingDetector, sample_recording
 from tactslip_torch.deploy.bins import Precision
-from tactslip_torch.deploy.check import _WORST, Run, _session_of, runner
+from tactslip_torch.deploy.check import LARGEST_ERROR, Run, runner, session_of
 from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.deploy.native import FILE, SOURCE, NativeFile
 from tactslip_torch.deploy.stream import stream_graph
@@ -253,15 +253,15 @@ def _test_set(detector: SlipDetector, every: int) -> Table:
     (fold,) = instantiate(config.split, _convert_="all")(source.ids)
     chosen = [each for each in source.ids if fold.roles.get(each) in ("test", "unseen")][::every]
     ways: dict[tuple[str, Precision], Callable[[Array], Mapping[str, Array]]] = {}
-    for precision in _WORST:
+    for precision in LARGEST_ERROR:
         ways["C", precision] = partial(_by_library, NativeFile.of(detector, precision))
         model = stream_graph(detector, AlarmSettings.of(detector), precision).model()
-        ways["graph", precision] = partial(_by_graph, runner(_session_of(model)))
+        ways["graph", precision] = partial(_by_graph, runner(session_of(model)))
     found: dict[tuple[str, Precision], list[Array]] = {way: [] for way in ways}
     for number, each in enumerate(chosen):
         say(f"native_c: recording {number + 1} of {len(chosen)} of the test set")
         given = source.load(each).samples.T.contiguous()
-        for precision in _WORST:
+        for precision in LARGEST_ERROR:
             samples = given.to(getattr(torch, precision))
             decided = StreamingDetector(detector, dtype=samples.dtype).push(samples)
             wanted = [decided.score, decided.is_on, decided.is_alarm, decided.is_valid]
@@ -276,7 +276,7 @@ def _test_set(detector: SlipDetector, every: int) -> Table:
         (score, on, alarm, valid), expected = both[:4], both[4:]
         off, spread = np.abs(score - expected[0]), np.nanstd(expected[0])
         is_other = (score >= 0) != (expected[0] >= 0)
-        is_outside = is_other & (np.abs(expected[0]) > _WORST[precision] * spread)
+        is_outside = is_other & (np.abs(expected[0]) > LARGEST_ERROR[precision] * spread)
         rows.append(
             {
                 "way": f"{way}, {precision}",
@@ -293,8 +293,8 @@ def _test_set(detector: SlipDetector, every: int) -> Table:
     return Table(
         rows,
         f"{len(chosen)} recordings of materials seen in training and held out (simulated), against "
-        f"the package; the margin is {_WORST['float32']:g} of the scores' standard deviation in "
-        f"float32, {_WORST['float64']:g} in float64.",
+        f"the package; the margin is {LARGEST_ERROR['float32']:g} of the scores' standard deviation "
+        f"in float32, {LARGEST_ERROR['float64']:g} in float64.",
     )
 
 

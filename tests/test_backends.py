@@ -11,7 +11,7 @@ from extremes import EXTREMES, extreme_bins
 from test_detector import repeated
 
 from tactslip_torch.deploy.bins import RawBin, bin_graph
-from tactslip_torch.deploy.check import _session_of, runner
+from tactslip_torch.deploy.check import runner, session_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.onset.decisions import score_stream
@@ -76,7 +76,7 @@ def backends(request, graphs_of, tmp_path_factory):
         model = bin_graph(made, precision).model()
     else:
         model = onnx.load(graphs_of(recipe, precision) / "model.onnx")
-    graph = runner(_session_of(model))
+    graph = runner(session_of(model))
     native, by_torch = (SlipDetector.load(file, backend=name) for name in ("auto", "torch"))
     score = native.predict_raw(bins_of(native, samples_of("D", 1))).score
     return Backends(native, by_torch, graph, getattr(torch, precision), float(score.std()))

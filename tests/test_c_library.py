@@ -13,7 +13,7 @@ from hosts import alarming_detector, slipping_stream
 from tactslip_torch import SlipDetector, StreamingDetector
 from tactslip_torch.commands import export
 from tactslip_torch.deploy.bins import Precision
-from tactslip_torch.deploy.check import _session_of, runner
+from tactslip_torch.deploy.check import runner, session_of
 from tactslip_torch.deploy.native import FILE, SOURCE, NativeFile, _NativeStream
 from tactslip_torch.deploy.stream import stream_graph
 from tactslip_torch.features.sensing import Sensing
@@ -180,7 +180,7 @@ def test_c_and_package_decide_alike(detector, native, kind):
 @pytest.mark.onnx
 def test_c_and_graph_decide_alike(detector, native):
     graph = stream_graph(detector, AlarmSettings.of(detector), "float64")
-    run = runner(_session_of(graph.model()))
+    run = runner(session_of(graph.model()))
     for kind in KINDS:
         native.reset()
         samples = kind_of(kind)

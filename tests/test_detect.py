@@ -14,6 +14,7 @@ from tactslip_torch import HandLayout, Recording
 from tactslip_torch.commands import detect as module
 from tactslip_torch.commands.detect import detect
 from tactslip_torch.commands.stopping import one_line
+from tactslip_torch.data.folder import recording_files
 from tactslip_torch.data.formats import FORMATS, Samples
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, score_stream
@@ -343,6 +344,14 @@ REFUSED = {
     ),
     "view": (recording, ["view=3"], "view must be [start, end] in seconds, got 3"),
 }
+
+
+def test_a_folder_of_folders_is_refused_with_where_the_recordings_are(tmp_path):
+    (tmp_path / "cup").mkdir()
+    save(tmp_path / "cup" / "a.npz", recording())
+    with pytest.raises(ValueError, match=r"itself \(folders inside it were not"):
+        recording_files(tmp_path)
+    assert [path.name for path in recording_files(tmp_path, in_folders=True)] == ["a.npz"]
 
 
 @pytest.mark.parametrize("name", REFUSED)

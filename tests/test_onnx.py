@@ -20,7 +20,7 @@ from test_detector import VARIANTS, noise, random_detector
 from test_predictions import with_imputation
 
 from tactslip_torch.deploy.bins import RawBin, Timing, bin_graph
-from tactslip_torch.deploy.check import _session_of, check_model, compare, runner
+from tactslip_torch.deploy.check import check_model, compare, runner, session_of
 from tactslip_torch.deploy.stream import stream_graph
 from tactslip_torch.deploy.value import F32, F64, Graph
 from tactslip_torch.features.sensing import Sensing
@@ -49,7 +49,7 @@ def run_on(detector, precision, samples, mask=None):
     feeds = {"samples": cut(detector, samples).to(getattr(torch, precision)).numpy()}
     if mask is not None:
         feeds["samples"][..., mask.numpy(), :] = np.nan
-    return runner(_session_of(bin_graph(detector, precision).model()))(feeds)
+    return runner(session_of(bin_graph(detector, precision).model()))(feeds)
 
 
 def assert_scores(detector, precision, samples, mask=None, spread=None):
@@ -193,7 +193,7 @@ WRONG = [
 def test_a_wrong_graph_is_refused(request, kind, change, message):
     made_of = request.getfixturevalue("joint" if kind == "joint" else "detector")
     graph = "bin" if kind == "bin" else "stream"
-    run = runner(_session_of(model_of(made_of, graph)))
+    run = runner(session_of(model_of(made_of, graph)))
     with pytest.raises(ValueError, match=message) as caught:
         compare(lambda given: change(given["samples"], run(given)), made_of, graph, "float32")
     assert "\n" not in str(caught.value)
@@ -232,12 +232,12 @@ def test_a_model_that_cannot_be_run_is_told_in_one_line():
     graph = Graph()
     graph.output("score", graph.input("samples", F64, ("batch", 8)).sum(1), ("batch",))
     with pytest.raises(ValueError, match=r"cannot run it on samples \[3, 7\]: .*") as one:
-        runner(_session_of(graph.model()))({"samples": np.ones((3, 7))})
+        runner(session_of(graph.model()))({"samples": np.ones((3, 7))})
     assert "\n" not in str(one.value)
     broken = graph.model()
     broken.graph.node[0].input[0] = "nowhere"
     with pytest.raises(ValueError, match=r"onnxruntime cannot load it: .*nowhere"):
-        _session_of(broken)
+        session_of(broken)
 
 
 # Streams ---------------------------------------------------------------------------------------
@@ -281,7 +281,7 @@ def watching(
 @cache
 def graph_of(precision, **options):
     detector, settings, _ = watching(**options)
-    return runner(_session_of(stream_graph(detector, settings, precision).model()))
+    return runner(session_of(stream_graph(detector, settings, precision).model()))
 
 
 class Host:

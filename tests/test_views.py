@@ -9,7 +9,7 @@ import torch
 from small_detector import HAND, raw_bins
 
 from tactslip_torch.deploy.bins import RawBin, bin_graph
-from tactslip_torch.deploy.check import _session_of, runner
+from tactslip_torch.deploy.check import runner, session_of
 from tactslip_torch.features.pool import FeaturePool, is_simple_of
 from tactslip_torch.features.selection import forward_selection
 from tactslip_torch.hand import HandLayout
@@ -401,7 +401,7 @@ def test_a_detector_of_several_views_scores_alike_by_torch_native_and_onnx():
     raw = RawBin.of(detector)
     start = detector.context_before - raw.before
     cut = bins[..., start : start + raw.length].contiguous().numpy()
-    got = runner(_session_of(bin_graph(detector, "float64").model()))({"samples": cut})
+    got = runner(session_of(bin_graph(detector, "float64").model()))({"samples": cut})
     np.testing.assert_allclose(got["score"], expected.score, rtol=0, atol=1e-9 * spread)
 
 

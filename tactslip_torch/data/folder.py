@@ -62,7 +62,9 @@ def recording_files(place: Path, *, in_folders: bool = False) -> list[Path]:
     found = [path for path in found if path != place / table]
     if not found:
         known = " or ".join(f".{ending}" for ending in endings())
-        raise ValueError(f"no recording in {place}; give a folder of {known} files")
+        inside = "" if in_folders else " itself (folders inside it were not looked into)"
+        inside = inside if any(path.is_dir() for path in place.iterdir()) else ""
+        raise ValueError(f"no recording in {place}{inside}; give a folder of {known} files")
     return found
 
 

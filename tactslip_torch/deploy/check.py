@@ -32,7 +32,7 @@ GraphKind = Literal["bin", "stream"]
 Arrays = Mapping[str, NDArray[Any]]
 Run = Callable[[Arrays], dict[str, NDArray[Any]]]
 
-_WORST: dict[Precision, float] = {"float32": 1e-3, "float64": 1e-9}
+LARGEST_ERROR: dict[Precision, float] = {"float32": 1e-3, "float64": 1e-9}
 """Largest error of a score in its standard deviations, and of a statistic in its range."""
 _WORST_PROBABILITY = {"float32": 1e-5, "float64": 1e-9}  # beside that of the score given
 _LOSSES = 10.0  # by which errors may be larger where channels are lost
@@ -56,7 +56,7 @@ def check_model(
     Raises:
         ValueError: for the first output that differs, in one line.
     """
-    return compare(runner(_session_of(model)), detector, kind, precision)
+    return compare(runner(session_of(model)), detector, kind, precision)
 
 
 def compare(
@@ -82,7 +82,7 @@ def compare(
         if what == "whole" and len(score):
             sd = float(score.std()) or 1.0
         _assert_alike(found, expected, f"{kind} graph, {what}")
-        most = _WORST[precision] * (1.0 if what == "whole" else _LOSSES)
+        most = LARGEST_ERROR[precision] * (1.0 if what == "whole" else _LOSSES)
         known = expected.get("statistic", score)
         known = known[known > NOTHING_YET]
         tolerances = {
@@ -241,7 +241,7 @@ def _with_losses(samples: Tensor, detector: SlipDetector) -> Tensor:
     return broken
 
 
-def _session_of(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
+def session_of(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
     """A session on one thread, optimised as onnxruntime does by default.
 
     Raises:
