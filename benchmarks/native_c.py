@@ -293,8 +293,9 @@ def _test_set(detector: SlipDetector, every: int) -> Table:
     return Table(
         rows,
         f"{len(chosen)} recordings of materials seen in training and held out (simulated), against "
-        f"the package; the margin is {LARGEST_ERROR['float32']:g} of the scores' standard deviation "
-        f"in float32, {LARGEST_ERROR['float64']:g} in float64.",
+        "the package; the margin is "
+        f"{LARGEST_ERROR['float32']:g} of the scores' standard deviation in float32, "
+        f"{LARGEST_ERROR['float64']:g} in float64.",
     )
 
 
