@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,6 +26,7 @@ from tactslip_torch.features.pool import Arithmetic
 from tactslip_torch.native import BackendName
 
 HAND = HandLayout.paper24()
+LENGTHS = (100, 256, 512, 1000, 1024)
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,25 @@ class Features(Benchmark):
             "the larger of the reference's magnitude and its column's standard deviation; of "
             "entropy and mode, which step, the 99th percentile."
         )
-        return {"tables": {"Time and error": Table(rows, note)}}
+        lengths = Table(self._by_length(), "Noise in float64, one thread.")
+        return {"tables": {"Time and error": Table(rows, note), "Length of bins": lengths}}
+
+    @torch.inference_mode()
+    def _by_length(self) -> list[dict[str, Any]]:
+        """What a sample costs in bins of each length, of one bin and of several."""
+        calls: dict[str, Callable[[], Any]] = {}
+        nums = {"one bin": 1, "in bulk": self.slow_bins}
+        for length in LENGTHS:
+            pool = FeaturePool(HAND, bin_samples=length).paper()
+            bins = torch.randn(self.slow_bins, len(HAND), length, dtype=torch.float64)
+            calls |= {f"{length} {name}": partial(pool, bins[:n]) for name, n in nums.items()}
+        with on_threads(1):
+            timings = interleaved(calls, self.rounds, block_s=0)
+        rows: list[dict[str, Any]] = [{"samples": length} for length in LENGTHS]
+        for row, (name, n) in product(rows, nums.items()):
+            seconds = timings[f"{row['samples']} {name}"]["seconds"]
+            row[f"{name}, us a sample"] = times(seconds, 1e6 / n / row["samples"])
+        return rows
 
 
 def _error(found: Tensor, reference: Tensor) -> float:

@@ -38,18 +38,20 @@ def small_detector(
     seed: int = 0,
     *,
     arithmetic: str = "double",
+    bin_samples: int = 100,
     backend: BackendName = "auto",
 ) -> SlipDetector:
     """Of random features, without those that the least rounding moves far."""
     rng = np.random.default_rng(seed)
-    pool = FeaturePool(HAND, arithmetic=arithmetic)  # type: ignore[arg-type]
+    pool = FeaturePool(HAND, bin_samples=bin_samples, arithmetic=arithmetic)  # type: ignore[arg-type]
     channel_filter = ChannelFilter([51, 51, 11, 11])
     jumpy, is_paper = ("mode", "cv", "entropy"), pool.is_paper.tolist()
     steady = [i for i, n in enumerate(pool.names) if is_paper[i] and n.descriptor not in jumpy]
     of_gauges = rng.choice([i for i in steady if i < 26], 4, replace=False)
     of_films = rng.choice([i for i in steady if i >= 26], NUM_FEATURES - 4, replace=False)
     selected = [int(i) for i in (*of_gauges, *of_films)]
-    features = pool(channel_filter.valid(raw_bins(64, seed=99)))[:, selected]
+    bins = raw_bins(64, seed=99, num_samples=bin_samples + 50)
+    features = pool(channel_filter.valid(bins))[:, selected]
     scaler = FeatureScaler.fit(features)
     bend = torch.from_numpy(rng.standard_normal((NUM_FEATURES, NUM_FEATURES)))
     linear = torch.from_numpy(rng.standard_normal(NUM_FEATURES))
@@ -69,9 +71,9 @@ def with_floors(detector: SlipDetector, min_alive: int, stuck_samples: int = 150
     return detector
 
 
-def alarming_detector(seed: int = 0) -> SlipDetector:
+def alarming_detector(seed: int = 0, bin_samples: int = 100) -> SlipDetector:
     """The small detector, with settings by which the simulated slip raises alarms."""
-    made = small_detector(seed, backend="auto")
+    made = small_detector(seed, bin_samples=bin_samples)
     scores = score_stream(made, slip_samples(HAND), 20).score
     made.info[KEY] = alarms_of(scores, 20).to_dict()
     return made

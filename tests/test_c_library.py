@@ -7,7 +7,9 @@ from dataclasses import replace
 import hosts
 import numpy as np
 import pytest
+import small_detector
 import torch
+from extremes import slip_samples
 from hosts import alarming_detector, slipping_stream
 
 from tactslip_torch import SlipDetector, StreamingDetector
@@ -278,6 +280,20 @@ def test_a_slow_hand_of_96_channels_decides_alike():
     samples = 1e4 + 300 * np.random.default_rng(3).standard_normal((900, 96))
     samples[400:600, 10:20] = np.nan
     assert_same(stream_of(detector).push(samples), by_package(detector, samples))
+
+
+@pytest.mark.parametrize("num", [300, 1000, 1024])
+def test_long_bins_are_decided_alike_and_their_files_stay_small(num):
+    detector = small_detector.alarming_detector(bin_samples=num)
+    samples = slip_samples(detector.pool.hand).T.numpy()
+    wanted = by_package(detector, samples)
+    assert wanted["alarm"].any()
+    assert_same(stream_of(detector).push(samples), wanted)
+    rounded = stream_of(detector, "float32").push(samples.astype(np.float32))["score"]
+    spread = np.nanstd(wanted["score"])
+    np.testing.assert_allclose(rounded, wanted["score"], rtol=0, atol=1e-3 * spread)
+    finest = 2 * num * (num // 2)  # numbers of the matrix to the lines of D1
+    assert len(NativeFile.of(detector).content) < 4 * finest
 
 
 def test_decisions_are_in_range_by_what_set_the_threshold():

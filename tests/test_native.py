@@ -211,6 +211,43 @@ def test_spectra_that_nothing_reads_are_no_part_of_the_plan(wanted, read, num):
     assert kept == set(read.split())
 
 
+LONG = {
+    (256, "reference"): 0,
+    (300, "reference"): 1024,
+    (999, "clean"): 0,
+    (512, "clean"): 512,
+    (1000, "clean"): 1000,
+    (1000, "reference"): 2048,
+    (1024, "reference"): 2048,
+}
+
+
+@needs_engine
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize(("num", "spectrum"), LONG, ids=str)
+def test_spectra_of_long_bins_are_transforms_and_as_exact(num, spectrum, level, monkeypatch):
+    monkeypatch.setenv(native.SWITCH, level)
+    options = {"bin_samples": num, "spectrum": spectrum}
+    whole = FeaturePool(HAND, **options)
+    steady = [i for i, n in enumerate(whole.names) if n.descriptor not in ("mode", "entropy")]
+    pool, bins = whole.select(steady), raw_bins(20, num_samples=num)
+    assert pool.engine(torch.float64).plan.num_points == LONG[num, spectrum]
+    exact = made(pool, backend="torch")(bins)
+    for count in (1, 20):
+        torch.testing.assert_close(pool(bins[:count]), exact[:count], rtol=1e-10, atol=1e-10)
+    rounded = bins.float()
+    exact = made(pool, backend="torch")(rounded.double())
+
+    def error():
+        in_float32 = FeaturePool(HAND, **options, arithmetic="native").select(steady)
+        lines = [i for i, name in enumerate(pool.names) if name.domain == "freq"]
+        return float(((in_float32(rounded) - exact) / exact.abs())[:, lines].abs().median())
+
+    by_transform = error()
+    monkeypatch.setattr(native, "_SHORT", num)
+    assert by_transform < min(1e-6, 1.1 * error())
+
+
 # Manners -------------------------------------------------------------------------------------
 
 

@@ -262,7 +262,7 @@ def _write_filters(
 def _write_plan(out: _Writer, plan: ctypes.Structure) -> None:
     num_levels, num_features = plan.num_branches // 2, plan.num_features
     out.numbers(plan.num_lines, num_levels)
-    out.fields(plan, "num_features", "num_slow", "num_fast")
+    out.fields(plan, "num_features", "num_slow", "num_fast", "num_points")
     places = plan.num_channels * (2 * plan.num_branches + 2)
     out.arrays(plan, np.int32, slow=plan.num_slow, fast=plan.num_fast, first=places + 1)
     out.arrays(plan, np.int32, descriptor=num_features, column=num_features)
@@ -274,6 +274,8 @@ def _write_plan(out: _Writer, plan: ctypes.Structure) -> None:
             _write_matrix(out, plan.out, branch)
             _write_matrix(out, plan.lines, branch)
     num_lines = plan.num_lines
+    num_points = plan.num_points
+    out.arrays(plan, cosines=num_points // 4 * 5, line_gains=num_points and num_lines)
     out.arrays(plan, ones=2 * num_lines, frequency_hz=num_lines)
     out.arrays(plan, gain_time=plan.num_samples, gain_lines=num_lines)
 

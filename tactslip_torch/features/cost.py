@@ -22,6 +22,7 @@ from torch import Tensor
 from tactslip_torch.features.descriptors import SORTED, FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import ColumnCosts
+from tactslip_torch.native import transform_work
 from tactslip_torch.signals.wavelet import wavelet_steps
 
 COSTS_PATH = Path(__file__).parent / "costs.json"
@@ -130,16 +131,17 @@ class WorkCosts:
         }
 
     @cached_property
-    def _products(self) -> dict[str, int]:
+    def _products(self) -> dict[str, float]:
         """Multiplications of each matrix: to a level, from there to a branch, and to its lines."""
-        pool, found = self.pool, dict[str, int]()
+        pool, found = self.pool, dict[str, float]()
         steps = wavelet_steps(pool.bin_samples, pool.wavelet, pool.level)
+        transform = transform_work(pool.maps.dense_lines.numpy())
         for m, (low, high) in enumerate(zip(steps.low, steps.high, strict=True)):
             found[f"level {m + 1}"] = _multiplications(low) + _multiplications(high)
             for kind, out in zip("AD", steps.out[2 * m :], strict=False):
                 found[f"{kind}{m + 1}"] = _multiplications(out)
                 to_lines = pool.maps.dense_lines @ out
-                found[f"{kind}{m + 1} lines"] = _multiplications(to_lines)
+                found[f"{kind}{m + 1} lines"] = min(_multiplications(to_lines), transform)
         return found
 
 

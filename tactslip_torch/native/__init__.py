@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import logging
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -33,6 +34,7 @@ BackendName = Literal["auto", "native", "torch"]
 _LOG = logging.getLogger(__name__)
 MAX_BRANCHES = 32
 _ROWS = 8  # of a block of a matrix
+_SHORT = 256  # samples of a bin up to which all spectra are products with a matrix
 _WHOLE = 16  # numbers to a multiple of which arrays of the machine are filled up
 
 
@@ -49,11 +51,12 @@ class _Matrix(ctypes.Structure):
 class _Plan(ctypes.Structure):
     _numbers = (
         *("num_channels", "num_samples", "num_lines", "num_branches"),
-        *("num_features", "num_coefficients", "num_slow", "num_fast"),
+        *("num_features", "num_coefficients", "num_slow", "num_fast", "num_points"),
     )
     _pointers = (
         *("slow", "fast", "first", "descriptor", "column", "need"),
-        *("low", "high", "out", "lines", "ones", "frequency_hz", "gain_time", "gain_lines"),
+        *("low", "high", "out", "lines", "cosines", "line_gains"),
+        *("ones", "frequency_hz", "gain_time", "gain_lines"),
     )
     _fields_ = tuple(
         [(name, ctypes.c_int32) for name in _numbers]
@@ -230,7 +233,7 @@ class FeatureEngine(_Kept):
         low: from a bin, or the approximation's coefficients of one level, to those of the next.
         high: from the same to the coefficients of details.
         out: from coefficients to branches A1, D1, A2, D2 and so on.
-        spectrum: from a branch to its lines, cosines before sines.
+        spectrum: from a branch to lines of its Fourier transform, cosines before sines.
         frequency_hz: of the lines.
 
     Shape:
@@ -270,10 +273,14 @@ class FeatureEngine(_Kept):
         need = np.zeros(num_channels * self._num_rows, np.uint32)
         np.bitwise_or.at(need, place, np.uint32(1) << descriptor.astype(np.uint32))
         is_read = _spectra_read(need.reshape(num_channels, -1), num_branches)
+        most = transform_work(spectrum)
+        is_dense = [len(spectrum) * matrix.shape[1] <= most for matrix in out]
         lines = [
-            spectrum @ matrix if read else matrix[:0]
-            for read, matrix in zip(is_read, out, strict=True)
+            spectrum @ matrix if read and dense else matrix[:0]
+            for read, dense, matrix in zip(is_read, is_dense, out, strict=True)
         ]
+        num_points = 0 if all(np.less_equal(is_read, is_dense)) else _num_points(spectrum)
+        angles = 2 * np.pi / max(1, num_points) * np.arange(num_points // 4 * 5)
         self.num_channels, self.num_features = num_channels, len(wanted)
         self._none = Filters([np.ones(1)] * num_channels, [0] * num_channels, dtype)
         self.plan = _Plan(
@@ -284,6 +291,7 @@ class FeatureEngine(_Kept):
             len(wanted),
             sum(len(matrix) + 8 for matrix in low) + 8,
             *map(len, (slow, fast)),
+            num_points,
             self._array(slow, np.int32),
             self._array(fast, np.int32),
             self._array(first, np.int32),
@@ -292,6 +300,8 @@ class FeatureEngine(_Kept):
             self._array(need, np.uint32),
             *bands,
             self._matrices(lines),
+            self._array(np.cos(angles)),
+            self._array(spectrum[: len(frequency_hz), 0]),
             self._array(spectrum.sum(-1)),
             self._array(frequency_hz),
             self._array(_entropy_growth(spectrum.shape[1])),
@@ -738,6 +748,29 @@ def _entropy_growth(num: int) -> Array:
     """
     p = np.arange(num + 1) / num
     return np.diff(np.diff(-p * np.log2(p + np.finfo(np.float64).eps)), prepend=0.0)
+
+
+def transform_work(spectrum: Array) -> float:
+    """Multiplications by a matrix that take as long as the engine's Fourier transform of a row.
+
+    Infinite where there is none: bins are short, or points of the transform no multiple of 4.
+
+    Shape:
+        - spectrum: ``[2 L, n]``, cosines before sines
+    """
+    num_samples, num_points = spectrum.shape[1], _num_points(spectrum)
+    if num_samples <= _SHORT or num_points % 4:
+        return math.inf
+    leaf, stages = num_points, 0
+    while leaf % 2 == 0 and leaf > 8:
+        leaf, stages = leaf // 2, stages + 1
+    return float(2 * num_samples * leaf + 4 * num_points * stages)  # measured, on x86-64 v4
+
+
+def _num_points(spectrum: Array) -> int:
+    """Of the Fourier transform whose lines these are: the first turns by one of them a sample."""
+    cosine, sine = spectrum[[1, len(spectrum) // 2 + 1], 1]
+    return round(2 * math.pi / math.atan2(-sine, cosine))
 
 
 def _spectra_read(need: Array, num_branches: int) -> list[bool]:

@@ -263,6 +263,7 @@ template <class E> struct Group : Describe<E> {
       return it;
     };
     size_t samples = n + 8, spectrum = 2 * num_lines + 16, framed = samples + most_taps;
+    size_t longest = framed > spectrum ? framed : spectrum, num_points = plan.num_points;
     weights = (V*)take(most_taps * sizeof(V));
     V **rows[] = {&y, &row, &raw, &few}, **bands[] = {&approximation, &coefficients};
     V** spectra[] = {&lines, &total};
@@ -270,7 +271,7 @@ template <class E> struct Group : Describe<E> {
     for (V** each : bands) *each = (V*)take(plan.num_coefficients * sizeof(V));
     for (V** each : spectra)
       *each = (V*)take((spectrum > samples ? spectrum : samples) * sizeof(V));
-    window = d = (V*)take((framed > spectrum ? framed : spectrum) * sizeof(V));
+    window = d = (V*)take((longest > num_points ? longest : num_points) * sizeof(V));
     wholes = (int32_t*)lines;  // entropy's, when the lines of a branch are done with
     levels = (uint8_t*)few;
     return at;
@@ -558,8 +559,54 @@ template <class E> struct Group : Describe<E> {
   }
 
   void spectrum_of(int32_t branch, const V* from, V* to) {
-    for (int32_t k = 0; k < plan.lines[branch].num_columns; ++k) few[k] = from[k] * unit;
-    product(plan.lines[branch], few, to);
+    const Matrix<E>& matrix = plan.lines[branch];
+    if (matrix.values || !plan.num_points) {
+      for (int32_t k = 0; k < matrix.num_columns; ++k) few[k] = from[k] * unit;
+      return product(matrix, few, to);
+    }
+    product(plan.out[branch], from, few);
+    transform(0, 1, d);
+    for (int32_t i = 0; i < num_lines; ++i) {
+      V gain = unit * plan.line_gains[i];
+      bool is_real = i == 0 || 2 * i == plan.num_points;
+      to[i] = gain * d[i];
+      to[num_lines + i] = is_real ? V{} : gain * d[plan.num_points - i];
+    }
+  }
+
+  // The Fourier transform of the row `few`, as if zeros followed, or of every `stride`-th of its
+  // values from `start` on: real parts of the lines up to half of its points, then imaginary parts
+  // backwards. Lines k and half - k take both parts from, and leave them in, the same four places.
+  void transform(int32_t start, int32_t stride, V* to) {
+    int32_t whole = plan.num_points, num = whole / stride, half = num / 2;
+    const E *cosines = plan.cosines, *sines = cosines + whole / 4;  // with another sign
+    if (num % 2 || num <= 8) {
+      for (int32_t k = 0; k <= half; ++k) {
+        V real = {}, imaginary = {};
+        for (int32_t i = start, angle = 0; i < n; i += stride) {
+          real += few[i] * cosines[angle], imaginary += few[i] * sines[angle];
+          angle += k * stride;
+          if (angle >= whole) angle -= whole;
+        }
+        to[k ? num - k : 0] = imaginary;
+        to[k] = real;
+      }
+      return;
+    }
+    V* odd = to + half;
+    transform(start, 2 * stride, to);
+    transform(start + stride, 2 * stride, odd);
+    V even = to[0];
+    to[0] = even + odd[0], odd[0] = even - odd[0];
+    for (int32_t k = 1; 4 * k < num; ++k) {
+      E cosine = cosines[k * stride], sine = sines[k * stride];
+      V real = odd[k] * cosine - odd[half - k] * sine;
+      V imaginary = odd[half - k] * cosine + odd[k] * sine;
+      V even_real = to[k], even_imaginary = to[half - k];
+      to[k] = even_real + real, odd[half - k] = even_imaginary + imaginary;
+      to[half - k] = even_real - real, odd[k] = imaginary - even_imaginary;
+    }
+    if (num % 4 == 0) odd[num / 4] = -odd[num / 4];
   }
 
   // Each branch's share of the energy of all spectra; 0 if all are zero.

@@ -23,13 +23,16 @@ template <class E> struct Matrix {
 
 template <class E> struct Plan {
   int32_t num_channels, num_samples, num_lines, num_branches;
-  int32_t num_features, num_coefficients, num_slow, num_fast;
+  int32_t num_features, num_coefficients, num_slow, num_fast, num_points;
   const int32_t *slow, *fast;  // channels that are read
   // of each channel and row (branches, their spectra, band energy ratios, the bin itself): where its part of descriptor and column starts, and which bits it has
   const int32_t *first, *descriptor, *column;
   const uint32_t* need;
   // from a bin, or an approximation's coefficients, to those one level coarser; to branches; to lines
   const Matrix<E> *low, *high, *out, *lines;
+  // of a Fourier transform to the lines of branches for which `lines` has no matrix; num_points = 0:
+  // there is none. Cosines of angles, which num_points of make a turn, and the gain of each line.
+  const E *cosines, *line_gains;  // [num_points 5 / 4], [num_lines]
   const E* ones;  // [2 num_lines] spectrum of the constant 1
   const E *frequency_hz, *gain_time, *gain_lines;  // gains: what one more value in a cell adds
 };

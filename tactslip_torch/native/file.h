@@ -223,7 +223,9 @@ template <class E> struct Model {
     int32_t num_levels, last = num_channels - 1;
     in.all({{&p.num_lines, 1, MOST_BIN}, {&num_levels, 0, MAX_BRANCHES / 2},
             {&p.num_features, 1, MOST}, {&p.num_slow, 0, num_channels},
-            {&p.num_fast, 0, num_channels}});
+            {&p.num_fast, 0, num_channels}, {&p.num_points, 0, 2 * MOST_BIN}});
+    in.expect(p.num_points % 4 == 0);
+    in.expect(!p.num_points || (p.num_points >= bin && p.num_points / 2 + 1 >= p.num_lines));
     p.num_branches = 2 * num_levels;
     in.all({{&p.slow, p.num_slow, 0, last}, {&p.fast, p.num_fast, 0, last}});
     in.expect(p.num_slow + p.num_fast > 0 && (num_levels || !p.num_fast));
@@ -263,6 +265,7 @@ template <class E> struct Model {
         put(lines, b, matrix(in, 2 * p.num_lines, most, true));
       }
     }
+    in.all({{&p.cosines, p.num_points / 4 * 5}, {&p.line_gains, p.num_points ? p.num_lines : 0}});
     in.all({{&p.ones, 2 * p.num_lines}, {&p.frequency_hz, p.num_lines}, {&p.gain_time, bin},
             {&p.gain_lines, p.num_lines}});
   }

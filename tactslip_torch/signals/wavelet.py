@@ -319,7 +319,8 @@ def spectrum_matrix(num_samples: int, method: SpectrumMethod = "reference") -> T
     that a tone on a line has its amplitude there.
 
     At bin lengths a constant matrix is as fast as an FFT and exports to ONNX without its slow and
-    inexact DFT operator.
+    inexact DFT operator. The native engine takes an FFT for bins above 256 samples where that is
+    faster.
 
     Shape:
         - output: ``[n, n]`` (``reference``) or ``[n // 2 + 1, n]`` (``clean``), complex128
