@@ -282,6 +282,7 @@ def _test_set(detector: SlipDetector, every: int) -> Table:
                 "way": f"{way}, {precision}",
                 "decisions": f"{len(score):,}",
                 "largest difference of a score, sd": f"{np.nanmax(off) / spread:.1e}",
+                "99.9 % are within": f"{np.nanquantile(off, 0.999) / spread:.1e}",
                 "other sign of the score": str(is_other.sum()),
                 "of these outside the margin": str(is_outside.sum()),
                 "other status": str((on != expected[1]).sum()),

@@ -123,6 +123,37 @@ def test_in_float32_throughout_scores_are_within_the_stated_margin(level, monkey
 
 @needs_engine
 @pytest.mark.parametrize("level", LEVELS)
+def test_correlation_near_one_is_right_to_its_last_digit_in_float32(level, monkeypatch):
+    """A sum in float32 leaves three digits of what is missing to 1, some 1e-4."""
+    monkeypatch.setenv(native.SWITCH, level)
+    rate = torch.linspace(1, 6, 40)[:, None, None]
+    bins = (torch.sin(rate * torch.arange(100) / 100) + 0.01 * noise(40)).float()
+    is_wanted = [name.descriptor == "correlation" and name.component == "A1" for name in NAMES]
+    pool = FeaturePool(HAND, backend="native", arithmetic="native")
+    found, exact = pool(bins)[:, is_wanted].double(), POOL(bins.double())[:, is_wanted]
+    assert exact.min() > 0.99
+    assert 1 - exact.max() < 1e-3
+    torch.testing.assert_close(found, exact, rtol=0, atol=2.0**-24)
+
+
+@needs_engine
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("num", [1, 20])
+def test_channels_that_lie_close_together_stay_apart_in_float32(level, num, rng, monkeypatch):
+    """The standard deviation of compressed values that differ by 1e-4 of their size."""
+    monkeypatch.setenv(native.SWITCH, level)
+    wide = torch.from_numpy(rng.uniform(-1, 1, (43, len(NAMES))))
+    layer = ChannelPooling.fit(HAND, NAMES, wide, ["std"])
+    away = np.array([1e-4 if name.channel.endswith("1") else -1e-4 for name in layer.inputs])
+    size = 10 ** rng.uniform(-3, 3, (num, 1))
+    inputs = np.float32(size * (1 + away * rng.uniform(0.5, 1, (num, len(away)))))
+    found = layer.machine(dtype=np.float32).columns(inputs)
+    exact = layer(torch.from_numpy(inputs).double()).numpy()
+    np.testing.assert_allclose(found, exact, 1e-6)
+
+
+@needs_engine
+@pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("compression", [None, 1e-3, 1.0, 1e7])
 @pytest.mark.parametrize("num", [1, 20])
 def test_columns_of_a_narrow_range_keep_their_digits_in_float32(

@@ -17,6 +17,7 @@ namespace {
 constexpr double CV_FLOOR = 1e-6;       // part of the rms that the mean counts as at least
 constexpr double CV_ZERO = 1e-12;       // part of it within which a mean has no sign
 constexpr double CROWDED = 2e-3;        // part of a row's span; float rounds to 3e-8 of it
+constexpr double NEAR_ONE = 0.99;       // correlation from which on float takes another formula
 constexpr double LEVELS = 255;          // of entropy's histogram, less one
 constexpr int FEWEST_SAMPLES = 16;      // of a bin that may be silent
 constexpr int CHUNK = 32;               // bins whose features are made before they are scored
@@ -186,8 +187,19 @@ template <class E> struct Describe {
     for (int32_t i = 1; i < n; ++i) sum += magnitude(d[i] - d[i - 1]);
     return s.span * (sum / (E)(n - 1));
   }
-  static V correlation(const Row& s) {
+  // Near 1 it is 1 less half the square of the distance of both as unit vectors: float rounds sums to
+  // 1e-7 of them, which is a large part of what is missing to 1.
+  static V correlation(const Row& s, const V* d, const V* with, int32_t n) {
     V value = s.both / root(s.second * s.other);
+    auto is_near = value > (E)NEAR_ONE;
+    if (sizeof(E) == 4 && any(is_near)) {
+      V own = 1 / root(s.second), its = 1 / root(s.other), square = {};
+      for (int32_t i = 0; i < n; ++i) {
+        V apart = d[i] * own - with[i] * its;
+        square += apart * apart;
+      }
+      value = is_near ? 1 - (E)0.5 * square : value;
+    }
     return (s.span > 0) & (s.other > 0) ? value : V{};
   }
   static V spectral_spread(const V* amplitude, V total, V centre, const E* frequency_hz, int32_t n) {
@@ -395,7 +407,7 @@ template <class E> struct Group : Describe<E> {
     if (wanted & 1u << SKEWNESS) values[SKEWNESS] = Base::skewness(s);
     if (wanted & 1u << KURTOSIS) values[KURTOSIS] = Base::kurtosis(s);
     if (wanted & 1u << PEAK_FACTOR) values[PEAK_FACTOR] = Base::peak_factor(s);
-    if (wanted & 1u << CORRELATION) values[CORRELATION] = Base::correlation(s);
+    if (wanted & 1u << CORRELATION) values[CORRELATION] = Base::correlation(s, d, raw, count);
     if (wanted & 1u << RMS) values[RMS] = Base::rms(s);
     if (wanted & 1u << MEAN_ABS_CHANGE)
       values[MEAN_ABS_CHANGE] = Base::mean_abs_change(s, d, count);

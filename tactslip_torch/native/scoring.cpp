@@ -192,11 +192,18 @@ template <class E> struct Scorer {
       count += in_use[c];
     }
     for (int32_t r = 0; r < p.num_families; r += step<ACROSS>()) {
-      V mean = {}, square = {}, low = {}, high = {}, last = {};
-      V scale = constants<ACROSS>(p.scales + r), inverse = inverse_of(scale);
+      V mean = {}, square = {}, low = {}, high = {}, last = {}, lowest = V{} + Limits<E>::LARGEST;
       for (int32_t c = 0; c < p.num_channels; ++c) {
-        V value = signed_log<E>(gathered<ACROSS>(x, p.inputs + c * stride + r), scale, inverse);
-        values[c] = in_use[c] > 0 ? value : V{};
+        values[c] = gathered<ACROSS>(x, p.inputs + c * stride + r);
+        lowest = in_use[c] > 0 ? smaller(values[c], lowest) : lowest;
+      }
+      lowest = larger(lowest, V{});
+      // where all are positive, logs are less that of the lowest: what lies close together stays apart
+      V scale = constants<ACROSS>(p.scales + r), whole = scale + lowest, inverse = inverse_of(whole);
+      V base = log_part<E>(lowest, scale, scale, inverse_of(scale));
+      for (int32_t c = 0; c < p.num_channels; ++c) {
+        V away = values[c] - lowest, bent = log_part<E>(magnitude(away), scale, whole, inverse);
+        values[c] = in_use[c] > 0 ? away < 0 ? -bent : bent : V{};
         mean += values[c];
         last = larger(last, values[c]);
       }
@@ -229,6 +236,7 @@ template <class E> struct Scorer {
             found += weight > 0 ? sorted[c] * weight : V{};  // linear interpolation
           }
         }
+        if (p.statistics[s] != POOLED_STD) found += base;
         if (ACROSS == BINS) y[*columns] = count > 0 ? found : V{} + machine.fill[*columns];
         for (int k = 0; ACROSS == ONE_BIN && k < L; ++k)
           if (columns[k] >= 0)
