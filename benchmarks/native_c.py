@@ -314,7 +314,11 @@ def _by_graph(run: Run, samples: Array) -> Mapping[str, Array]:
 def _boards(detectors: Mapping[str, SlipDetector], folder: Path) -> Table:
     counts, scale = sample_counts()
     rows = []
-    detectors = {**detectors, f"{NAME}, with a network": _with_network(detectors[NAME])}
+    networks = {
+        f"{NAME}, with a network {first}-{second}": _with_network(detectors[NAME], first, second)
+        for first, second in ((128, 48), (64, 32))
+    }
+    detectors = {**detectors, **networks}
     for name, detector in detectors.items():
         place = folder / "board"  # where the library is built once
         place.mkdir(exist_ok=True)
@@ -345,14 +349,15 @@ def _boards(detectors: Mapping[str, SlipDetector], folder: Path) -> Table:
     )
 
 
-def _with_network(detector: SlipDetector) -> SlipDetector:
+def _with_network(detector: SlipDetector, *widths: int) -> SlipDetector:
     """The detector with an onset classifier whose weights are drawn: it costs what any does."""
     made = copy.deepcopy(detector)
     evidence = OnsetEvidence(made.pool.hand, made.pool.sample_rate_hz)
     num = evidence.num_columns
     scaler = FeatureScaler(-torch.ones(num).double(), torch.ones(num).double())
     torch.manual_seed(0)
-    network = Perceptron.drawn(num * (1 + len(evidence.lags))).double().requires_grad_(False)
+    num_inputs = num * (1 + len(evidence.lags))
+    network = Perceptron.drawn(num_inputs, widths).double().requires_grad_(False)
     onset = OnsetClassifier(evidence, scaler, network, threshold=1e6)
     made.info[KEY] = replace(AlarmSettings.of(made), onset=onset).to_dict()
     return made

@@ -599,7 +599,7 @@ class Perceptron(nn.Module):
         self.biases = nn.ParameterList([each.detach().clone() for each in biases])
 
     @classmethod
-    def drawn(cls, num_inputs: int, widths: Sequence[int] = (64, 32)) -> Perceptron:
+    def drawn(cls, num_inputs: int, widths: Sequence[int]) -> Perceptron:
         """With weights drawn as ``torch.nn.Linear`` does."""
         sizes = [num_inputs, *widths, 1]
         layers = [nn.Linear(a, b) for a, b in pairwise(sizes)]
