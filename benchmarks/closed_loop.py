@@ -41,7 +41,11 @@ from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.report import style
 from tactslip_torch.simulation import SEEN_MATERIALS
 
-SOURCES = ("tactslip_torch/pretrained/paper24-sim.pt",)
+SOURCES = (
+    "tactslip_torch/pretrained/paper24-sim.pt",
+    "benchmarks/alarms.py",
+    "conf/onset/alarms.yaml",
+)
 _CYCLE = ("gradual", "sudden", "heavy", "gradual", "sudden", "steady") * 2
 _KINDS = (*_CYCLE[:-1], "sudden, 1.4")
 """Of lifts, in turn; the last is shown apart, as few grips can save it."""

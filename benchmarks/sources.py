@@ -23,6 +23,9 @@ _PACKAGES = ("tactslip_torch", "benchmarks")
 _SHOW = {ROOT / "benchmarks" / name for name in ("harness.py", "tables.py", "sources.py")}
 _BESIDE = (".c", ".cpp", ".h", ".json")
 _TARGET = re.compile(r"^\s*_target_:\s*(\S+)", re.MULTILINE)
+_OPTION = re.compile(r"(?:^|[\s+~'\"])(\w+)=(\w*)$")
+"""Of a group, in the words of a command line; nothing behind the sign: a name is put in."""
+_DEFAULT = re.compile(r"^ +- (?:override +)?/?(?:(\w+)(?:@\S+)?: +)?(\w+)\b", re.MULTILINE)
 _COMMENT = re.compile(r"(?:^|(?<=\s))#.*", re.MULTILINE)
 _SECTION = re.compile(r"`python -m benchmarks\.(\w+)[^`]*`[^\n]*?\bcode ([0-9a-f]{16})[^\n]*")
 STALE = "*The code has changed since this was measured: numbers of the present code may differ.*"
@@ -66,7 +69,38 @@ def sources(name: str) -> list[Path]:
         if path not in found and path not in _SHOW:
             found.add(path)
             left += _followed(path)
+        left = left or [of for of in _configuration(found) if of not in found]
     return sorted(found)
+
+
+def _configuration(found: Iterable[Path]) -> list[Path]:
+    """What commands of these files are configured by: their own files and the options chosen.
+
+    An option is chosen by the defaults of a file that counts, or by the strings of a benchmark,
+    such as ``+exp=unseen4``; one that ends in ``recipe=`` chooses all options of the group.
+    """
+    if ROOT / "tactslip_torch" / "commands" / "configuration.py" not in found:
+        return []
+    of_benchmarks = [path for path in found if path.parent == ROOT / "benchmarks"]
+    words = [
+        node.value
+        for path in of_benchmarks
+        for node in ast.walk(_tree(path) if path.suffix == ".py" else ast.Module([], []))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+    chosen = {option for word in words for option in _OPTION.findall(word)}
+    for path in found:
+        if path.suffix == ".yaml":
+            group = path.parent.relative_to(ROOT / "conf").as_posix()
+            chosen |= {
+                (of or group, option)
+                for of, option in _DEFAULT.findall(path.read_text(encoding="utf-8"))
+            }
+    options = sorted(ROOT.glob("conf/*/*.yaml"))
+    return [
+        *sorted(ROOT.glob("conf/*.yaml")),
+        *(of for of in options if {(of.parent.name, of.stem), (of.parent.name, "")} & chosen),
+    ]
 
 
 @cache
@@ -80,8 +114,6 @@ def _followed(path: Path) -> list[Path]:
     tree = _tree(path)
     needed = [of for module, name in _imports(tree) if (of := _defined(module, name))]
     needed += [of for of in path.parent.iterdir() if of.suffix in _BESIDE]
-    if path == ROOT / "tactslip_torch" / "commands" / "configuration.py":
-        needed += ROOT.glob("conf/**/*.yaml")
     for node in tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "SOURCES":
             for pattern in ast.literal_eval(node.value):

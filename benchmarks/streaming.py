@@ -160,7 +160,7 @@ class Streaming(Benchmark):
 
 _FIRST_TIMED = 300  # hop, when evidence has its floor
 _HOP_LIMITS = {"Python": 250.0, "C": 100.0, "onnxruntime": 200.0}  # us, the median
-_WIDTHS = (128, 48)  # of the network of +exp=onset
+_WIDTHS = (64, 32)  # of the network of +exp=onset
 
 
 def _hops(detector: SlipDetector, samples: Array, num: int) -> list[dict[str, Any]]:

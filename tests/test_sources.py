@@ -71,6 +71,42 @@ def test_comments_docstrings_and_other_modules_do_not_change_a_digest(digest_of)
     assert digest_of(changed) == digest_of({})
 
 
+COMMANDS = {
+    "tactslip_torch/commands/configuration.py": "",
+    "benchmarks/a.py": "from tactslip_torch.commands import configuration\nGIVEN = ['+exp=one']\n",
+    "conf/train.yaml": "defaults:\n  - onset: none   # no alarm\n",
+    "conf/onset/none.yaml": "{}\n",
+    "conf/onset/alarms.yaml": "hop_ms: 5\n",
+    "conf/onset/other.yaml": "hop_ms: 6\n",
+    "conf/exp/one.yaml": "defaults:\n  - override /onset: alarms\n",
+    "conf/exp/two.yaml": "seed: 2\n",
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [
+        ("conf/train.yaml", True),
+        ("conf/onset/none.yaml", True),
+        ("conf/exp/one.yaml", True),
+        ("conf/onset/alarms.yaml", True),
+        ("conf/onset/other.yaml", False),
+        ("conf/exp/two.yaml", False),
+    ],
+)
+def test_options_that_a_benchmark_chooses_change_its_digest_and_others_do_not(
+    digest_of, name: str, counts: bool
+) -> None:
+    changed = COMMANDS | {name: COMMANDS[name] + "more: 1\n"}
+    assert (digest_of(changed) != digest_of(COMMANDS)) == counts
+
+
+def test_a_name_that_is_put_in_chooses_every_option(digest_of) -> None:
+    words = COMMANDS["benchmarks/a.py"].replace("'+exp=one'", "f'+exp={name}'")
+    files = COMMANDS | {"benchmarks/a.py": words}
+    assert digest_of(files | {"conf/exp/two.yaml": "seed: 3\n"}) != digest_of(files)
+
+
 @pytest.mark.parametrize(("page", "name", "code"), SECTIONS)
 def test_a_section_shows_kept_numbers_and_says_if_the_code_has_changed(
     page: Path, name: str, code: str
