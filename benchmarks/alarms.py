@@ -235,7 +235,7 @@ class Alarms(Benchmark):
                 "those of them whose channels differ. *Of each*: of reflex grips, of which there "
                 f"are {GRIPS_PER_S:g} a second, and of strokes of the arm. Thresholds of each seed "
                 f"are those of {_hours(set_by[-1]['streams']['calibrate'])} of other materials, "
-                "at the point estimate. 0.2.0 has heard a part of the recordings of the first "
+                "at the point estimate. 0.2.0 was given a part of the recordings of the first "
                 "seed; its hours are whole ones.",
             ),
         }
