@@ -81,11 +81,11 @@ def _configuration(found: Iterable[Path]) -> list[Path]:
     """
     if ROOT / "tactslip_torch" / "commands" / "configuration.py" not in found:
         return []
-    of_benchmarks = [path for path in found if path.parent == ROOT / "benchmarks"]
     words = [
         node.value
-        for path in of_benchmarks
-        for node in ast.walk(_tree(path) if path.suffix == ".py" else ast.Module([], []))
+        for path in found
+        if path.parent == ROOT / "benchmarks" and path.suffix == ".py"
+        for node in ast.walk(_tree(path))
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     ]
     chosen = {option for word in words for option in _OPTION.findall(word)}
