@@ -205,13 +205,13 @@ class Alarms(Benchmark):
         quiet = [row for each in of_seeds for row in each.quiet]
         first = self.seeds[0]
         earlier = self._earlier(given[0])
-        quiet += [{"method": EARLIER} | row for row in earlier.get("quiet", [])]
+        quiet += [{"method": EARLIER} | row for row in earlier["quiet"].values()]
         without = [*given[0], "onset.worlds.bristles=0"]
         others = replace(self, worlds=tuple(w for w in self.worlds if "bristles" in w))
         unknown = list[dict[str, Any]]()
         if others.worlds and self.without_bristles:
             unknown = others._seed(job.folder / "without bristles", first, without).slips
-        before = earlier.get("slips", {})
+        before = earlier["slips"]
         rows = [
             _world_row(world, own, before.get(world, []))
             for (world,), own in by(slips, "world").items()
@@ -287,21 +287,26 @@ class Alarms(Benchmark):
         return _Seed(alarm, slips, quiet)
 
     def _earlier(self, given: Sequence[str]) -> dict[str, Any]:
-        """What 0.2.0 made of the recordings of the first seed; empty if it heard others."""
+        """What 0.2.0 made of slips and recordings without, as far as it heard those of here."""
         kept: dict[str, Any] = json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
-        if kept.get("digest") == self.digest(given):
-            return kept
-        say("0.2.0 has not heard these recordings: benchmarks.earlier")
-        return {}
+        made, heard = self.digests(given), kept.get("digests", {})
+        if others := [name for name, own in made.items() if heard.get(name) != own]:
+            say(f"0.2.0 has not heard these recordings ({', '.join(others)}): benchmarks.earlier")
+        return {
+            part: {name: of for name, of in kept.get(part, {}).items() if name not in others}
+            for part in ("slips", "quiet")
+        }
 
-    def digest(self, given: Sequence[str]) -> str:
-        """Of the recordings of the first seed."""
+    def digests(self, given: Sequence[str]) -> dict[str, str]:
+        """Of the recordings of the first seed, by world and by kind without slip."""
         source, groups, materials = quiet_recordings(["+exp=onset", *given])
-        keys = [source.key(recording) for own in groups.values() for recording in own]
+        digests = {
+            quiet_name(*group): _digest(source, recordings) for group, recordings in groups.items()
+        }
         for world in self.worlds:
             own = world_recordings(world, materials, self.sessions, self.seeds[0])
-            keys += [own.key(recording) for recording in own.ids]
-        return hashlib.sha256(json.dumps(keys, default=str).encode()).hexdigest()[:16]
+            digests[world] = _digest(own, own.ids)
+        return digests
 
     def section(self, report: Report) -> str:
         """The tables, and their figure."""
@@ -418,6 +423,16 @@ def quiet_recordings(
             groups[recording.scene, is_imperfect].append(recording)
     materials = dict.fromkeys(one.material for own in groups.values() for one in own)
     return source, dict(groups), list(materials)
+
+
+def quiet_name(kind: str, is_imperfect: bool) -> str:
+    """Of a group of recordings without slip, among what 0.2.0 heard."""
+    return f"{kind}, with imperfections" if is_imperfect else kind
+
+
+def _digest(source: RecordingSource, recordings: Sequence[RecordingId]) -> str:
+    keys = [source.key(recording) for recording in recordings]
+    return hashlib.sha256(json.dumps(keys, default=str).encode()).hexdigest()[:16]
 
 
 def _slips(

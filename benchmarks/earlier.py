@@ -19,46 +19,48 @@ from typing import Any
 
 import numpy as np
 
+SLIP = "slip"
 _QUIET = 8  # recordings of each kind without slip, with imperfections and without
 KEPT = Path(__file__).parent / "peers" / "alarms_0_2_0.json"
 
 
 def store(folder: Path) -> None:
     """Write samples of slips in all worlds, and of a few recordings without slip of each kind."""
-    from benchmarks.alarms import Alarms, quiet_recordings, world_recordings
+    from benchmarks.alarms import Alarms, quiet_name, quiet_recordings, world_recordings
     from tactslip_torch.runtime import bar
 
     sizes = Alarms()
     given = [f"seed={sizes.seeds[0]}", *sizes.overrides]
     quiet_source, groups, materials = quiet_recordings(["+exp=onset", *given])
-    wanted: list[tuple[str, str, Any, Any]] = [
-        ("world", world, source, recording)
+    wanted: list[tuple[str, str, bool, Any, Any]] = [
+        (world, SLIP, False, source, recording)
         for world in sizes.worlds
         for source in [world_recordings(world, materials, sizes.sessions, sizes.seeds[0])]
         for recording in source.ids
     ]
     wanted += [
-        ("imperfect" if is_imperfect else "quiet", kind, quiet_source, recording)
+        (quiet_name(kind, is_imperfect), kind, is_imperfect, quiet_source, recording)
         for (kind, is_imperfect), own in groups.items()
         for recording in own[:_QUIET]
     ]
     folder.mkdir(parents=True, exist_ok=True)
     index = list[dict[str, Any]]()
-    for role, kind, source, recording in bar(wanted, "store", "recording"):
-        times, name = source.timeline(recording), f"{len(index):05d}.npy"
-        np.save(folder / name, source.load(recording).samples.float().T.numpy())
+    for name, kind, is_imperfect, source, recording in bar(wanted, "store", "recording"):
+        times, file = source.timeline(recording), f"{len(index):05d}.npy"
+        np.save(folder / file, source.load(recording).samples.float().T.numpy())
         index.append(
             {
-                "file": name,
-                "role": role,
+                "file": file,
+                "of": name,
                 "kind": kind,
+                "is_imperfect": is_imperfect,
                 "onsets_s": times.onsets_s,
                 "released_s": times.released_s,
                 "hours": times.duration_s / 3600,
                 "strokes": len(times.arm_s),
             }
         )
-    made = {"digest": sizes.digest(given), "recordings": index}
+    made = {"digests": sizes.digests(given), "recordings": index}
     (folder / "index.json").write_text(json.dumps(made), encoding="utf-8")
 
 
@@ -92,20 +94,16 @@ def count(folder: Path) -> None:
     for own in index["recordings"]:
         found = np.load(folder / own["file"].replace(".npy", ".npz"))
         made = SimpleNamespace(**{name: torch.from_numpy(found[name]) for name in found.files})
-        if own["role"] == "world":
-            slips.setdefault(own["kind"], []).extend(delays(SimpleNamespace(**own), made))
+        if own["kind"] == SLIP:
+            slips.setdefault(own["of"], []).extend(delays(SimpleNamespace(**own), made))
             continue
-        key = f"{own['kind']} {own['role']}"
-        row = quiet.setdefault(key, {"alarms": 0, "hours": 0.0, "strokes": 0})
-        row["kind"], row["is_imperfect"] = own["kind"], own["role"] == "imperfect"
+        row = quiet.setdefault(own["of"], {"alarms": 0, "hours": 0.0, "strokes": 0})
+        row |= {name: own[name] for name in ("kind", "is_imperfect")}
         row["alarms"] += int(made.is_alarm.sum())
         row["hours"] += own["hours"]
         row["strokes"] += own["strokes"]
-    KEPT.write_text(
-        json.dumps({"digest": index["digest"], "slips": slips, "quiet": list(quiet.values())})
-        + "\n",
-        encoding="utf-8",
-    )
+    kept = {"digests": index["digests"], "slips": slips, "quiet": quiet}
+    KEPT.write_text(json.dumps(kept) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -64,7 +64,7 @@ def _strokes_that_carry(rng: Rng, duration_s: float) -> list[dict[str, Any]]:
 
 
 CONFOUNDERS: Mapping[str, Callable[[Rng], dict[str, Any]]] = {
-    "held": lambda rng: {},
+    "held": lambda rng: {"partial_slips_per_s": 0.0},
     "grips": lambda rng: {"grips_per_s": 0.8},
     "reflex_grips": lambda rng: {
         "grips_per_s": 0.8,
@@ -99,7 +99,10 @@ CONFOUNDERS: Mapping[str, Callable[[Rng], dict[str, Any]]] = {
     },
     "creeping_finger": lambda rng: {"partial_slips_per_s": float(rng.uniform(0.1, 0.5))},
 }
-"""Kinds of recordings without slip of the hand, and what is drawn of each beside the ranges."""
+"""Kinds of recordings without slip of the hand, and what is drawn of each beside the ranges.
+
+Where a hand is held at rest no finger creeps: that is a kind of its own.
+"""
 _BESIDE_SLIPS = ("grips", "reflex_grips", "loosened", "taps", "knocks", "machine")
 
 
