@@ -68,6 +68,19 @@ def test_worlds_cover_what_was_asked_for():
         assert scene.imperfections.local_noise_mv == 0
 
 
+def test_no_finger_creeps_where_a_hand_is_held_with_imperfect_channels_or_not():
+    held, grips = (
+        [scene.imperfections for scene in scenes_of(worlds)]
+        for worlds in (
+            WorldRecordings(confounders={kind: 40}, materials=MATERIALS)
+            for kind in ("held", "grips")
+        )
+    )
+    assert {own.partial_slips_per_s for own in held} == {0.0}
+    assert 5 < sum(own.local_noise_mv > 0 for own in held) < 35
+    assert max(own.partial_slips_per_s for own in grips) > 0.1
+
+
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
