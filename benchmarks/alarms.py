@@ -236,7 +236,7 @@ class Alarms(Benchmark):
                 f"are {GRIPS_PER_S:g} a second, and of strokes of the arm. Thresholds of each seed "
                 f"are those of {_hours(set_by[-1]['streams']['calibrate'])} of other materials, "
                 "at the point estimate. 0.2.0 was given a part of the recordings of the first "
-                "seed; its hours are whole ones.",
+                f"seed; its hours are whole ones. {_left_out(earlier['others'])}",
             ),
         }
         if unknown:
@@ -287,15 +287,19 @@ class Alarms(Benchmark):
         return _Seed(alarm, slips, quiet)
 
     def _earlier(self, given: Sequence[str]) -> dict[str, Any]:
-        """What 0.2.0 made of slips and recordings without, as far as it heard those of here."""
+        """Kept results of 0.2.0, of groups whose recordings are still the same, and the others."""
         kept: dict[str, Any] = json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
-        made, heard = self.digests(given), kept.get("digests", {})
-        if others := [name for name, own in made.items() if heard.get(name) != own]:
-            say(f"0.2.0 has not heard these recordings ({', '.join(others)}): benchmarks.earlier")
-        return {
-            part: {name: of for name, of in kept.get(part, {}).items() if name not in others}
+        made, known = self.digests(given), kept.get("digests", {})
+        same = {name for name, own in made.items() if known.get(name) == own}
+        others = [name for name in made if name not in same]
+        if others:
+            named = ", ".join(others) if same else "all"
+            say(f"kept results of 0.2.0 are of other recordings ({named}); run benchmarks.earlier")
+        rows = {
+            part: {name: of for name, of in kept.get(part, {}).items() if name in same}
             for part in ("slips", "quiet")
         }
+        return {**rows, "others": others}
 
     def digests(self, given: Sequence[str]) -> dict[str, str]:
         """Of the recordings of the first seed, by world and by kind without slip."""
@@ -425,8 +429,16 @@ def quiet_recordings(
     return source, dict(groups), list(materials)
 
 
+def _left_out(groups: Sequence[str]) -> str:
+    """What is not shown of 0.2.0, as a sentence; empty if all is."""
+    if not groups:
+        return ""
+    names = ", ".join(group.replace("_", " ") for group in groups)
+    return f"It was not run again where recordings have changed since: {names}."
+
+
 def quiet_name(kind: str, is_imperfect: bool) -> str:
-    """Of a group of recordings without slip, among what 0.2.0 heard."""
+    """Of a group of recordings without slip, among the kept results of 0.2.0."""
     return f"{kind}, with imperfections" if is_imperfect else kind
 
 

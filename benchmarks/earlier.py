@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-SLIP = "slip"
+SLIP = "slip"  # as in simulation.worlds, which 0.2.0 does not have
 _QUIET = 8  # recordings of each kind without slip, with imperfections and without
 KEPT = Path(__file__).parent / "peers" / "alarms_0_2_0.json"
 
@@ -51,7 +51,7 @@ def store(folder: Path) -> None:
         index.append(
             {
                 "file": file,
-                "of": name,
+                "group": name,
                 "kind": kind,
                 "is_imperfect": is_imperfect,
                 "onsets_s": times.onsets_s,
@@ -95,9 +95,9 @@ def count(folder: Path) -> None:
         found = np.load(folder / own["file"].replace(".npy", ".npz"))
         made = SimpleNamespace(**{name: torch.from_numpy(found[name]) for name in found.files})
         if own["kind"] == SLIP:
-            slips.setdefault(own["of"], []).extend(delays(SimpleNamespace(**own), made))
+            slips.setdefault(own["group"], []).extend(delays(SimpleNamespace(**own), made))
             continue
-        row = quiet.setdefault(own["of"], {"alarms": 0, "hours": 0.0, "strokes": 0})
+        row = quiet.setdefault(own["group"], {"alarms": 0, "hours": 0.0, "strokes": 0})
         row |= {name: own[name] for name in ("kind", "is_imperfect")}
         row["alarms"] += int(made.is_alarm.sum())
         row["hours"] += own["hours"]
