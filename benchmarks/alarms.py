@@ -54,7 +54,7 @@ from tactslip_torch.training.alarm import (
 
 SOURCES = (
     "tactslip_torch/pretrained/paper24-sim.pt",
-    "benchmarks/peers/alarms_0_2_0.json",
+    "benchmarks/kept/alarms_0_2_0.json",
 )
 FOUND_S, EARLY_S, HINT_S = 0.25, 0.2, 0.1
 """Of the first release: an alarm until then finds a slip, before it is early; a hint is in time."""

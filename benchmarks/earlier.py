@@ -5,7 +5,7 @@
     python -m benchmarks.earlier count FOLDER             # here: what became of slips
 
 DETECTOR is what ``python -m tactslip_torch.train +exp=onset`` of that version left
-(docs/migrating.md names its commit). ``count`` writes benchmarks/peers/alarms_0_2_0.json, which
+(docs/migrating.md names its commit). ``count`` writes benchmarks/kept/alarms_0_2_0.json, which
 ``benchmarks.alarms`` shows beside its own numbers. All recordings are simulated.
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 
 SLIP = "slip"  # as in simulation.worlds, which 0.2.0 does not have
 _QUIET = 8  # recordings of each kind without slip, with imperfections and without
-KEPT = Path(__file__).parent / "peers" / "alarms_0_2_0.json"
+KEPT = Path(__file__).parent / "kept" / "alarms_0_2_0.json"
 
 
 def store(folder: Path) -> None:
