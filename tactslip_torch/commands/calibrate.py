@@ -28,11 +28,7 @@ from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.rules import Budget
-from tactslip_torch.report.calibration import (
-    calibration_figure,
-    calibration_table,
-    pooled_outcome,
-)
+from tactslip_torch.report.calibration import calibration_figure, calibration_table, pooled_outcome
 from tactslip_torch.runtime import bar, check_number, check_share, plain, whole_file, write_json
 from tactslip_torch.training.alarm import OURS, Stream, Timing, score_streams
 from tactslip_torch.training.bins import RecordingBins

@@ -32,11 +32,7 @@ from tactslip_torch.data.recording import RecordingId, Timeline
 from tactslip_torch.features.sensing import level_message, level_ratio
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import score_stream
-from tactslip_torch.report.recordings import (
-    use_figure,
-    use_table,
-    written_table,
-)
+from tactslip_torch.report.recordings import use_figure, use_table, written_table
 from tactslip_torch.report.style import SIMULATED_LINE
 from tactslip_torch.runtime import __version__, in_processes, runs_of
 from tactslip_torch.signals.filtering import ChannelFilter, frame_lengths

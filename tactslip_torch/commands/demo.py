@@ -75,12 +75,7 @@ def _real(folder: Path) -> Path:
     from tactslip_torch.commands.configuration import compose_config
     from tactslip_torch.commands.detect import detect
     from tactslip_torch.model.detector import SlipDetector
-    from tactslip_torch.pretrained import (
-        HELD_OUT,
-        REAL_NAME,
-        real_onset_s,
-        write_real_recordings,
-    )
+    from tactslip_torch.pretrained import HELD_OUT, REAL_NAME, real_onset_s, write_real_recordings
 
     recordings, model = folder / "recordings", folder / "detector.pt"
     write_real_recordings(recordings)

@@ -17,12 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from tactslip_torch.commands.configuration import (
-    CommandLine,
-    checked,
-    conf_dir,
-    with_lists,
-)
+from tactslip_torch.commands.configuration import CommandLine, checked, conf_dir, with_lists
 from tactslip_torch.commands.stopping import Stopped, errors_in_one_line
 from tactslip_torch.runtime import is_first_process, whole_file
 

@@ -18,14 +18,7 @@ from typing import Any, NamedTuple
 
 from tactslip_torch.data.formats import is_there
 from tactslip_torch.data.labels import label_of
-from tactslip_torch.data.recording import (
-    MOMENTS,
-    SPANS,
-    TIMES,
-    RecordingId,
-    Stretch,
-    Timeline,
-)
+from tactslip_torch.data.recording import MOMENTS, SPANS, TIMES, RecordingId, Stretch, Timeline
 from tactslip_torch.runtime import whole_file
 
 MANIFEST = "manifest.csv"

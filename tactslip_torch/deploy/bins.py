@@ -17,12 +17,7 @@ from tactslip_torch.deploy.value import BOOL, F32, F64, Graph, Value
 from tactslip_torch.features.bank import Bank, Frame, Samples
 from tactslip_torch.features.descriptors import TINY
 from tactslip_torch.features.pooling import over_channels
-from tactslip_torch.features.sensing import (
-    FEWEST_SAMPLES,
-    LARGEST_SAMPLE,
-    Sensing,
-    is_enough,
-)
+from tactslip_torch.features.sensing import FEWEST_SAMPLES, LARGEST_SAMPLE, Sensing, is_enough
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm

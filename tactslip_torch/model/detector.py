@@ -30,12 +30,7 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Platt, calibration_from_dict
 from tactslip_torch.model.calibration import probability as stated
 from tactslip_torch.model.kernels import QuadraticForm, collapse, kernel_from_dict
-from tactslip_torch.model.prediction import (
-    ChannelMask,
-    Prediction,
-    predict_in_parts,
-    without,
-)
+from tactslip_torch.model.prediction import ChannelMask, Prediction, predict_in_parts, without
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import (
     BackendName,

@@ -19,12 +19,7 @@ from tactslip_torch.simulation.scene import (
     Stroke,
     paper_scenes,
 )
-from tactslip_torch.simulation.simulate import (
-    SimulatedRecordings,
-    Timeline,
-    simulate,
-    timeline,
-)
+from tactslip_torch.simulation.simulate import SimulatedRecordings, Timeline, simulate, timeline
 from tactslip_torch.simulation.worlds import CONFOUNDERS, WorldRecordings
 
 __all__ = [

@@ -22,18 +22,8 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import check_number
 from tactslip_torch.simulation._blocks import Array, Grid, generator
 from tactslip_torch.simulation._bristles import integrator
-from tactslip_torch.simulation._contact import (
-    Grasp,
-    Slips,
-    draw_grasp,
-    scene_contact,
-)
-from tactslip_torch.simulation._sensors import (
-    Handled,
-    held_samples,
-    recorded_channels,
-    volts_of,
-)
+from tactslip_torch.simulation._contact import Grasp, Slips, draw_grasp, scene_contact
+from tactslip_torch.simulation._sensors import Handled, held_samples, recorded_channels, volts_of
 from tactslip_torch.simulation.scene import (
     PAPER,
     SEEN_MATERIALS,

@@ -27,11 +27,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import ROLES, Split, everything, have_same_bins
-from tactslip_torch.features.cache import (
-    FeatureCache,
-    default_cache_folder,
-    versions,
-)
+from tactslip_torch.features.cache import FeatureCache, default_cache_folder, versions
 from tactslip_torch.features.descriptors import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import statistics_of

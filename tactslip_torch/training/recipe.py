@@ -31,12 +31,7 @@ from tactslip_torch.features.selection import (
     rank_features,
     t_scores,
 )
-from tactslip_torch.features.sensing import (
-    Sensing,
-    SpanFeatures,
-    least_alive,
-    most_stuck_samples,
-)
+from tactslip_torch.features.sensing import Sensing, SpanFeatures, least_alive, most_stuck_samples
 from tactslip_torch.model.calibration import platt_or_none
 from tactslip_torch.model.detector import SlipDetector, counted_channels
 from tactslip_torch.model.fit import HeldOut, TrainingBins, fit_machine
