@@ -46,15 +46,24 @@ const profile = mkdtempSync(join(tmpdir(), "look-"));
 const flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
   "--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage",
   "--remote-debugging-pipe", `--user-data-dir=${profile}`, "about:blank"];
-const browser = spawn(chromium, flags, { stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"] });
+const stdio = ["ignore", "ignore", "ignore", "pipe", "pipe"];
+const browser = spawn(chromium, flags, { stdio, detached: true }); // a group of its own: all of it is ended
 const stop = (status, text) => {
   console.log(text);
   browser.removeAllListeners("exit");
   browser.once("exit", () => {
-    rmSync(profile, { recursive: true, force: true, maxRetries: 5 });
+    try {
+      rmSync(profile, { recursive: true, force: true, maxRetries: 5 });
+    } catch (error) {
+      console.error(`${profile} is left: ${error.code}`);
+    }
     process.exit(status);
   });
-  if (!browser.kill("SIGKILL")) process.exit(status);
+  try {
+    process.kill(-browser.pid, "SIGKILL");
+  } catch {
+    process.exit(status);
+  }
 };
 browser.on("error", (error) => stop(2, `${chromium}: ${error.message}`));
 browser.on("exit", (code) => stop(2, `${chromium} ended by itself, status ${code}`));
