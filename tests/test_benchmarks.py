@@ -1,15 +1,19 @@
 """Each benchmark runs in its smallest form, and writes where it is asked to."""
 
 import json
+import subprocess
+import sys
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from test_real_sets import write_osu
 
+from benchmarks import train
 from benchmarks.harness import Benchmark, between_markers
 from benchmarks.native_c import BOARD_TOOLS, TOOLS, missing_tools
 from benchmarks.paper_tables import RIDGE, forward_order
@@ -119,6 +123,22 @@ def test_only_what_stands_between_the_markers_is_replaced() -> None:
     assert between_markers(text, "a", "new") == text.replace("old", "new")
     with pytest.raises(ValueError, match="not both there"):
         between_markers(text, "b", "new")
+
+
+def test_seconds_of_features_are_counted_in_one_stage_of_a_training_alone(tmp_path, monkeypatch):
+    # of the features, some are made before the fit and some in the test
+    seconds = {"features": 3.0, "fit": 2.0, "test": 4.0, "total": 7.0}
+    metrics = {"timing_s": seconds, "splits": {"test": {"num_bins": 30}}}
+    (tmp_path / "cold").mkdir()
+    (tmp_path / "cold" / "metrics.json").write_text(json.dumps(metrics))
+
+    def ended(command, **options):
+        return subprocess.Popen([sys.executable, "-c", ""], **options)
+
+    monkeypatch.setattr(train, "subprocess", SimpleNamespace(Popen=ended))
+    run = train._training([], tmp_path, "cold", 0.01)
+    assert run["stages"] == {"start-up": run["wall_s"] - 7, "fit": 2.0, "test": 4.0, "other": 1.0}
+    assert (run["features_s"], run["bins_a_second"]) == (3.0, 10.0)
 
 
 def _trials(folder: Path) -> Path:

@@ -101,7 +101,8 @@ CONFOUNDERS: Mapping[str, Callable[[Rng], dict[str, Any]]] = {
 }
 """Kinds of recordings without slip of the hand, and what is drawn of each beside the ranges.
 
-In ``held`` no finger creeps, not even with imperfections; ``creeping_finger`` is the kind for that.
+In ``held`` no finger creeps, whether channels have imperfections or not: ``creeping_finger`` is the
+kind of recordings where one does.
 """
 _BESIDE_SLIPS = ("grips", "reflex_grips", "loosened", "taps", "knocks", "machine")
 
@@ -120,7 +121,8 @@ class WorldRecordings(SimulatedRecordings):
         materials: ids in ``MATERIALS``, taken in turn.
         channels: rows for ``HandLayout.from_rows``; ``None`` for the paper's hand.
         tail_s: length of a recording without slip.
-        imperfect: fraction of recordings with imperfections; in ``held`` no finger creeps for them.
+        imperfect: fraction of recordings with imperfections; in ``held`` these are of channels
+            alone.
         bristles: fraction whose contact is of bristles; the others are kinematic.
         scene: what all recordings have in common, in place of what is drawn.
 
