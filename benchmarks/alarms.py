@@ -29,12 +29,12 @@ from hydra.utils import instantiate
 
 from benchmarks.earlier import KEPT
 from benchmarks.harness import Benchmark, Job
+from benchmarks.onset_baselines import BaselineDetector
 from benchmarks.tables import Report, Table, by, percent
 from benchmarks.trainings import composed, resumed, say
 from tactslip_torch import AlarmSettings, SlipDetector
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.onset.baselines import BaselineDetector
 from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.onset.events import first_releases
 from tactslip_torch.onset.rules import Budget

@@ -178,7 +178,7 @@ def _folds(sizes: Model) -> tuple[list[dict[str, Any]], float]:
     bins = TrainingBins(z, is_slip)
     calls: dict[str, Callable[[], Any]] = {
         "one fit": partial(fit_machine, bins, PENALTY, KERNEL),
-        "fit and folds in closed form": lambda: HeldOut(bins, groups, KERNEL).at(PENALTY).scores,
+        "fit and folds in closed form": lambda: HeldOut(bins, groups, KERNEL).at(PENALTY),
         "refits": refits,
     }
     timings = interleaved(calls, sizes.rounds, block_s=0)

@@ -26,7 +26,7 @@ from hydra.utils import instantiate
 from benchmarks import ROOT
 from benchmarks.deployment import host
 from benchmarks.harness import Benchmark, Job, say
-from benchmarks.subjects import Array, loaded
+from benchmarks.subjects import Array, drawn_network, loaded
 from benchmarks.tables import Table
 from benchmarks.timing import interleaved, on_threads
 from benchmarks.trainings import composed, trained
@@ -38,7 +38,7 @@ from tactslip_torch.deploy.native import FILE, SOURCE, NativeFile
 from tactslip_torch.deploy.stream import stream_graph
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.decisions import KEY, AlarmSettings
-from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence, Perceptron
+from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.pretrained import NAME
 
 HOST = ROOT / "export" / "native"
@@ -355,10 +355,7 @@ def _with_network(detector: SlipDetector, *widths: int) -> SlipDetector:
     evidence = OnsetEvidence(made.pool.hand, made.pool.sample_rate_hz)
     num = evidence.num_columns
     scaler = FeatureScaler(-torch.ones(num).double(), torch.ones(num).double())
-    torch.manual_seed(0)
-    num_inputs = num * (1 + len(evidence.lags))
-    network = Perceptron.drawn(num_inputs, widths).double().requires_grad_(False)
-    onset = OnsetClassifier(evidence, scaler, network, threshold=1e6)
+    onset = OnsetClassifier(evidence, scaler, drawn_network(evidence, *widths), threshold=1e6)
     made.info[KEY] = replace(AlarmSettings.of(made), onset=onset).to_dict()
     return made
 

@@ -336,7 +336,7 @@ class _Sampled(NamedTuple):
 
         def validation(penalty: float) -> float:
             try:
-                says = held_out.at(penalty).scores >= 0
+                says = held_out.at(penalty) >= 0
             except ValueError:  # close to singular: no candidate
                 return -1.0
             return mean(balanced_accuracy(says[of], few.is_slip[of]) or 0.0 for of in members)

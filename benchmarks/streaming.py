@@ -33,6 +33,7 @@ from benchmarks.subjects import (
     RATE_HZ,
     Array,
     alarm_settings,
+    drawn_network,
     loaded,
     onset_settings,
     pushing,
@@ -45,7 +46,6 @@ from tactslip_torch import AlarmSettings, SlipDetector, StreamingDetector
 from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.deploy.native import NativeFile
 from tactslip_torch.onset.decisions import KEY
-from tactslip_torch.onset.evidence import Perceptron
 
 SOURCES = ("export/c/*",)
 HOP, PUSH = 20, 200
@@ -167,10 +167,7 @@ def _hops(detector: SlipDetector, samples: Array, num: int) -> list[dict[str, An
     """Time on a CPU of pushes of a hop, those that complete a bin apart; by host."""
     settings = onset_settings(detector, samples)
     assert settings.onset is not None
-    evidence = settings.onset.evidence
-    torch.manual_seed(0)
-    network = Perceptron.drawn(evidence.num_columns * (1 + len(evidence.lags)), _WIDTHS)
-    network = network.double().requires_grad_(False)
+    network = drawn_network(settings.onset.evidence, *_WIDTHS)
     settings = replace(settings, onset=replace(settings.onset, head=network))
     hop = settings.decision_samples
     live = StreamingDetector(detector, settings, dtype=torch.float32)

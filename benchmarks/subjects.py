@@ -22,7 +22,7 @@ from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import KEY
-from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
+from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence, Perceptron
 from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.simulate import SimulatedRecordings
@@ -108,3 +108,10 @@ def onset_settings(detector: SlipDetector, samples: Array) -> AlarmSettings:
     head = QuadraticForm(*map(torch.from_numpy, numbers))
     onset = OnsetClassifier(plain, FeatureScaler.fit(columns), head, threshold=1e9)
     return replace(settings, onset=onset)
+
+
+def drawn_network(evidence: OnsetEvidence, *widths: int) -> Perceptron:
+    """A network on all inputs of an onset classifier, its weights drawn: it costs what any does."""
+    torch.manual_seed(0)
+    network = Perceptron.drawn(evidence.num_columns * (1 + len(evidence.lags)), widths)
+    return network.double().requires_grad_(False)

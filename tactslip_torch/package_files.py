@@ -22,6 +22,7 @@ from tactslip_torch.runtime import whole_file
 DETECTOR = "tactslip_torch detector 5"
 SUMS = "tactslip_torch sums 3"
 SIDECAR = "tactslip_torch onnx 2"
+_MOST_JSON_BYTES = 2**24
 DAMAGE_ERRORS = (
     ArithmeticError,
     AttributeError,
@@ -93,14 +94,14 @@ def load_table(
     return metadata, tensors
 
 
-def read_json(path: str | os.PathLike[str], form: str, most_bytes: int = 2**24) -> dict[str, Any]:
-    """The content of a JSON file of the package.
+def read_json(path: str | os.PathLike[str], form: str) -> dict[str, Any]:
+    """The content of a JSON file of the package, at most 16 MiB.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no JSON, longer than that, or of another format.
     """
-    text = _regular_file(path, most_bytes).read_bytes()
+    text = _regular_file(path, _MOST_JSON_BYTES).read_bytes()
     with reading(path):
         content: dict[str, Any] = json.loads(text)
         if content["format"] != form:

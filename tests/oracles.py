@@ -48,16 +48,14 @@ def savgol(x: np.ndarray, window_length: int, polyorder: int = 1) -> np.ndarray:
 # Section 3: branches and spectrum ------------------------------------------------------------
 
 
-def wavelet_branches(
-    x: np.ndarray, wavelet: str = "rbio2.2", level: int = 4, mode: str = "symmetric"
-) -> np.ndarray:
+def wavelet_branches(x: np.ndarray, wavelet: str = "rbio2.2", level: int = 4) -> np.ndarray:
     """A1, D1, A2, D2, ..: decompose m times, keep one array of coefficients, put it back."""
     branches = []
     for m in range(1, level + 1):
-        coefficients = pywt.wavedec(x, wavelet, mode=mode, level=m)  # cA_m, cD_m, cD_m-1, ..
+        coefficients = pywt.wavedec(x, wavelet, mode="symmetric", level=m)  # cA_m, cD_m, cD_m-1, ..
         for kept in (0, 1):
             only = [c if i == kept else np.zeros_like(c) for i, c in enumerate(coefficients)]
-            branches.append(pywt.waverec(only, wavelet, mode=mode)[: len(x)])
+            branches.append(pywt.waverec(only, wavelet)[: len(x)])
     return np.stack(branches)
 
 

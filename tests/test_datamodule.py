@@ -7,7 +7,7 @@ from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import leave_one_material_out
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.signals.filtering import ChannelFilter, savgol_filter
+from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 
 
@@ -15,7 +15,7 @@ def test_features_are_those_of_the_filtered_bins():
     source = SmallSet()
     made = small_maker(source)(RecordingId("a", 1))
     samples = source.load(RecordingId("a", 1)).samples.double()
-    filtered = torch.stack([savgol_filter(samples[0], 51), savgol_filter(samples[1], 11)])
+    filtered = ChannelFilter([51, 11])(samples[:2])
     edge = round((1.1 - 0.010) * RATE_HZ)
     starts = [edge - 2000 + 100 * i for i in range(20)] + [edge + 100 * i for i in range(17)]
     bins = torch.stack([filtered[:, s : s + 100] for s in starts])

@@ -9,6 +9,8 @@ import torch
 from small_detector import HAND, raw_bins, small_detector
 from test_detector import noise, random_detector
 
+from tactslip_torch.features.bank import linear_maps
+from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
 
 BAD = [float("nan"), float("inf"), -float("inf"), 1e308]
@@ -240,3 +242,21 @@ def test_inference_mode_leaves_predictions_and_gradients_as_they_are(how, either
         torch.testing.assert_close(found.score, either.predict(bins).score, **close)
     if how != "moved":
         assert gradient_of(made, bins).isfinite().all()
+
+
+@pytest.mark.parametrize("is_made_inside", [False, True])
+def test_what_a_pool_keeps_in_inference_mode_serves_a_gradient_later(is_made_inside, rng):
+    """Once "Inference tensors cannot be saved for backward": vmap goes another way than values."""
+    bins = torch.from_numpy(rng.standard_normal((2, len(HAND), 100)))
+    linear_maps.cache_clear()
+    pool = FeaturePool(HAND)
+    if is_made_inside:
+        linear_maps.cache_clear()
+    with torch.inference_mode():
+        pool = FeaturePool(HAND) if is_made_inside else pool
+        inside = torch.func.vmap(pool)(bins)
+    x = bins.clone().requires_grad_()
+    features = pool(x)
+    torch.testing.assert_close(features.detach(), inside)
+    (gradient,) = torch.autograd.grad(features.sum(), x)
+    assert gradient.isfinite().all()

@@ -225,10 +225,10 @@ def refitted(bins, groups, penalty, kernel):
 
 
 def assert_refits(bins, groups, penalty, kernel=PAPER_KERNEL):
-    fit = HeldOut(bins, groups, kernel).at(penalty)
+    scores = HeldOut(bins, groups, kernel).at(penalty)
     expected = refitted(bins, groups, penalty, kernel)
     scale = max(1.0, np.abs(expected).max())
-    np.testing.assert_allclose(fit.scores.numpy(), expected, rtol=0, atol=1e-8 * scale)
+    np.testing.assert_allclose(scores.numpy(), expected, rtol=0, atol=1e-8 * scale)
 
 
 # Scores ---------------------------------------------------------------------------------------
@@ -275,7 +275,7 @@ def test_scores_are_those_in_closed_form_with_derivatives_right_twice(kind, num_
         return held_out_scores(z, is_slip, groups, *numbers)
 
     bins = TrainingBins(z.detach(), is_slip, numbers[2].detach())
-    closed = HeldOut(bins, groups, Polynomial(2, 0.4), "dual").at(0.7).scores
+    closed = HeldOut(bins, groups, Polynomial(2, 0.4), "dual").at(0.7)
     torch.testing.assert_close(scores(z, *numbers).detach(), closed, rtol=0, atol=1e-10)
     assert torch.autograd.gradcheck(scores, (z, *numbers))
     assert torch.autograd.gradgradcheck(scores, (z, *numbers))

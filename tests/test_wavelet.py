@@ -31,11 +31,10 @@ def assert_branches_close(actual, expected):
 
 
 @pytest.mark.parametrize("wavelet", ["haar", "bior2.4", "sym5"])
-@pytest.mark.parametrize("mode", ["symmetric", "reflect", "zero", "periodic", "constant"])
 @pytest.mark.parametrize(("num_samples", "level"), [(72, 1), (75, 3)])
-def test_every_option_equals_pywavelets(wavelet, mode, level, num_samples, rng):
+def test_every_option_equals_pywavelets(wavelet, level, num_samples, rng):
     x = rng.standard_normal((2, num_samples))
-    options = {"wavelet": wavelet, "mode": mode, "level": level}
+    options = {"wavelet": wavelet, "level": level}
     expected = np.stack([oracles.wavelet_branches(one, **options) for one in x])
     assert_branches_close(wavelet_branches(torch.from_numpy(x), **options), expected)
     matrix = branch_matrix(num_samples, **options)

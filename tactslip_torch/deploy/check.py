@@ -34,7 +34,7 @@ Run = Callable[[Arrays], dict[str, NDArray[Any]]]
 
 LARGEST_ERROR: dict[Precision, float] = {"float32": 1e-3, "float64": 1e-9}
 """Largest error of a score in its standard deviations, and of a statistic in its range."""
-_WORST_PROBABILITY = {"float32": 1e-5, "float64": 1e-9}  # beside that of the score given
+_LARGEST_PROBABILITY_ERROR = {"float32": 1e-5, "float64": 1e-9}  # beside that of the given score
 _LOSSES = 10.0  # by which errors may be larger where channels are lost
 _CLOSE = 1e-9  # of times, and of onset scores, which are float64 always
 _NUM_BINS, _NUM_DECISIONS = 128, 12
@@ -96,7 +96,7 @@ def compare(
             tolerances["onset_score"] = most * float(own.std()) if len(own) else 0.0
         tolerances["statistic"] = most * (float(np.ptp(known)) if len(known) else 0.0)
         if calibrated is not None:
-            tolerances["probability"] = _WORST_PROBABILITY[precision]
+            tolerances["probability"] = _LARGEST_PROBABILITY_ERROR[precision]
             llr = calibrated[0].llr(torch.from_numpy(found["score"].astype(np.float64)))
             expected["probability"] = probability(llr, calibrated[1]).numpy()
         for name, most in tolerances.items():

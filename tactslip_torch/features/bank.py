@@ -311,15 +311,16 @@ def linear_maps(
     Raises:
         ValueError: if a bin is too short for the levels.
     """
-    spectrum = spectrum_matrix(num, method)
-    names = branch_names(level)
-    return LinearMaps(
-        branches=names,
-        is_approximation=tuple(name[0] == "A" for name in names),
-        dense=tuple(branch_matrix(num, wavelet, level)),
-        dense_lines=torch.cat([spectrum.real, spectrum.imag]).contiguous(),
-        frequency_hz=frequency_axis_hz(num, sample_rate_hz, method),
-    )
+    with torch.inference_mode(False):  # they may be needed for a gradient later
+        spectrum = spectrum_matrix(num, method)
+        names = branch_names(level)
+        return LinearMaps(
+            branches=names,
+            is_approximation=tuple(name[0] == "A" for name in names),
+            dense=tuple(branch_matrix(num, wavelet, level)),
+            dense_lines=torch.cat([spectrum.real, spectrum.imag]).contiguous(),
+            frequency_hz=frequency_axis_hz(num, sample_rate_hz, method),
+        )
 
 
 def _low_rank(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -399,6 +400,7 @@ class Bank:
             Samples, coordinates and what there is one of per row are float64.
     """
 
+    @torch.inference_mode(False)  # what it keeps may be needed for a gradient later
     def __init__(
         self,
         maps: LinearMaps,

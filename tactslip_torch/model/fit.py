@@ -370,18 +370,6 @@ def _gram_matrix(kernel: Polynomial, z: Tensor) -> Tensor:
 # Pattern Recognition 40(8), 2154-2162.
 
 
-class _HeldOutFit(NamedTuple):
-    """A machine, and what its training bins would score without their groups.
-
-    Attributes:
-        head: the machine of all bins.
-        scores: ``[N]``, each from the machine without the bin's group.
-    """
-
-    head: QuadraticForm
-    scores: Tensor
-
-
 class HeldOut:
     """Exact leave-one-group-out scores for any number of values of C.
 
@@ -418,26 +406,29 @@ class HeldOut:
         else:
             self._system = kernel.sums(self._z, self._weights)
 
-    def at(self, penalty: float) -> _HeldOutFit:
-        """The machine and the held-out scores for one value of C.
+    def at(self, penalty: float) -> Tensor:
+        """The held-out scores for one value of C.
 
-        The scores are right to 100 eps times the condition of the system of all bins.
+        They are right to 100 eps times the condition of the system of all bins.
 
         Args:
             penalty: the paper's ``C``, positive and finite.
+
+        Shape:
+            - output: ``[N]``, each from the machine without the bin's group
 
         Raises:
             ValueError: if the penalty is not that, the condition is above ``MOST_CONDITION``, or
                 the machine without a group (named) cannot be told in float64.
         """
         _check_penalty(penalty)
-        head, residuals = self._dual(penalty) if self._is_dual else self._primal(penalty)
+        residuals = self._dual(penalty) if self._is_dual else self._primal(penalty)
         scores = torch.empty_like(residuals)
         scores[self._order] = self._targets - residuals
-        return _HeldOutFit(head, scores)
+        return scores
 
-    def _dual(self, penalty: float) -> tuple[QuadraticForm, Tensor]:
-        beta, report, factor = _solve_symmetric(
+    def _dual(self, penalty: float) -> Tensor:
+        beta, _, factor = _solve_symmetric(
             self._system, self._targets, penalty, self._weights, name="gram",
             most_condition=MOST_CONDITION,
         )  # fmt: skip
@@ -455,11 +446,9 @@ class HeldOut:
                 within = slice(own.start - part.start, own.stop - part.start)
                 lower = torch.linalg.cholesky(inverse[within, within])
                 residuals[own] = torch.cholesky_solve(beta[own, None], lower)[:, 0]
-        head = collapse(self._z, beta, self._kernel)
-        head.solved = report
-        return head, residuals
+        return residuals
 
-    def _primal(self, penalty: float) -> tuple[QuadraticForm, Tensor]:
+    def _primal(self, penalty: float) -> Tensor:
         kernel, z, roots = self._kernel, self._z, self._weights.sqrt()
         moment = kernel.sum_of_monomials(z, self._weights * self._targets)
         head, factor = solve_normal_equations(
@@ -489,7 +478,7 @@ class HeldOut:
                 else:
                     right = torch.cholesky_solve(right, lower)
                 residuals[own] = right[:, 0] / roots[own]
-        return head, residuals
+        return residuals
 
 
 _Group = tuple[int, slice]  # its name, and its rows among ordered bins

@@ -182,12 +182,6 @@ class _Cost(NamedTuple):
     multiply_adds: int
     num_bytes: int
 
-    def __str__(self) -> str:
-        return (
-            f"{self.multiply_adds / 1000:.1f} k multiply-adds a bin and "
-            f"{self.num_bytes / 1000:.1f} kB"
-        )
-
 
 @dataclass(frozen=True)
 class SolveReport:

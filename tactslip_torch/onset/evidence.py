@@ -379,7 +379,7 @@ class OnsetEvidence:
         still = torch.tensor(self.is_still or (False,) * len(self.hand.fast))
         return (known & (moves | still)).sum(-1) < self.min_alive
 
-    def begin(self, blocks: _Blocks, num_lagged: int = 0) -> _Memory:
+    def begin(self, blocks: _Blocks) -> _Memory:
         """What is kept where a block is the first: all that was before is equal to it."""
         first = blocks.only(slice(0, 1))
         num_fast, num_slow = len(self.hand.fast), len(self.hand.slow)
@@ -394,7 +394,7 @@ class OnsetEvidence:
             no_step.expand(self.delay, num_steps, num_slow),
             first.logs.new_full((len(FLOORS_S), self.num_filters, num_fast), math.nan),
             first.logs.new_full((num_steps, num_slow), math.nan),
-            zeros(num_lagged, self.num_columns if num_lagged else 0),
+            zeros(0, 0),
         )
 
     def columns(

@@ -9,8 +9,8 @@ below the corner are raised by a third, and the corners move to 200 Hz and 44 Hz
 sample gets what the sample half a frame before it gets if centred: no look-ahead and no more noise,
 but half a frame late.
 
-``savgol_filter`` is the filter of one frame; ``ChannelFilter`` has a frame of its own for every
-channel, of whole recordings and of bins, with Savitzky-Golay's weights or others.
+``ChannelFilter`` has a frame of its own for every channel, of whole recordings and of bins, with
+Savitzky-Golay's weights or others.
 
 Cutting recordings into bins, the paper's 50 ms analysis unit.
 """
@@ -176,43 +176,6 @@ def _edges_of_kernel(weights: Sequence[float], polyorder: int, align: Align) -> 
     return Edges(_convolve_valid(before.T, kernel).T, kernel, _convolve_valid(after.T, kernel).T)
 
 
-def savgol_filter(
-    x: Tensor, window_length: int, polyorder: int = 1, align: Align = "centred"
-) -> Tensor:
-    """Savitzky-Golay filter along the last axis, ``scipy.signal.savgol_filter(mode="interp")``.
-
-    Samples whose frame would leave the signal take the polynomial fitted to the first or last
-    frame: half a frame at either end, or all but one sample of the first frame if causal or
-    trailing; trailing half a frame earlier, and the first half of them its first value.
-    Linear, so gradients flow everywhere; a NaN reaches as far as a frame does and no further.
-
-    Args:
-        x: signal in any unit.
-        window_length: frame in samples, odd; 11 for PVDF and 51 for SG in the paper; 1 leaves the
-            signal as it is.
-        polyorder: order of the fitted polynomial, 1 in the paper.
-        align: ``"centred"``; or ``"causal"``: the frame ends with the sample, as
-            ``scipy.signal.savgol_coeffs(pos=window_length - 1)``; or ``"trailing"``: it ends with
-            the sample and its middle is taken, the centred filter half a frame late.
-
-    Shape:
-        - x, output: ``[*, T]`` with ``T >= window_length``
-
-    Raises:
-        ValueError: if the frame is even, not above the order, or longer than the signal, or the
-            alignment is unknown.
-
-    Example:
-        >>> savgol_filter(torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0]), 3)
-        tensor([-0.5000,  1.0000,  1.0000,  1.0000, -0.5000])
-        >>> savgol_filter(torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0]), 3, align="causal")
-        tensor([-0.5000,  1.0000,  2.5000,  1.0000, -0.5000])
-        >>> savgol_filter(torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0]), 3, align="trailing")
-        tensor([-0.5000, -0.5000,  1.0000,  1.0000,  1.0000])
-    """
-    return _savgol_edges(window_length, polyorder, align).filtered(x)
-
-
 def _convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
     """Correlate ``[*, T]`` with ``[W]``, keeping the ``T - W + 1`` full overlaps.
 
@@ -313,15 +276,22 @@ def frame_lengths(hand: HandLayout, frames: Mapping[str, int | None]) -> list[in
 
 
 class ChannelFilter(nn.Module):
-    """``savgol_filter`` with a frame of its own for every channel.
+    """The Savitzky-Golay filter with a frame of its own for every channel.
+
+    That of a whole signal is ``scipy.signal.savgol_filter(mode="interp")``: samples whose frame
+    would leave the signal take the polynomial fitted to the first or last frame. These are half a
+    frame at either end, or all but one sample of the first frame if causal or trailing; trailing,
+    half a frame earlier, and the first half of them its first value. Linear, so gradients flow
+    everywhere; a NaN reaches as far as a frame does and no further.
 
     A bin is filtered exactly with ``context_before`` samples before it and ``context_after``
     behind: as many on each side if centred, else all of them before, ``2 * context`` in all.
 
     Args:
         window_lengths: one odd frame per channel, in samples; 1 leaves a channel as it is.
-        polyorder: order of the fitted polynomial.
-        align: where in its frame a sample lies.
+        polyorder: order of the fitted polynomial, 1 in the paper.
+        align: where in its frame a sample lies. ``"causal"`` is
+            ``scipy.signal.savgol_coeffs(pos=window_length - 1)``.
         kernels: other weights than Savitzky-Golay's, by length of the frame; each sums to 1. The
             ends of a signal are then filtered between a made-up past and future.
 
@@ -334,6 +304,15 @@ class ChannelFilter(nn.Module):
     Raises:
         ValueError: if a frame is even or does not exceed the order, the alignment is unknown, or a
             kernel fits no frame or does not sum to 1.
+
+    Example:
+        >>> x = torch.tensor([[0.0, 0.0, 3.0, 0.0, 0.0]])
+        >>> ChannelFilter([3])(x)
+        tensor([[-0.5000,  1.0000,  1.0000,  1.0000, -0.5000]])
+        >>> ChannelFilter([3], align="causal")(x)
+        tensor([[-0.5000,  1.0000,  2.5000,  1.0000, -0.5000]])
+        >>> ChannelFilter([3], align="trailing")(x)
+        tensor([[-0.5000, -0.5000,  1.0000,  1.0000,  1.0000]])
     """
 
     def __init__(

@@ -128,9 +128,6 @@ def _numbers(name: str, values: Sequence[float]) -> tuple[float, ...]:
     return numbers
 
 
-ExtensionMode = Literal["symmetric", "reflect", "zero", "constant", "periodic"]
-
-
 def branch_names(level: int) -> tuple[str, ...]:
     """``("A1", "D1", "A2", "D2", ...)``, the order of branches everywhere.
 
@@ -175,19 +172,16 @@ def highest_level(num_samples: int, wavelet: Wavelet = "rbio2.2") -> int:
     return highest
 
 
-def wavelet_branches(
-    x: Tensor, wavelet: Wavelet = "rbio2.2", level: int = 4, mode: ExtensionMode = "symmetric"
-) -> Tensor:
+def wavelet_branches(x: Tensor, wavelet: Wavelet = "rbio2.2", level: int = 4) -> Tensor:
     """Approximations and details of a signal, each at the signal's own length.
 
-    ``A1 + D1 = x`` and ``A(m) = A(m+1) + D(m+1)``. Gradients flow (the map is linear).
+    ``A1 + D1 = x`` and ``A(m) = A(m+1) + D(m+1)``. Gradients flow (the map is linear). The ends are
+    extended half-point symmetrically, as in the paper's MATLAB (ptwt's own default is another).
 
     Args:
         x: filtered bin.
         wavelet: any discrete wavelet PyWavelets knows, or filters; ``rbio2.2`` in the paper.
         level: number of levels; 4 in the paper.
-        mode: extension at the ends; half-point ``symmetric`` in the paper's MATLAB
-            (ptwt's own default, ``reflect``, is another).
 
     Shape:
         - x: ``[*, n]``
@@ -207,7 +201,7 @@ def wavelet_branches(
             f"got {level}; use fewer levels or longer bins"
         )
     filters = _of_pywt(wavelet)
-    coefficients = wavedec(x.reshape(-1, num_samples), filters, mode=mode, level=level)
+    coefficients = wavedec(x.reshape(-1, num_samples), filters, mode="symmetric", level=level)
     alone = []  # each array of coefficients with zeros in place of the others, put together
     for kept in range(level + 1):
         arrays = [c if i == kept else torch.zeros_like(c) for i, c in enumerate(coefficients)]
@@ -221,12 +215,7 @@ def wavelet_branches(
 
 
 @lru_cache(maxsize=16)
-def branch_matrix(
-    num_samples: int,
-    wavelet: Wavelet = "rbio2.2",
-    level: int = 4,
-    mode: ExtensionMode = "symmetric",
-) -> Tensor:
+def branch_matrix(num_samples: int, wavelet: Wavelet = "rbio2.2", level: int = 4) -> Tensor:
     """``wavelet_branches`` as one matrix: ``branches = matrix @ x``. Do not write into it.
 
     Shape:
@@ -237,7 +226,7 @@ def branch_matrix(
     """
     with torch.inference_mode(False):  # it may be needed for a gradient later
         identity = torch.eye(num_samples, dtype=torch.float64)
-        return wavelet_branches(identity, wavelet, level, mode).movedim(0, -1).contiguous()
+        return wavelet_branches(identity, wavelet, level).movedim(0, -1).contiguous()
 
 
 class _WaveletSteps(NamedTuple):

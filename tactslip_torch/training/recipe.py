@@ -717,7 +717,7 @@ class Paper(_Recipe):
         sample = sample.joined()
         machine = HeldOut(bins, sample.group, self.kernel)
         for penalty in bar(penalties, "choose C on held-out groups", show=show):
-            scores = machine.at(penalty).scores
+            scores = machine.at(penalty)
             by_group = {
                 name: balanced_accuracy(scores[mine] >= 0, bins.is_slip[mine])
                 for index, name in enumerate(sample.group_names)
