@@ -145,8 +145,8 @@ def oracle(evidence, x, masked=()):
             level = [np.log(before(power, n, 0, t)).T / 2 for n in windows]  # [B, F]
             rises = np.concatenate([each - floors[0][t] for each in level])
             row += pools(rises, ("mean", "max", "min", "std"))
-            rises = [each - floor[t] for each in level[:2] for floor in floors[1:]]
-            row += pools(np.concatenate(rises), ("mean", "max"))
+            quick = [each - floor[t] for each in level[:2] for floor in floors[1:]]
+            row += pools(np.concatenate(quick), ("mean", "max"))
             if len(hand.fast) > 1:
                 squares = [
                     np.concatenate(
@@ -158,8 +158,12 @@ def oracle(evidence, x, masked=()):
                     )
                     for i, j in combinations(range(len(fast)), 2)
                 ]
-                squares = squares or [np.zeros(len(windows) * len(level[0]))]
-                row += [np.mean(squares, 0), np.max(squares, 0)]
+                risen = np.maximum(rises, 0)
+                weights = [risen[:, i] * risen[:, j] for i, j in combinations(range(len(fast)), 2)]
+                squares = squares or [np.zeros(len(rises))]
+                weights = weights or squares
+                by_rises = np.sum(np.multiply(weights, squares), 0) / (np.sum(weights, 0) + 1e-6)
+                row += [np.mean(squares, 0), np.max(squares, 0), by_rises]
         if slow:
             size = np.log1p(np.abs(z[t]))
             row += pools(size, ("mean", "max", "min"))

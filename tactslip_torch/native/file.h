@@ -361,7 +361,7 @@ template <class E> struct Model {
     int64_t num = 0, rows = (int64_t)o.num_windows * o.num_filters;
     bool many_fast = o.num_fast > 1, many_slow = o.num_slow > 1;
     if (o.num_fast) num += (many_fast ? 4 : 1) * rows + (many_fast ? 2 : 1) * 4 * o.num_filters;
-    if (many_fast) num += 2 * rows;
+    if (many_fast) num += 3 * rows;
     if (o.num_slow) num += 2 * (many_slow ? 3 : 1) * o.num_steps + many_slow * o.num_steps;
     return num;
   }

@@ -11,6 +11,7 @@ namespace {
 constexpr int32_t FEWEST_SAMPLES = 4;  // of a hop that may be one value
 constexpr int32_t NUM_FLOORS = 3;
 constexpr double LEAST_STEPS = 1e-3;  // sum of steps over their floors, that counts as none
+constexpr double LEAST_RISE = 1e-6;   // sum of products of rises that counts as none
 
 // Parts of the memory, in their order: onset/evidence.py, Memory.
 template <class E> struct Kept {
@@ -31,7 +32,8 @@ template <class E> struct Hop {
   int32_t num_sizes = own.num_steps * own.num_slow;
   int32_t longest_lag = own.num_lags ? own.lags[own.num_lags - 1] : 0;
   Kept<E> kept;
-  E *frame, *heard, *logs, *products, *means, *power, *level, *steps, *columns, *scaled, *values;
+  E *frame, *heard, *logs, *products, *means, *power, *level, *risen, *steps, *columns, *scaled;
+  E *values;
   E* other;
   bool* in_use;  // fast or slow channels
 
@@ -221,7 +223,12 @@ template <class E> struct Hop {
       last_means(kept.products, products, num_products, own.windows[w], false, values);
       for (int32_t b = 0; b < num_filters; ++b) {
         const E* own_power = power + w * num_logs + b * num_fast;
-        E sum = 0, num = 0, most = 0;
+        const E* own_level = level + w * num_logs + b * num_fast;
+        for (int32_t f = 0; f < num_fast; ++f) {
+          E rise = own_level[f] - kept.floor[b * num_fast + f];
+          risen[f] = in_use[f] && rise > 0 ? rise : 0;
+        }
+        E sum = 0, num = 0, most = 0, weighted = 0, weights = 0;
         for (int32_t p = 0; p < own.num_pairs; ++p) {
           int32_t i = own.first[p], j = own.second[p];
           if (!in_use[i] || !in_use[j]) continue;
@@ -229,12 +236,14 @@ template <class E> struct Hop {
           E square = product * product / (own_power[i] * own_power[j]);
           most = square > most ? square : most;
           sum += square, num += 1;
+          weighted += risen[i] * risen[j] * square, weights += risen[i] * risen[j];
         }
         to[w * num_filters + b] = num ? sum / num : 0;
         to[num_squares + w * num_filters + b] = most;
+        to[2 * num_squares + w * num_filters + b] = weighted / (weights + (E)LEAST_RISE);
       }
     }
-    if (num_fast > 1) to += 2 * num_squares;
+    if (num_fast > 1) to += 3 * num_squares;
     // pools over slow channels
     if (int32_t num_slow = own.num_slow) {
       int32_t num_known = 0;
@@ -342,6 +351,7 @@ template <class E> struct Hop {
     take(means, own.num_slow);
     take(power, own.num_windows * num_logs);
     take(level, own.num_windows * num_logs);
+    take(risen, own.num_fast);
     take(steps, num_sizes);
     take(columns, own.num_columns);
     take(scaled, (1 + own.num_lags) * own.num_columns);

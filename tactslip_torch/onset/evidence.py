@@ -4,7 +4,8 @@ All columns are ratios, so neither gain nor unit of a channel matters:
 
 - *fast channels*: power of up to four band filters over 10, 25 and 50 ms, as a log ratio to the
   channel's own *floor*, its mean log power over the last 1, 0.3 and 0.1 s; mean, largest, smallest
-  and spread over channels; mean and largest squared correlation between channels, of each filter;
+  and spread over channels; squared correlation between channels, of each filter: its mean, its
+  largest, and its mean with the rises of both channels as weights, as few may touch;
 - *slow channels*: steps between means of neighbouring stretches over the mean size of such steps in
   the last second; their size and, with their sign, mean, largest and smallest over channels, and
   how far the signs agree.
@@ -68,7 +69,7 @@ FEWEST_BLOCK_SAMPLES = 4
 """Of a block that counts as still where all its samples are one value."""
 _BLIND_WINDOWS = 5  # of a stream without a score, in longest windows
 _MOST_PAIRS = 120  # of channels whose correlation is taken
-_LEAST_RISE = 1e-6  # of a floor over that of silence, in half the log power
+_LEAST_RISE = 1e-6  # of a floor over that of silence, in half the log power, and of weights
 _LEAST_STEPS = 1e-3  # sum over channels of steps over their floors, that counts as none
 _LEAST_POWER = 1e-30  # of a filter, where the converter's step is not known
 _NUMBERS: Mapping[str, Any] = {
@@ -518,7 +519,7 @@ class OnsetEvidence:
             columns += _over_channels(torch.cat(quick, 1), alive, num_fast)[:2]
             if num_fast > 1:
                 columns += self._correlations(
-                    torch.cat([*power], 1), torch.cat([*products], 1), alive
+                    torch.cat([*power], 1), torch.cat([*products], 1), rises, alive
                 )
         if num_slow:
             known = (steps + step_floor).sum(1).isfinite() & slow
@@ -534,8 +535,15 @@ class OnsetEvidence:
         num_alive = alive.type_as(steps if num_slow else power[0]).sum(-1)
         return torch.cat(columns, -1), num_alive >= float(self.min_alive)
 
-    def _correlations(self, power: Tensor, products: Tensor, alive: Tensor) -> list[Tensor]:
-        """Mean and largest squared correlation over pairs in use, 0 of none: ``[k, W * B]``."""
+    def _correlations(
+        self, power: Tensor, products: Tensor, rises: Tensor, alive: Tensor
+    ) -> list[Tensor]:
+        """Squared correlation over pairs in use, 0 of none: mean, largest, mean by rises.
+
+        Shape:
+            - power, rises: ``[k, W * B, F]``; products: ``[k, W * B, P]``; alive: ``[k, F]``
+            - output: ``[k, W * B]`` each
+        """
         num_fast, num_pairs = len(self.hand.fast), self.pairs.shape[1]
         first, second = torch.zeros(2, num_fast, num_pairs, dtype=torch.float64)
         first[self.pairs[0], torch.arange(num_pairs)] = 1.0
@@ -546,7 +554,10 @@ class OnsetEvidence:
         known = torch.where(alive.unsqueeze(1), power, 1.0)
         square = products * products / ((known @ first) * (known @ second))
         square = torch.where(both.unsqueeze(1) > 0.0, square, 0.0)
-        return [square.sum(-1) / num, square.amax(-1)]
+        risen = torch.where(alive.unsqueeze(1), rises, 0.0).clamp(min=0.0)
+        weight = (risen @ first) * (risen @ second)
+        by_rises = (square * weight).sum(-1) / (weight.sum(-1) + _LEAST_RISE)
+        return [square.sum(-1) / num, square.amax(-1), by_rises]
 
     def to_dict(self) -> dict[str, Any]:
         """All but the hand and the sample rate, which are the detector's."""
