@@ -94,7 +94,7 @@ RULES = ("debounced", "k of n below 0", "one of one", "cusum", "onset")
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("num_places", [8, pytest.param(120, marks=pytest.mark.slow)])
-def test_lost_samples_of_all_channels_raise_no_alarm_and_lose_none(
+def test_lost_samples_raise_no_alarm_but_what_fast_channels_alone_say_and_lose_none(
     detector, volts, rules, rule, num_places
 ):
     _, clean, _ = decided(detector, rules[rule], volts)
@@ -102,7 +102,7 @@ def test_lost_samples_of_all_channels_raise_no_alarm_and_lose_none(
     # frames of slow channels are longer, so at a loss fast ones are known earlier and longer
     slow = [c.adapting == "slow" for c in detector.pool.hand.channels]
     alone, _, _ = decided(detector, rules[rule], volts.masked_fill(torch.tensor(slow), torch.nan))
-    rng = np.random.default_rng(num_places)
+    rng, by_fast = np.random.default_rng(num_places), 0
     for case in range(num_places):
         num = int(rng.integers(1, 401)) if case else 1
         near_slip = case % 3 == 0 and rule != "onset"  # whose evidence is the lost moment itself
@@ -116,11 +116,14 @@ def test_lost_samples_of_all_channels_raise_no_alarm_and_lose_none(
         # a sum may need one decision more, as the evidence behind the loss may be weaker
         reach = (num + REACH + 50 * (rule == "cusum")) / RATE + 1e-9
         for found in alarms:
-            times = clean + made.available_s[is_told].tolist()
-            assert any(abs(found - own) <= reach for own in times), (start, num, found)
+            if not any(abs(found - own) <= reach for own in clean):
+                told_s = made.available_s[is_told]
+                assert ((found - told_s).abs() <= reach).any(), (start, num, found)
+                by_fast += 1
         for own in clean:  # what was raised in quiet may be lost
             is_near = (made.available_s >= own) & (made.available_s <= own + reach)
             assert made.is_on[is_near].any() or own < SLIP_S - 0.1, (start, num, own)
+    assert by_fast <= num_places // 100  # none of 8 places, one of 120
 
 
 def noise(size, seed=0):
