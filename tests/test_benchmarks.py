@@ -27,7 +27,7 @@ SUBJECTS = [
     for path in sorted((ROOT / "benchmarks").glob("*.py"))
     if "(Benchmark)" in path.read_text(encoding="utf-8")
 ]
-"""Benchmarks of the harness, one a file; ``crossval_general`` is another's."""
+"""Benchmarks of the harness, one a file."""
 
 
 def _subject(name: str) -> type[Benchmark]:
