@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import reduce
 from operator import xor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from small_detector import HAND, alarming_detector
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from tactslip_torch import SlipDetector
 from tactslip_torch.data.formats import Reading
 from tactslip_torch.live import (
     Block,
@@ -48,7 +50,9 @@ from tactslip_torch.live import (
 from tactslip_torch.live.sinks import decision_columns
 from tactslip_torch.onset.decisions import joined_decisions
 from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.pretrained import sample_recording
 
+ROOT = Path(__file__).parents[1]
 RATE, NAN = 2000.0, np.nan
 NAMES = HAND.names
 HEADER = "AA 55"
@@ -833,3 +837,18 @@ def test_a_page_that_does_not_read_loses_samples_for_itself_alone(serve, detecto
         got = got[-1000:] + peer.recv(1 << 20)
     assert int(last[1]) > 0
     peer.close()
+
+
+def test_the_line_on_the_page_is_what_a_stream_of_the_demo_prints() -> None:
+    page = (ROOT / "docs" / "live.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"^```json\n(.*)\n```$", page, re.MULTILINE)
+    printed: list[str] = []
+    stream = StreamingDetector(SlipDetector.pretrained())
+    sink = JsonLines(printed.append, sample_rate_hz=RATE)
+    for decisions in (stream.push(sample_recording().samples.T), stream.flush()):
+        sink.decisions(decisions)
+    (line,) = map(json.loads, printed)
+    assert line == {
+        name: pytest.approx(value, rel=1e-5) if isinstance(value, float) else value
+        for name, value in json.loads(shown).items()
+    }, printed
