@@ -56,7 +56,6 @@ class AnyHand:
         size: of the noise, in whatever unit.
         offset: that it stands on.
         num_features: to select.
-        polyorder: of the filter.
         has_own_filters: whether wavelet and kernels of the filter are numbers of its own.
     """
 
@@ -71,7 +70,6 @@ class AnyHand:
     size: float = 0.1
     offset: float = 0.0
     num_features: int = 12
-    polyorder: int = 1
     has_own_filters: bool = False
 
     def layout(self) -> HandLayout:
@@ -98,9 +96,9 @@ class AnyHand:
 
     def channel_filter(self) -> ChannelFilter:
         lengths = frame_lengths(self.layout(), self.frames)
-        layer = ChannelFilter(lengths, self.polyorder, self.align)
+        layer = ChannelFilter(lengths, align=self.align)
         if self.has_own_filters:
-            layer = ChannelFilter(lengths, self.polyorder, self.align, own_kernels(layer))
+            layer = ChannelFilter(lengths, align=self.align, kernels=own_kernels(layer))
         return layer
 
     def noise(self, num: int, num_samples: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -17,7 +17,6 @@ from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.recipe import Paper
@@ -115,13 +114,11 @@ def small_recipe(**changes: Any) -> Paper:
     return Paper(**({"num_features": 10, "penalties": (0.1, 1.0), "sample_bins": 50} | changes))
 
 
-def refitted_scores(
-    bins: TrainingBins, groups: torch.Tensor, penalty: float, kernel: Polynomial = PAPER_KERNEL
-) -> torch.Tensor:
+def refitted_scores(bins: TrainingBins, groups: torch.Tensor, penalty: float) -> torch.Tensor:
     """Of each bin, by the machine that is fitted without its group."""
     scores = torch.full((len(groups),), torch.nan, dtype=torch.float64)
     for group in groups.unique():
         own = groups == group
         others = (x[~own] for x in (bins.features, bins.is_slip, bins.weights) if x is not None)
-        scores[own] = fit_machine(TrainingBins(*others), penalty, kernel)(bins.features[own])
+        scores[own] = fit_machine(TrainingBins(*others), penalty)(bins.features[own])
     return scores

@@ -20,7 +20,6 @@ from tactslip_torch.training.evaluation import Outcomes, compared
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",
-    "ignore:The '.*_dataloader' does not have many workers",
     "ignore:.*does not have many workers",
 )
 SIMPLE = ["logistic_regression", "logistic_regression_simple", "random_forest_simple"]

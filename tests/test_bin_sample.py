@@ -125,10 +125,14 @@ def test_joined_groups_hold_every_group_once_and_are_of_about_one_size():
     assert torch.equal(joined.weight, bins.weight)
 
 
-def test_groups_of_one_class_are_joined_to_groups_of_both():
-    """Recordings that are slip, or are not, as a whole."""
-    joined = sample_of([(6, 0), (0, 5)] * 20).joined()
-    for place in range(MOST_GROUPS):
+@pytest.mark.parametrize(
+    ("sizes", "num"), [([(6, 0), (0, 5)] * 20, MOST_GROUPS), ([(2, 0)] * 3 + [(0, 2)] * 3, 3)]
+)
+def test_groups_of_one_class_are_joined_to_groups_of_both(sizes, num):
+    """Recordings that are slip, or are not, as a whole; of few, as many as can have both."""
+    joined = sample_of(sizes).joined()
+    assert len(joined.group_names) == num
+    for place in range(num):
         assert len(joined.is_slip[joined.group == place].unique()) == 2
 
 

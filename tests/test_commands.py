@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from biotac_layout import write_biotac
+from contract.recordings import CHANNELS
 from hydra.errors import InstantiationException
 from small_set import NoiseRecordings
 
@@ -23,27 +24,20 @@ BAD_INPUT = (ValueError, KeyError, TypeError, OSError, InstantiationException)
 class TinyRecordings(NoiseRecordings):
     """Recordings in the place of real ones: two strokes, louder while the hand slides.
 
-    ``scene`` may hold ``slide_s``, ``quiet`` (materials that never slip long enough for a bin) and
-    ``rate``; ``channels`` says how many of the four channels there are, ``broken`` which recording
-    ends in NaN.
+    ``scene`` may hold ``slide_s`` and ``rate``; ``channels`` says how many of the four channels
+    there are, ``broken`` which recording ends in NaN.
     """
 
     def __init__(self, seed, cycles, materials, channels=None, scene=None, broken="", **simulated):
-        rows = [
-            {"name": f"{kind}{i}", "kind": kind, "finger": finger, "segment": "distal"}
-            for kind in ("SG", "PVDF")
-            for i, finger in enumerate(("index", "thumb"), 1)
-        ]
-        self.hand = HandLayout.from_rows(rows[-channels:] if channels else rows)
-        self._options = {"slide_s": 0.8, "quiet": (), "rate": 2000.0} | (scene or {})
+        self.hand = HandLayout.from_rows(CHANNELS[-channels:] if channels else CHANNELS)
+        self._options = {"slide_s": 0.8, "rate": 2000.0} | (scene or {})
         assert not simulated.get("extra_scenes")
         self.sample_rate_hz = self._options["rate"]
         self.ids = tuple(RecordingId(m, c) for m in materials for c in range(cycles))
         self._seed, self._broken = seed, broken
 
     def timeline(self, recording):
-        is_quiet = recording.material in self._options["quiet"]
-        slide_s, onsets = 0.02 if is_quiet else self._options["slide_s"], (1.1, 3.1)
+        slide_s, onsets = self._options["slide_s"], (1.1, 3.1)
         return Timeline(
             duration_s=4.5,
             onsets_s=onsets,
@@ -55,7 +49,7 @@ class TinyRecordings(NoiseRecordings):
 
     def key(self, recording):
         own = {"tiny": str(recording), "seed": self._seed, "hand": self.hand.to_rows()}
-        return own | self._options | {"quiet": [*self._options["quiet"]], "broken": self._broken}
+        return own | self._options | {"broken": self._broken}
 
     def seed(self, recording):
         return self._seed * 1009 + sum(recording.material.encode()) * 31 + recording.cycle

@@ -150,10 +150,3 @@ def test_a_recipe_that_counts_costs_takes_a_cheaper_set():
         assert len(names) == 4
         taken[machine] = costs.cost([costs.parts(name) for name in names])
     assert taken["m7"] < taken[None]
-
-
-def test_a_machine_that_is_none_or_no_number_of_columns_is_refused():
-    with pytest.raises(ValueError, match=r"recipe\.per_cost must be one of m7, x86"):
-        General(per_cost="m33", num_features=5)
-    with pytest.raises(ValueError, match=r"give recipe\.num_features"):
-        General(per_cost="m7")

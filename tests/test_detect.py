@@ -1,11 +1,11 @@
 """``detect`` as a command: what it detects, what it leaves, and what it says of bad input."""
 
-import csv
 import json
 
 import numpy as np
 import pytest
 import torch
+from contract.test_commands import table as rows_of
 from drawing import assert_png
 from small_detector import HAND, small_detector
 from test_commands import composed as composed_of
@@ -71,11 +71,6 @@ def detected(model, place, folder, *overrides):
     content = detect(composed(f"model={model}", f"input={place}", *overrides), folder)
     assert json.loads((folder / "onsets.json").read_text()) == content
     return content
-
-
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,6 @@ from tactslip_torch.training.learner import SlipLearner
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",
-    "ignore:The '.*_dataloader' does not have many workers",
     "ignore:.*does not have many workers",
 )
 

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from contract.recordings import CHANNELS, HELD_OUT, SEEN, TRIALS
 from hydra.core.config_store import ConfigStore
@@ -18,7 +17,6 @@ from tactslip_torch.data.file_recordings import hand_file
 from tactslip_torch.data.formats import Reading
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import everything, leave_groups_out
-from tactslip_torch.training.bins import SampledBins
 from tactslip_torch.training.datamodule import _grouping
 
 HAND = {
@@ -206,25 +204,6 @@ def test_of_one_object_validation_leaves_out_sessions_or_recordings(sessions, ex
     group = _grouping(fold.having("train"))
     assert {group(r).replace("@2", "") for r in ids} == expected
     assert _grouping([*ids, RecordingId("box", 0)])(ids[0]) == "cup"
-
-
-def test_recordings_of_one_label_are_joined_until_two_groups_have_both():
-    group = torch.arange(6).repeat_interleave(2)
-    sample = SampledBins(
-        torch.zeros(12, 1),
-        group >= 3,
-        group,
-        tuple("abcdef"),
-        torch.zeros(12),
-        ("",),
-        torch.ones(12, dtype=torch.float64),
-        group,
-        tuple("abcdef"),
-    )
-    joined = sample.joined()
-    assert len(joined.group_names) == 3
-    for each in range(3):
-        assert set(joined.is_slip[joined.group == each].tolist()) == {True, False}
 
 
 def test_a_file_of_another_rate_is_resampled_as_in_training_or_refused_by_the_key(tmp_path):

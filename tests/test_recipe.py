@@ -9,9 +9,9 @@ import pytest
 import torch
 from scipy.stats import ttest_ind
 from small_set import SMALL_HAND, refitted_scores
+from test_views import POOL as FAST_POOL
 
 from tactslip_torch.features.pool import FeaturePool, is_simple_of
-from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
 from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.report.metrics import balanced_accuracy
@@ -22,13 +22,6 @@ from tactslip_torch.training.views import ViewBins
 
 WHOLE_POOL = FeaturePool(SMALL_HAND)
 POOL = WHOLE_POOL.paper()
-FAST_POOL = FeaturePool(
-    HandLayout.from_rows(
-        {"name": f"f{i}", "kind": "fast", "finger": f"f{i}", "segment": "tip", "adapting": "fast"}
-        for i in range(4)
-    ),
-    level=1,
-)
 FEW = {"num_features": 4, "penalties": (0.1, 3.0)}
 
 
@@ -189,6 +182,8 @@ BAD = [
     (Paper, {"penalties": (0.1, float("inf"))}, "validation needs finite values"),
     (Paper, {"penalties": ("0.1",)}, r"recipe.penalties must be a number, got '0.1'"),
     (Paper, {"num_features": 1.5}, "recipe.num_features"),
+    (General, {"per_cost": "m33", "num_features": 5}, r"recipe\.per_cost must be one of m7, x86"),
+    (General, {"per_cost": "m7"}, r"give recipe\.num_features"),
     (Paper, {"offset": -1.0}, "offset"),
     (Paper, {"sample_bins": 1}, "recipe.sample_bins"),
     (Paper, {"degree": 3}, "degree of the kernel must be 1 or 2, got 3"),

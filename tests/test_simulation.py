@@ -431,11 +431,6 @@ def touching(grasp):
     return np.isin(grasp.element_of_channel, grasp.touching)
 
 
-def apart(intervals):
-    """Those that no other one overlaps."""
-    return [a for a in intervals if all(b is a or b[0] > a[1] or b[1] < a[0] for b in intervals)]
-
-
 # --- disturbances and handling ------------------------------------------------------------------
 
 

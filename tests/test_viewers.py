@@ -12,16 +12,7 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from small_detector import HAND
-from test_detect import (  # noqa: F401
-    RATE_HZ,
-    SETTINGS,
-    detected,
-    model,
-    recording,
-    rows_of,
-    save,
-    volts,
-)
+from test_detect import RATE_HZ, SETTINGS, detected, model, recording, rows_of, save  # noqa: F401
 
 from tactslip_torch.data.formats import FORMATS, Reading, open_file
 from tactslip_torch.live import Block

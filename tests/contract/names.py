@@ -9,15 +9,7 @@ Left: the word the tests use. Right: what it is called now.
 
 from collections.abc import Sequence
 
-from tactslip_torch import (
-    FeaturePool,
-    HandLayout,
-    Scene,
-    SlipDetector,
-    StreamingDetector,
-    sample_recording,
-    simulate,
-)
+from tactslip_torch import FeaturePool, HandLayout, Scene, SlipDetector, StreamingDetector, simulate
 
 PACKAGE = "tactslip_torch"
 BACKENDS = ("torch", "auto")
