@@ -132,9 +132,7 @@ class Crossval(Benchmark):
         'given=[data.cycles=4,"data.materials=[M1,M2,iron]",recipe.num_features=10,'
         '"recipe.penalties=[0.001]"]'
     )
-    charts: ClassVar = {
-        "": [("By choice, seed 0", "mean"), ("By material, seed 0", "paper mean")]
-    }
+    charts: ClassVar = {"": [("By choice, seed 0", "mean"), ("By material, seed 0", "paper mean")]}
     given: tuple[str, ...] = ()
     recipes: tuple[str, ...] = ("paper", "general")
     seeds: tuple[int, ...] = (0, 4)

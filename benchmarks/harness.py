@@ -182,7 +182,8 @@ class Benchmark(ABC):
         places = drawing.subplots(len(shown), squeeze=False, height_ratios=heights)[:, 0]
         for axes, (title, _, *over), (names, columns) in zip(places, panels, shown, strict=True):
             only = next(iter(columns)) if len(columns) == 1 else ""
-            about = f"{title}: {only}" if only else title
+            of_all = next((name for name in [*tables[title].rows[0]][:1] if "%" in name), "")
+            about = f"{title}: {only or of_all}".removesuffix(": ")
             for x in over:
                 lines(axes, tables[title].curves(only, x), x, about)
             if not over:
