@@ -230,7 +230,8 @@ def _data(config: DictConfig, source: Loaded, width_ms: float) -> Iterator[SlipD
     """The features of all recordings for bins of a width, as many levels as they allow."""
     rule = instantiate(config.labels, bin_ms=float(width_ms))
     fold: Split = instantiate(config.split, _convert_="all")(source.ids)[0]
-    maker = feature_maker(source, rule, **config.features)
+    recipe: Paper = instantiate(config.recipe, _convert_="all")
+    maker = feature_maker(source, rule, **config.features, recipe=recipe, with_baselines=False)
     with feature_cache("off") as maker.cache:
         data = SlipDataModule(maker, [fold], num_workers=0)
         data.setup()
