@@ -182,8 +182,9 @@ class Benchmark(ABC):
         places = drawing.subplots(len(shown), squeeze=False, height_ratios=heights)[:, 0]
         for axes, (title, _, *over), (names, columns) in zip(places, panels, shown, strict=True):
             only = next(iter(columns)) if len(columns) == 1 else ""
-            of_all = next((name for name in [*tables[title].rows[0]][:1] if "%" in name), "")
-            about = f"{title}: {only or of_all}".removesuffix(": ")
+            first = next(iter(tables[title].rows[0]))  # of many columns it names their unit
+            of = only or (first if "%" in first else "")
+            about = f"{title}: {of}" if of else title
             for x in over:
                 lines(axes, tables[title].curves(only, x), x, about)
             if not over:

@@ -153,6 +153,12 @@ def test_too_few_hours_are_told_and_a_scene_without_any_is_refused(caplog):
     few = stage(Streams(cycles=1), budget=BARE, hours={"held": 0.0, **of_others})
     with pytest.raises(ValueError, match="0 h of held cannot show"):
         few.roles(loudness_detector())
+    few = stage(
+        Streams(cycles=1), budget={**BARE}, hours={"others": 1.0, "paper": 0.0, "held": 1.0}
+    )
+    few.streams.ids = tuple(r for r in few.streams.ids if r.cycle or r.scene != "held")
+    with pytest.raises(ValueError, match="0 h of held cannot show"):
+        few.roles(loudness_detector())
 
 
 BEYOND_THE_HOURS = [

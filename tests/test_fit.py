@@ -247,6 +247,14 @@ def test_many_bins_go_through_the_primal_and_few_do_not(kernel, crossover, rng):
         assert fit_machine(draw(rng, num_bins), 0.3, kernel, "dual").solved.size == num_bins
 
 
+def test_a_machine_of_fewer_bins_than_its_many_features_is_a_quadratic_form_too(rng):
+    bins = draw(rng, 60, num_features=1001)
+    machine = fit_machine(bins, 0.3)
+    new = rng.uniform(-1, 1, (5, 1001))
+    expected = ridge(bins, 0.3, PAPER_KERNEL, new)
+    np.testing.assert_allclose(machine(torch.from_numpy(new)).numpy(), expected, rtol=1e-9)
+
+
 NONE = TrainingBins(torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool))
 SOME = TrainingBins(torch.eye(3), torch.tensor([True, False, True]))
 
