@@ -23,7 +23,7 @@ COMMANDS = {
     "export": "write a detector as ONNX",
     "importance": "which sensors matter",
     "pareto": "the most accurate detector within a deadline",
-    "hosts": "copy a program that runs an exported detector: python, c, node or web",
+    "hosts": "copy a program that runs an exported detector: python, c, native, node or web",
 }
 OF_THEIR_OWN = ("demo", "setup", "hosts")
 """Commands without a configuration."""

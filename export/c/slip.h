@@ -18,7 +18,7 @@ struct slip_facts {
     size_t max_samples;   /* of one push */
     size_t max_decisions; /* that one push can bring */
     bool is_double;       /* the graph computes in float64 */
-    bool has_onset;       /* an onset classifier raises alarms too */
+    bool has_onset;       /* alarms come from an onset classifier alone */
     double first_bin_s;   /* from when on decisions speak of a bin */
 };
 
@@ -34,7 +34,7 @@ struct slip_decision {
     bool alarm;                /* raised by this decision */
     bool on;                   /* stands after it */
     double onset_score; /* of fast evidence; NaN: none, or no onset classifier */
-    bool by_onset;      /* it reaches its threshold: then it raised the alarm, else the statistic */
+    bool by_onset;      /* it reaches its threshold: alarms come from it, where there is one */
     bool hint;          /* it reaches a lower one: a controller may tighten a little */
 };
 

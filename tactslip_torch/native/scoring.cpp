@@ -228,7 +228,7 @@ template <class E> struct Scorer {
           if (!is_sorted)  // those not in use come last
             for (int32_t c = 0; c < p.num_channels; ++c)
               sorted[c] = in_use[c] > 0 ? values[c] : last;
-          if (!is_sorted) merges(sorted, p.num_channels, 1);
+          if (!is_sorted) sort_few(sorted, p.num_channels);
           is_sorted = true;
           found = mean - mean;  // NaN stays NaN
           for (int32_t c = 0; c < p.num_channels; ++c) {

@@ -105,15 +105,19 @@ template <class E, class V> INLINE V clamped(V x, E most) {
   return x > most ? V{} + most : x < -most ? V{} - most : x;
 }
 
-// Sorts blocks of a power of two, whose halves are sorted, by Batcher's odd-even merges: those of 2 p
-// first. What is missing of the last block counts as larger than all.
 template <class V> INLINE void exchange(V* a, V* b) {
   V x = *a, y = *b;
   *a = smaller(x, y);
   *b = larger(x, y);
 }
-template <class V> INLINE void merges(V* v, int n, int p) {
-  for (; p < n; p *= 2)
+template <int NUM, class V> INLINE void exchange_all(V* v, const int (&pairs)[NUM][2]) {
+#pragma GCC unroll 19
+  for (auto& pair : pairs) exchange(v + pair[0], v + pair[1]);
+}
+
+// Sorts by Batcher's odd-even merges, with the fewest comparisons: for few values.
+template <class V> INLINE void sort_few(V* v, int n) {
+  for (int p = 1; p < n; p *= 2)
     for (int k = p; k > 0; k /= 2)
       for (int block = 0; block < n; block += 2 * p) {
         int end = block + 2 * p < n ? block + 2 * p : n;
@@ -122,20 +126,26 @@ template <class V> INLINE void merges(V* v, int n, int p) {
       }
 }
 
+// Sorts by bitonic merges, of which those within 8 values stay in registers. Needs memory for a whole
+// number of 8 values.
 template <class V> NOINLINE void sort(V* v, int n) {
 #if defined(TACTSLIP_SMALL)
-  merges(v, n, 1);
+  sort_few(v, n);
 #else
-  int whole = 0;
-  for (; whole + 8 <= n; whole += 8) {  // in registers: the same merges, one behind the other
-    V* w = v + whole;
-    constexpr int pairs[][2] = {{0, 1}, {2, 3}, {4, 5}, {6, 7}, {0, 2}, {1, 3}, {4, 6},
-                                {5, 7}, {1, 2}, {5, 6}, {0, 4}, {1, 5}, {2, 6}, {3, 7},
-                                {2, 4}, {3, 5}, {1, 2}, {3, 4}, {5, 6}};
-#pragma GCC unroll 19
-    for (auto& pair : pairs) exchange(w + pair[0], w + pair[1]);
+  constexpr int sorts[][2] = {{0, 1}, {2, 3}, {4, 5}, {6, 7}, {0, 2}, {1, 3}, {4, 6},
+                              {5, 7}, {1, 2}, {5, 6}, {0, 4}, {1, 5}, {2, 6}, {3, 7},
+                              {2, 4}, {3, 5}, {1, 2}, {3, 4}, {5, 6}};
+  constexpr int merges[][2] = {{0, 4}, {1, 5}, {2, 6}, {3, 7}, {0, 2}, {1, 3},
+                               {4, 6}, {5, 7}, {0, 1}, {2, 3}, {4, 5}, {6, 7}};
+  for (; n % 8; ++n) v[n] = V{} + INFINITY;
+  for (int i = 0; i < n; i += 8) exchange_all(v + i, sorts);
+  for (int p = 8; p < n; p *= 2) {  // two sorted blocks of p become one
+    for (int low = 0, high = 2 * p - 1; low + p < n; low += 2 * p, high += 2 * p)
+      for (int i = high < n ? 0 : high - n + 1; i < p; ++i) exchange(v + low + i, v + high - i);
+    for (int k = p / 2; k >= 8; k /= 2)
+      for (int low = 0; low + k < n; low += 2 * k)
+        for (int i = low; i < low + k && i + k < n; ++i) exchange(v + i, v + i + k);
+    for (int i = 0; i < n; i += 8) exchange_all(v + i, merges);
   }
-  merges(v + whole, n - whole, 1);
-  merges(v, n, 8);
 #endif
 }

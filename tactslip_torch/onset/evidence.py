@@ -69,7 +69,7 @@ FEWEST_BLOCK_SAMPLES = 4
 """Of a block that counts as still where all its samples are one value."""
 _BLIND_WINDOWS = 5  # of a stream without a score, in longest windows
 _MOST_PAIRS = 120  # of channels whose correlation is taken
-_LEAST_RISE = 1e-6  # of a floor over that of silence, in half the log power, and of weights
+_LEAST_RISE = 1e-6  # of a floor over that of silence, in half the log power; or a sum of weights
 _LEAST_STEPS = 1e-3  # sum over channels of steps over their floors, that counts as none
 _LEAST_POWER = 1e-30  # of a filter, where the converter's step is not known
 _NUMBERS: Mapping[str, Any] = {
@@ -755,7 +755,7 @@ class OnsetClassifier:
         if len(scaler.minimum) != num or head.num_features not in known:
             raise ValueError(
                 f"expected {num} columns of evidence, got {len(scaler.minimum)} and a head of "
-                f"{head.num_features}"
+                f"{head.num_features}; another version made this alarm, train again"
             )
         hint = math.inf if plain["hint"] is None else float(plain["hint"])
         return cls(evidence, scaler, head, float(plain["threshold"]), hint, float(plain["lead_s"]))
