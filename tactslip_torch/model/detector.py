@@ -76,8 +76,9 @@ class SlipDetector(nn.Module):
         info: JSON-able metadata about the training, kept in the file.
         imputation: scaled columns in place of those of a lost channel, ``[S]``; default 0.
         pooling: from the features that are read to the columns; ``None``: they are the columns.
-        sensing: what training tells of channels that work, by which lost channels and decisions
-            that are not valid are told; may be set at any time. Default: ``Sensing.unknown``.
+        sensing: what training found of channels that work: from it follows which channels are lost
+            and which decisions are not valid. May be set at any time. Default:
+            ``Sensing.unknown``.
         backend: what features are made by where no gradient is asked for (``FeaturePool``).
 
     Shape:
@@ -262,9 +263,9 @@ class SlipDetector(nn.Module):
     ) -> Prediction:
         """``predict`` for raw bins with their context, where NaN and Inf count as filters reach it.
 
-        A channel is alive only where what its filter leaves stands above the rounding of the raw
-        samples in its frames (``features.pool.LEAST_SPAN``). A tone that the filter takes out
-        wholly leaves nothing, however loud it is.
+        A channel is alive only if its filtered samples vary by more than the rounding of the raw
+        samples in its frames (``features.pool.LEAST_SPAN``). So a channel with nothing but a tone
+        that the filter removes is not alive, however loud the tone is.
 
         Shape:
             - samples: ``[*, C, context_before + n + context_after]``, volts

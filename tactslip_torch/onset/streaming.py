@@ -49,16 +49,16 @@ class StreamEvent(NamedTuple):
 class StreamingDetector:
     """A detector that watches a stream without end.
 
-    What all pushes and the final ``flush`` return, put together, is what ``score_stream`` and a
-    ``Decider`` make of the whole recording, whatever pieces it came in: scores to rounding. A
-    decision uses no sample behind its bin's ``look_ahead`` and is returned by the push that brings
-    the last one. Not for several threads at once.
+    All pushes and the final ``flush`` together return the decisions that ``score_stream`` and a
+    ``Decider`` make of the whole recording; scores are equal to rounding, whatever the size of the
+    pushes. A decision needs the samples of its bin and ``look_ahead`` more, and is returned by the
+    push that brings the last of them. Not for several threads at once.
 
-    **Missing samples** are NaN; so are the samples of a gap of at most ``settings.hold_s`` that the
-    times of samples show, and those of a channel that keeps one value for too long. Decisions that
-    they reach are made without the channel; with too few channels they are not valid, and move no
-    rule (``features.sensing``). A longer gap ends the stream as ``flush`` does and begins another,
-    from decision number 0; ``num_gaps`` counts, and the log warns.
+    **Missing samples** are NaN. Two more count as missing: a gap in the times of samples, up to
+    ``settings.hold_s``, and a channel that keeps one value for too long. Decisions that need
+    missing samples of a channel are made without it. With too few channels they are not valid, and
+    do not change the rule (``features.sensing``). A longer gap ends the stream, as ``flush`` does,
+    and begins another, from decision number 0; ``num_gaps`` counts them, and the log warns.
 
     Args:
         detector: fitted on this hand.
