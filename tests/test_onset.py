@@ -483,7 +483,10 @@ BAD_SETTINGS = [
     (lambda: evidence_of(resolution=(1.0,)), r"resolution must be finite, at least 0 and \[6\]"),
     (lambda: evidence_of(least_rms=((1.0,) * 4,)), r"least_rms must be .* and \[3, 4\]"),
     (lambda: evidence_of(is_still=(True,)), "is_still must be of 3 channels, got 1"),
-    (lambda: kept(lambda plain: plain.update(minimum=[0.0], maximum=[1.0])), "expected .* columns"),
+    (
+        lambda: kept(lambda plain: plain.update(minimum=[0.0], maximum=[1.0])),
+        "expected .* columns .* got 1 .*; another version made this alarm, train again",
+    ),
     (lambda: kept(lambda plain: plain.pop("mains_hz")), "of this version: 'mains_hz'"),
     (lambda: Perceptron([torch.ones(2, 3)], [torch.ones(2)]), "end in one output, got .*2, 3"),
 ]
