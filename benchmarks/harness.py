@@ -31,7 +31,7 @@ from threadpoolctl import threadpool_info  # type: ignore[import-untyped]
 
 from benchmarks import RESULTS, ROOT
 from benchmarks.sources import digest
-from benchmarks.tables import Report, Table, chart, is_barred, lines
+from benchmarks.tables import Report, Table, by_unit, chart, is_barred, lines
 from benchmarks.trainings import say as say
 from benchmarks.trainings import write_text
 from tactslip_torch.commands.stopping import errors_in_one_line, stopping
@@ -172,18 +172,23 @@ class Benchmark(ABC):
     def draw(self, numbers: Report, drawing: Figure, ending: str) -> None:
         """Fill the figure of that ending: ``charts``, unless a subject draws something else."""
         tables = self.tables(numbers)
-        panels = [of for of in self.charts[ending] if of[0] in tables]
-        shown = [tables[title].columns(starts) for title, starts, *_ in panels]
+        panels = [
+            (title, x, names, unit, columns)
+            for title, starts, *x in self.charts[ending]
+            if title in tables
+            for names, every in [tables[title].columns(starts)]
+            for unit, columns in by_unit(every).items()
+        ]
         heights = [
             14 if x else 3 + len(names) * max(1, 0.7 * len(columns) * is_barred(names, columns))
-            for (_, _, *x), (names, columns) in zip(panels, shown, strict=True)
+            for _, x, names, _, columns in panels
         ]
         drawing.set_size_inches(9.2, max(4.8, 0.22 * sum(heights)))
-        places = drawing.subplots(len(shown), squeeze=False, height_ratios=heights)[:, 0]
-        for axes, (title, _, *over), (names, columns) in zip(places, panels, shown, strict=True):
+        places = drawing.subplots(len(panels), squeeze=False, height_ratios=heights)[:, 0]
+        for axes, (title, over, names, unit, columns) in zip(places, panels, strict=True):
             only = next(iter(columns)) if len(columns) == 1 else ""
-            first = next(iter(tables[title].rows[0]))  # of many columns it names their unit
-            of = only or (first if "%" in first else "")
+            first = next(iter(tables[title].rows[0]))  # of many columns it may name their unit
+            of = only or (first if "%" in first else unit)
             about = f"{title}: {of}" if of else title
             for x in over:
                 lines(axes, tables[title].curves(only, x), x, about)

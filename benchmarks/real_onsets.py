@@ -188,7 +188,7 @@ class RealOnsets(Benchmark):
         for per_hour in self.per_hour:
             for name, runs in methods.items():
                 events = [one for run in runs for one in _events(source, run, per_hour)]
-                rows.append(_row(f"{name}, {per_hour:g}", pooled_metrics(events), len(runs)))
+                rows.append(_row(f"{name}, {per_hour:g} /h", pooled_metrics(events), len(runs)))
         quiet_min = 60 * pooled_metrics(events)["quiet_hours"]
         note = (
             f"{len(source.ids)} trials of {len(objects)} objects, {quiet_min:.1f} min are quiet; "

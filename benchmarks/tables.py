@@ -19,6 +19,7 @@ Report = Mapping[str, Any]
 """What a benchmark keeps: ``numbers`` that it measured, and what they were measured on."""
 MOST_BARS = 24
 """In a chart; more values are dots."""
+_UNIT = re.compile(r"[ ,](%|us|ms|s|kB|MB)$")
 _DASHES = ("-", "--", ":")
 
 
@@ -111,14 +112,22 @@ class Table(NamedTuple):
     ) -> tuple[list[str], dict[str, list[float | None]]]:
         """What names the rows, and the first number of each cell in columns that begin like this.
 
-        Names are the words before those columns, of the first three.
+        Names are the words before those columns, of the first three, without results (``mean ±
+        sd``) and words that all rows have.
         """
         chosen = [name for name in list(self.rows[0])[1:] if name.startswith(starts)]
         found = {name: [_first_number(row[name]) for row in self.rows] for name in chosen}
         before = list(self.rows[0])[: min(3, list(self.rows[0]).index(chosen[0]))]
-        words = [name for name in before if isinstance(self.rows[0][name], str)]
+        cells = {name: [row[name] for row in self.rows] for name in before}
+        words = [
+            name
+            for place, (name, own) in enumerate(cells.items())
+            if isinstance(own[0], str) and not any("±" in str(cell) for cell in own)
+            if not place or len(set(own)) > 1
+        ]
         of = {
-            n: n if all(re.match(r"[+-]?\d", str(r[n])) for r in self.rows) else "" for n in words
+            name: name if all(re.match(r"[+-]?\d", str(cell)) for cell in cells[name]) else ""
+            for name in words
         }
         names = [", ".join(f"{of[n]} {row[n]}".strip() for n in words) for row in self.rows]
         return names, found
@@ -188,6 +197,20 @@ def limits(rows: Iterable[tuple[str, float, float, str]]) -> Table:
     )
 
 
+def by_unit(columns: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Columns by the unit that ends their names, or ``""``.
+
+    Example:
+        >>> by_unit({"median ms": 1, "size, kB": 2, "p95 ms": 3})
+        {'ms': {'median ms': 1, 'p95 ms': 3}, 'kB': {'size, kB': 2}}
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for name, values in columns.items():
+        unit = _UNIT.search(name)
+        found.setdefault(unit[1] if unit else "", {})[name] = values
+    return found
+
+
 def is_barred(names: Sequence[str], series: Mapping[str, object]) -> bool:
     """Whether a chart has bars: they are few enough."""
     return len(names) * len(series) <= MOST_BARS
@@ -197,6 +220,8 @@ def chart(
     axes: Axes, names: Sequence[str], series: Mapping[str, Sequence[float | None]], about: str
 ) -> None:
     """Horizontal bars, each with its value, or dots where they are many; the first row on top.
+
+    Dots of later series are smaller, so that all are seen where they meet.
 
     The axis of values is logarithmic where bars differ by more than a factor of 20 and are no
     percentages.
@@ -208,16 +233,18 @@ def chart(
         about: labels the axis of values.
     """
     is_bars, height = is_barred(names, series), 0.8 / len(series)
-    looks = product("osD", style.PALETTE)
+    looks, look = product("osD", style.PALETTE), dict[str, Any]()
     for step, (label, (marker, color)) in enumerate(zip(series, looks, strict=False)):
         shift = height * (step - (len(series) - 1) / 2) if is_bars else 0.0
         shown = {place + shift: of for place, of in enumerate(series[label]) if of is not None}
         if not is_bars:
-            axes.plot(list(shown.values()), list(shown), marker, color=color, label=label)
+            size = 3 + 6 * (len(series) - step) / len(series)
+            look = {"color": color, "markersize": size}
+            axes.plot(list(shown.values()), list(shown), marker, label=label, **look)
             continue
         axes.barh(list(shown), list(shown.values()), color=color, height=0.9 * height, label=label)
         for place, value in shown.items():
-            look: Any = {"textcoords": "offset points", "va": "center", "size": 7}
+            look = {"textcoords": "offset points", "va": "center", "size": 7}
             axes.annotate(number(value), (value, place), (3, 0), **look)
     style.lanes(axes, names)
     every = [of for values in series.values() for of in values if of]

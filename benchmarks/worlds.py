@@ -139,7 +139,7 @@ def _real_onsets(numbers: Mapping[str, Any]) -> Iterator[Row]:
             for other in every
             if other["rate"] == of["rate"] and not other["name"].startswith("alarm")
         }
-        world = f"osu, begins of slips, {of['name']}, set to {of['rate']} /h"
+        world = f"osu, begins of slips, {of['name']}, set to {of['rate']}"
         row = _row(world, "real", "found", float(of["found %"].split()[0]))
         row["delay, ms"] = of["delay ms"].split()[0]
         row["false alarms"] = f"{of['false an hour'].split()[0]} /h"

@@ -92,6 +92,16 @@ def test_a_table_has_numbers_to_the_right_and_words_to_the_left() -> None:
     assert table.markdown().split("\n")[1] == "| --- | ---: | --- |"
 
 
+def test_names_in_a_chart_leave_out_results_and_what_all_rows_have() -> None:
+    rows = [
+        {"method": "a", "slips": "116", "test %": "98.8 ± 0.1", "found %": "40 [30, 50]"},
+        {"method": "b", "slips": "116", "test %": "96.0 ± 0.2", "found %": "60 [50, 70]"},
+    ]
+    assert Table(rows).columns("found") == (["a", "b"], {"found %": [40.0, 60.0]})
+    rows[1]["slips"] = "99"
+    assert Table(rows).columns("found")[0] == ["a, slips 116", "b, slips 99"]
+
+
 def test_forward_selection_takes_what_lessens_the_error_most() -> None:
     """Against a solve of every candidate at every step, with features that repeat each other."""
     generator = torch.Generator().manual_seed(3)
