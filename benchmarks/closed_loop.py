@@ -126,24 +126,24 @@ class ClosedLoop(Benchmark):
             {
                 "tightened by": _words(name),
                 "dropped %": _percents(row["dropped"]),
-                "beside the alarm": _percents(row["beside"]),
+                "more than with the alarm, %": _percents(row["beside"]),
                 "slid mm": f"{row['slid'][1]:.2f} [{row['slid'][2]:.1f}]",
                 "peak grip": f"{row['peak'][1]:.2f} [{row['peak'][2]:.2f}]",
                 "mean grip": f"{row['mean'][1]:.2f}",
                 "late ms": "-" if row["late"] is None else f"{row['late']:.0f}",
-                "false": f"{row['false_alarms']:.2f}",
-                "by hint": f"{row['false_hints']:.2f}",
+                "false alarms a lift": f"{row['false_alarms']:.2f}",
+                "false hints a lift": f"{row['false_hints']:.2f}",
             }
             for name, row in numbers["methods"].items()
         ]
         note = (
-            f"{numbers['lifts']} lifts. In brackets 95 % of the bootstrap over lifts; *beside "
-            "the alarm*: dropped more than with the alarm at that delay, in the same lifts. *Slid* "
-            "and *peak grip*: median and, in brackets, 95 % quantile; grips over the least that "
-            "the largest load needs. *Late*: from the begin of a slide to the first tightening in "
-            "it, median. *False*: tightenings of a lift where no pad slid in the quarter second "
-            f"before. Thresholds of energy and CUSUM are what {numbers['calibration']} lifts of "
-            "seen materials without slip reach at most."
+            f"{numbers['lifts']} lifts. In brackets 95 % of the bootstrap over lifts. *More "
+            "than with the alarm*: difference of drops to the alarm at the same delay, in the same "
+            "lifts. *Slid* and *peak grip*: median and, in brackets, 95 % quantile; grips are "
+            "divided by the least grip that holds the largest load. *Late*: from the begin of a "
+            "slide to the first tightening in it, median. *False*: the grip was tightened where no "
+            "pad had slid in the quarter second before. Thresholds of energy and CUSUM: the "
+            f"largest values in {numbers['calibration']} lifts of seen materials without slip."
         )
         kinds = [
             {"dropped %, load": kind}

@@ -19,7 +19,7 @@ import torch
 from hydra.utils import instantiate
 
 from benchmarks.harness import Benchmark, Job
-from benchmarks.tables import Report, Table, percent
+from benchmarks.tables import ROLES, Report, Table, percent
 from benchmarks.trainings import composed, resumed
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import seen6
@@ -134,7 +134,7 @@ class Crossval(Benchmark):
     )
     charts: ClassVar = {
         "": [
-            ("By choice, seed 0", ("mean", "least")),
+            ("By choice, seed 0", ("mean", "lowest")),
             ("By material, seed 0", ("paper mean", "general mean")),
         ]
     }
@@ -210,14 +210,16 @@ def split_rows(run: Report) -> list[dict[str, object]]:
             numbers = {
                 "mean": mean(scores),
                 "sd": _spread(scores),
-                "least": scores[0],
-                "5 %": scores[int(0.05 * len(scores))],
+                "lowest": scores[0],
+                "5 % quantile": scores[int(0.05 * len(scores))],
                 "median": median(scores),
-                "most": scores[-1],
+                "highest": scores[-1],
                 "the paper's four": papers[0] if papers else None,
             }
             row = {title: percent(value) for title, value in numbers.items()}
-            rows.append({"balanced accuracy, %": f"{name}, {role}", **row, "splits": len(scores)})
+            rows.append(
+                {"balanced accuracy, %": f"{name}, {ROLES[role]}", **row, "choices": len(scores)}
+            )
     return rows
 
 
@@ -225,7 +227,7 @@ def material_rows(run: Report) -> list[dict[str, object]]:
     """One row for each material: its scores in the choices where it is unseen."""
     rows: list[dict[str, object]] = []
     for material in run["materials"]:
-        row: dict[str, object] = {"unseen material, %": material}
+        row: dict[str, object] = {"held-out material, %": material}
         for name, splits in run["splits"].items():
             found = [split["per_material"].get(material) for split in splits]
             scores = [score for score in found if score is not None]
@@ -256,10 +258,10 @@ def _worst_rows(run: Report) -> list[dict[str, object]]:
             {
                 "held-out materials": f"{recipe}, seed {run['seed']}",
                 "mean %": percent(mean(split["unseen"] for split in known)),
-                "worst choice %": percent(worst["unseen"]),
-                "which": ", ".join(worst["materials"]),
-                "worst single material %": percent(score),
-                "which of which choice": f"{material} of {', '.join(beside)}",
+                "lowest choice %": percent(worst["unseen"]),
+                "choice": ", ".join(worst["materials"]),
+                "lowest single material %": percent(score),
+                "material, of choice": f"{material}, of {', '.join(beside)}",
             }
         )
     return rows

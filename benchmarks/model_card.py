@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import torch
 
 from benchmarks.harness import Benchmark, Job
-from benchmarks.tables import Table, listed
+from benchmarks.tables import ROLES, Table, listed
 from benchmarks.timing import interleaved, on_threads
 from tactslip_torch import SlipDetector
 from tactslip_torch.deploy.export import export_detector
@@ -69,7 +69,10 @@ class ModelCard(Benchmark):
                 "sample rate": f"{pool.sample_rate_hz:g} Hz",
                 "bin; look-ahead": f"{1e3 * pool.bin_samples / pool.sample_rate_hz:.0f} ms; "
                 f"{1e3 * detector.look_ahead / pool.sample_rate_hz:.1f} ms",
-                **{f"balanced accuracy, {role}": f"{100 * of:.2f} %" for role, of in known.items()},
+                **{
+                    f"balanced accuracy, {ROLES.get(role, role)}": f"{100 * of:.2f} %"
+                    for role, of in known.items()
+                },
                 "alarm": repr(info["alarm"]["rule"]["name"]) + ", no rate of false alarms is set",
             },
         )

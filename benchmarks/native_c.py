@@ -112,7 +112,7 @@ class NativeC(Benchmark):
     about = (
         "the detector that comes with the package, made by the default recipe, as `detector.tslip` "
         "in C programs, on 1 thread; boards are emulated by QEMU, which counts instructions and "
-        "says nothing of time"
+        "does not show time"
     )
     page = "docs/deploy.md"
     charts: ClassVar = {"": (("A decision on this machine", "us a decision"),)}
@@ -284,7 +284,7 @@ def _test_set(detector: SlipDetector, every: int) -> Table:
                 "largest difference of a score, sd": f"{np.nanmax(off) / spread:.1e}",
                 "99.9 % are within": f"{np.nanquantile(off, 0.999) / spread:.1e}",
                 "other sign of the score": str(is_other.sum()),
-                "of these outside the margin": str(is_outside.sum()),
+                "other sign, |score| above the margin": str(is_outside.sum()),
                 "other status": str((on != expected[1]).sum()),
                 "alarms": f"{expected[2].sum():.0f}",
                 "other alarms": str((alarm != expected[2]).sum()),

@@ -104,10 +104,10 @@ class Numerics(Benchmark):
                     flips += int(((scores >= 0) != (reference >= 0))[both].sum())
                     off = np.abs(scores - reference)[both].max(initial=0.0) / (sd or 1.0)
                     row[name] = float(off)
-                rows.append(row | {"decided otherwise": flips})
+                rows.append(row | {"other decision": flips})
         note = (
             "The largest difference of scores to torch in float64, in their standard deviations; "
-            f"{self.bins} bins, rounded to float32, of each kind. *Decided otherwise*: bins whose "
+            f"{self.bins} bins, rounded to float32, of each kind. *Other decision*: bins whose "
             "sign or validity differs, of all backends together."
         )
         return Table(rows, note)
@@ -138,7 +138,7 @@ class Numerics(Benchmark):
                     "each sample moved by its last float32 digit": name,
                     "median change": float(off.median()),
                     "largest change": float(off.max()),
-                    "decided otherwise": int(((after >= 0) != (before >= 0)).sum()),
+                    "other decision": int(((after >= 0) != (before >= 0)).sum()),
                 }
             )
         note = (
@@ -168,8 +168,10 @@ class Numerics(Benchmark):
                     "C": f"{penalty:g}",
                     "largest error": number(max(wrong)) if wrong else "-",
                     "largest stated": number(max(stated)) if stated else "-",
-                    "beyond stated": sum(w > s + 1e-14 for w, s in zip(wrong, stated, strict=True)),
-                    "refused": refused,
+                    "errors above stated": sum(
+                        w > s + 1e-14 for w, s in zip(wrong, stated, strict=True)
+                    ),
+                    "fits refused": refused,
                 }
             )
         note = f"Scores of training bins, root mean square; {self.systems} systems a row."
@@ -201,7 +203,7 @@ def _plain(seed: int) -> tuple[Array, Array]:
     return z, np.where(z[:, 0] * z[:, 1] > 0, 1.0, -1.0)
 
 
-_SYSTEMS = {"plain": _plain, "nearly the same twice": _duplicates}
+_SYSTEMS = {"independent columns": _plain, "columns nearly equal in pairs": _duplicates}
 
 
 def _exact(z: Array, targets: Array, penalty: float) -> Array:

@@ -418,8 +418,8 @@ def _selected(runs: Runs) -> Table:
         for what, of in paper.items()
     ]
     note = (
-        f"Counts; the paper selects {published.NUM_SELECTED}, and prints of descriptors an order "
-        "only. Its features were ranked on all bins, ours on training bins."
+        f"Counts; the paper selects {published.NUM_SELECTED}, and gives only an order of "
+        "descriptors. Its features were ranked on all bins, ours on training bins."
     )
     return Table(rows, note)
 
@@ -531,7 +531,7 @@ def _leakage(scores: Scores) -> Table:
                         "seeds": len(found),
                     }
                 )
-    return Table(rows, "The leak is that of each seed, then mean and spread.")
+    return Table(rows, "Leakage is computed for each seed; mean and standard deviation over seeds.")
 
 
 def _confound(runs: Runs, scores: Scores) -> dict[str, Table]:
@@ -577,7 +577,7 @@ def _confound(runs: Runs, scores: Scores) -> dict[str, Table]:
     }
     note = (
         f"Clearly better: more than {CLEARLY:g} points in every seed; no worse: a mean loss of at "
-        f"most {NO_WORSE:g}. Both are asked for before training on such scenes is recommended."
+        f"most {NO_WORSE:g}. Training on such scenes is recommended only if both hold."
     )
     return {
         "Slip or the arm": Table(rows, "Recalls; - where a scene has no bin of a class."),

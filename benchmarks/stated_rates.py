@@ -1,7 +1,7 @@
 """Whether stated false-alarm rates hold: ``python -m benchmarks.stated_rates [KEY=VALUE ...]``.
 
-Of 50 h of decisions without slip sets of stretches are drawn at random; each sets the threshold of
-an alarm for a rate, as ``tactslip calibrate`` does, and the rate is counted in all other stretches.
+Of 50 h of decisions without slip sets of segments are drawn at random; each sets the threshold of
+an alarm for a rate, as ``tactslip calibrate`` does, and the rate is counted in all other segments.
 Decisions are noise and disturbances that come in bunches; beside the bound with the dispersion of
 counts stands that of a Poisson process. Decisions are drawn, no sensor is simulated. Puts its table
 into docs/onset.md.
@@ -74,7 +74,7 @@ class StatedRates(Benchmark):
     about = "in how many of the calibration sets the stated rate holds in the other hours"
     page, markers, has_headings = "docs/onset.md", "stated_rates", False
     quick = "hours=10 hours_of_set=[3] sets=3"
-    charts: ClassVar = {"": [("Stated rates", ("holds", "as if one by one"))]}
+    charts: ClassVar = {"": [("Stated rates", ("holds",))]}
     hours: float = 50.0
     hours_of_set: tuple[float, ...] = (8.0,)
     per_hour: float = 10.0
@@ -93,10 +93,11 @@ class StatedRates(Benchmark):
                 rows.append({"false alarms": name, "set": f"{hours:g} h"})
                 rows[-1] |= self._row(made, scored, round(hours / _STRETCH_H))
         note = (
-            f"{self.sets} sets of stretches of {60 * _STRETCH_H:g} min out of {self.hours:g} h, at "
-            f"most {self.per_hour:g} false alarms an hour with a confidence of 0.95. *Refused*: "
-            "sets that cannot show the rate, as bunches are large for so few hours; they count in "
-            "neither column. *Used*: the median of the rate in the other hours by the one stated."
+            f"{self.sets} sets of segments of {60 * _STRETCH_H:g} min out of {self.hours:g} h; at "
+            f"most {self.per_hour:g} false alarms an hour with a confidence of 0.95. *Holds*: the "
+            "rate in the other hours is at most that. *Without dispersion*: as if alarms came one "
+            "by one. *Refused*: sets with too few hours for such bunches; they are not in *holds*. "
+            "*Counted / stated*: the rate in the other hours by the stated one, median."
         )
         return {"tables": {"Stated rates": Table(rows, note)}}
 
@@ -119,10 +120,10 @@ class StatedRates(Benchmark):
         seen, single = rates[True], rates[False]
         return {
             "holds %": _held(seen, self.per_hour),
-            "as if one by one %": _held(single, self.per_hour),
+            "holds % without dispersion": _held(single, self.per_hour),
             "dispersion": f"{median(dispersions):.1f}",
             "refused": f"{self.sets - len(seen)}",
-            "used": f"{median(seen) / self.per_hour:.2f}" if seen else "-",
+            "counted / stated": f"{median(seen) / self.per_hour:.2f}" if seen else "-",
         }
 
 

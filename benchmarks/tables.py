@@ -17,6 +17,8 @@ from tactslip_torch.report import style
 percent = style.percent
 Report = Mapping[str, Any]
 """What a benchmark keeps: ``numbers`` that it measured, and what they were measured on."""
+ROLES = {"test": "test cycles", "unseen": "held-out materials"}
+"""Of a split, in words."""
 MOST_BARS = 24
 """In a chart; more values are dots."""
 _UNIT = re.compile(r"[ ,](%|us|ms|s|kB|MB)$")

@@ -41,7 +41,7 @@ class Train(Benchmark):
     """
 
     title = "Training"
-    about = "python -m tactslip_torch.train, with an empty feature cache and with a full one"
+    about = "the main job, `python -m tactslip_torch.train`, with an empty and a full feature cache"
     quick = (
         'overrides=[+exp=quick,recipe=paper,recipe.num_features=12,"data.materials=[M1,iron]","split.seen=[M1]",'
         "num_workers=0,baselines=false,export=false] repeats=1 sample_s=1.0"

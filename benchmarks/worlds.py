@@ -71,7 +71,11 @@ class Worlds(Benchmark):
             for row in rows
         ]
         note = "; ".join(missing)
-        return {"tables": {"The worst first": Table(shown, f"{note[:1].upper()}{note[1:]}.")}}
+        return {
+            "tables": {
+                "The worst first": Table(shown, f"{note[:1].upper()}{note[1:]}." if note else "")
+            }
+        }
 
 
 _PERCENT = ("ours, %", "best baseline, %")
