@@ -89,7 +89,7 @@ def test_no_wrong_access_on_damaged_files_and_odd_samples(files, tmp_path):
     make(tmp_path, "sanitized")
     opened = 0
     for number, path in enumerate([*files.values(), long]):
-        command = [tmp_path / "check", path, "1250", str(number)]
+        command = [tmp_path / "sanitized" / "check", path, "1250", str(number)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr[:3000]
         opened += json.loads(done.stdout)["opened"]

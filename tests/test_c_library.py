@@ -2,6 +2,7 @@
 
 import copy
 import math
+import re
 from dataclasses import replace
 
 import hosts
@@ -387,6 +388,38 @@ def test_where_float32_is_off_the_default_is_float64_and_says_why(typed, tmp_pat
     assert status == 2
     assert err.strip().endswith("give precision=float64 or auto")
     assert not (tmp_path / FILE).exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["graph=native", "native.scale=0"], "native.scale must not be 0, got 0"),
+        (["graph=native", "native.scale=[1.0,0]"], "native.scale must not be 0"),
+        (["graph=native", "native.offset=abc"], "native.offset must be a number .* got 'abc'"),
+        (["native.scale=3e-5"], "need graph=native"),
+        (["native.source=true"], "need graph=native"),
+    ],
+)
+def test_a_converter_that_makes_no_volts_is_refused(words, said, typed, tmp_path):
+    model = tmp_path / "detector.pt"
+    alarming_detector().save(model)
+    status, _, err = typed(export, *words, f"model={model}")
+    assert status == 2
+    assert re.search(said, err)
+    assert [path.name for path in tmp_path.iterdir()] == ["detector.pt"]
+
+
+@pytest.mark.parametrize("graph", ["native", "bin"])
+def test_a_mean_that_was_subtracted_for_training_is_told(graph, typed, tmp_path):
+    """The files do not subtract it."""
+    model, detector = tmp_path / "detector.pt", copy.deepcopy(alarming_detector())
+    detector.save(model)
+    assert "tare_s" not in typed(export, f"graph={graph}", f"model={model}")[2]
+    detector.info["reading"] = {"tare_s": [0.0, 0.5]}
+    detector.save(model)
+    status, _, err = typed(export, f"graph={graph}", f"model={model}")
+    assert status == 0
+    assert "the mean of 0 to 0.5 s was taken off each channel (reading.tare_s)" in err
 
 
 @pytest.mark.parametrize("graph", ["native", "stream"])

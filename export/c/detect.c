@@ -13,7 +13,7 @@
 #include "slip.h"
 
 #define USAGE \
-    "usage: detect [--rate HZ] [--chunk N] [--threshold T] [--decisions] stream.onnx recording.npy"
+    "usage: detect [--rate HZ] [--chunk N] [--threshold T] [--decisions] MODEL recording.npy"
 enum { LARGEST_CHUNK = 2000, WRONG = 1, WRONG_USAGE = 2 };
 
 struct options {
@@ -88,7 +88,7 @@ static int read_options(int count, char **words, struct options *options) {
         if (which != 1 && !read_number(value, which ? &options->threshold : &options->rate))
             return refuse(WRONG_USAGE, "%s: expected a finite decimal number, got %s", name, value);
     }
-    if (!options->recording) return refuse(WRONG_USAGE, "stream.onnx and recording.npy are needed");
+    if (!options->recording) return refuse(WRONG_USAGE, "a model and a recording.npy are needed");
     return 0;
 }
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point
+from tactslip_torch.data.formats import Reading
 from tactslip_torch.deploy.bins import Precision
 from tactslip_torch.deploy.export import export_detector, summary, wanted_graphs
 from tactslip_torch.deploy.native import NativeFile
@@ -29,18 +33,43 @@ def export(config: DictConfig, results: Path) -> None:
     if folder.suffix == ".onnx" or folder.is_file():
         raise ValueError(f"output must be a folder, got {folder}; the files have their names")
     check_choice("precision", config.precision, ("auto", "float32", "float64"))
+    given: Any = OmegaConf.to_container(config.native)
+    with_source = given.pop("source")
+    _check_counts(given)
     if config.graph == "native":
-        given: Any = OmegaConf.to_container(config.native)
-        with_source = given.pop("source")
         made = NativeFile.checked(detector, config.precision, **given)
         reason = f", as in float32 {made.why_double}" if made.why_double else ""
         for path in made.write(folder, source=with_source):
             print(f"{path}: {path.stat().st_size / 1000:.0f} kB, {made.precision}{reason}")
+        _tell_tare(detector)
         return
+    if with_source or given != {"scale": 1.0, "offset": 0.0}:
+        raise ValueError("native.source, native.scale and native.offset need graph=native")
     graphs = wanted_graphs(config.graph, detector)
     precision: Precision = "float32" if config.precision == "auto" else config.precision
     for path in export_detector(detector, folder, graphs, precision, source=source):
         print(summary(path))
+    _tell_tare(detector)
+
+
+def _check_counts(given: Mapping[str, Any]) -> None:
+    """Raise ValueError unless scale and offset are numbers, and no scale is 0."""
+    for name, value in given.items():
+        for one in value if isinstance(value, list) else [value]:
+            if type(one) not in (int, float) or not math.isfinite(one):
+                raise ValueError(f"native.{name} must be a number or a list of them, got {value!r}")
+            if name == "scale" and one == 0:
+                raise ValueError(f"native.scale must not be 0, got {value!r}: it is volts a count")
+
+
+def _tell_tare(detector: SlipDetector) -> None:
+    """Files take samples as they are; the means that were subtracted for training are not."""
+    if tare := Reading.of(detector.info.get("reading") or {}).tare_s:
+        print(
+            f"note: for training, the mean of {tare[0]:g} to {tare[1]:g} s was taken off each "
+            "channel (reading.tare_s); a program that runs these files must take it off too",
+            file=sys.stderr,
+        )
 
 
 main = entry_point("export", export)
