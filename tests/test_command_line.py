@@ -5,6 +5,7 @@
 
 import contextlib
 import io
+import re
 import shlex
 import shutil
 import subprocess
@@ -18,6 +19,7 @@ from omegaconf import OmegaConf
 from tactslip_torch import __version__
 from tactslip_torch.__main__ import COMMANDS, OF_THEIR_OWN, main
 from tactslip_torch.commands.configuration import _keys_of, checked, conf_dir, help_text, with_lists
+from tactslip_torch.commands.hosts import copy_host
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "troubleshooting.md"
@@ -200,6 +202,14 @@ def test_help_comes_without_torch(line):
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert "tactslip train +exp=quick" in done.stdout
+
+
+@pytest.mark.parametrize("name", ["c", "native", "python", "web"])
+def test_the_links_of_a_copied_page_lead_into_the_copy(name, tmp_path):
+    copy_host(name, tmp_path)
+    for page in tmp_path.glob("*/README.md"):
+        links = re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8"))
+        assert [link for link in links if not (page.parent / link).exists()] == []
 
 
 def test_the_version_is_that_of_the_package(capsys, monkeypatch):

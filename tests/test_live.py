@@ -638,6 +638,15 @@ def test_help_for_who_reads_no_further_ends_without_a_word():
         assert (ended.returncode, ended.stderr) == (0, b"")
 
 
+def test_a_stream_without_one_sample_is_an_error(tmp_path):
+    model = tmp_path / "detector.pt"
+    alarming_detector().save(model)
+    words = [sys.executable, "-m", "tactslip_torch", "stream", f"model={model}", "source=stdin"]
+    ended = subprocess.run(words, input="volts\n" * 9, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert "ended before a sample came; check that it sends" in ended.stderr.splitlines()[-1]
+
+
 # The page ----------------------------------------------------------------------------------------
 
 

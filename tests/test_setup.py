@@ -11,7 +11,11 @@ import yaml
 
 from tactslip_torch.commands import setup
 from tactslip_torch.data.file_names import name_pattern
+from tactslip_torch.data.file_recordings import FileRecordings
+from tactslip_torch.data.labels import LabelColumn
+from tactslip_torch.data.manifest import Entry, Listing
 from tactslip_torch.data.proposal import Answers, _filter_frame, bin_samples, look, propose
+from tactslip_torch.data.recording import RecordingId
 
 # Names ---------------------------------------------------------------------------------------
 
@@ -189,9 +193,93 @@ def test_uneven_times_ask_for_the_rate_and_are_left_out(tmp_path):
         write(tmp_path / f"{name}.csv", ["a", "b"], time=times, slip=[0] * 200 + [1] * 200)
     question, *_ = propose(look(tmp_path)).questions
     assert question.name == "rate_hz"
-    assert float(question.default) > 0
+    assert question.default == ""  # the median step is a fifth shorter than the mean
+    assert "Hz in the mean" in question.text
     reading = propose(look(tmp_path), Answers(rate_hz=80.0)).settings["data"]["reading"]
     assert (reading["time"], reading["sample_rate_hz"]) == (None, 80.0)
+
+
+def slips(tmp_path, **labels):
+    """Two files of 400 rows, each with these cells in its columns."""
+    for name in ("cup_1", "cup_2"):
+        write(tmp_path / f"{name}.csv", ["a", "b"], **labels)
+    return look(tmp_path)
+
+
+def test_jitter_that_the_rate_does_not_fit_is_resampled(tmp_path):
+    """A set that setup reads is read by train."""
+    for seed, name in ((0, "cup_1"), (2, "cup_2")):
+        times = 0.002 * np.arange(400) + np.random.default_rng(seed).uniform(-6e-4, 6e-4, 400)
+        write(tmp_path / f"{name}.csv", ["a", "b"], time=times, slip=[0] * 200 + [1] * 200)
+    reading = propose(look(tmp_path)).settings["data"]["reading"]
+    files = ("cup_1.csv", "cup_2.csv")
+    listing = Listing(tuple(Entry(name, name, RecordingId(name, 0), None) for name in files))
+
+    def lengths(how):
+        source = FileRecordings(tmp_path, manifest=listing, reading={"time": "time", **how})
+        return [source.load(name).samples.shape[1] for name in source.ids]
+
+    rates = {key: reading.get(key) for key in ("sample_rate_hz", "resample_hz")}
+    assert lengths(rates) == pytest.approx([400, 400], abs=2)
+    with pytest.raises(ValueError, match="but 500 Hz is stated"):
+        lengths({"sample_rate_hz": 500.0})
+
+
+def test_times_without_a_unit_that_step_by_tens_are_milliseconds(tmp_path):
+    found = slips(tmp_path, time=10 * np.arange(400), slip=[0] * 200 + [1] * 200)
+    reading = propose(found).settings["data"]["reading"]
+    assert (reading["time_unit"], reading["sample_rate_hz"]) == ("ms", 100.0)
+
+
+def test_a_known_word_keeps_its_meaning_when_another_is_stated(tmp_path):
+    found = slips(tmp_path, state=["slip"] * 100 + ["free"] * 100 + ["stick"] * 200)
+    (question,) = propose(found).questions
+    assert question.flag == "--label WORD=slip or --label WORD=non-slip for each"
+    assert question.text.endswith("not known: free")
+    for says_slip, wanted in ((False, ["slip"]), (True, ["free", "slip"])):
+        words = {"free": says_slip}
+        assert propose(found, Answers(words=words)).settings["labels"]["slip"] == wanted
+    with pytest.raises(ValueError, match="column state has no word foo; it holds free, slip, st"):
+        propose(found, Answers(words={"foo": True}))
+
+
+def test_labels_of_minus_one_and_one_are_not_all_slip(tmp_path):
+    labels = propose(slips(tmp_path, slip=[-1] * 200 + [1] * 200)).settings["labels"]
+    column = LabelColumn("slip", slip=labels["slip"])
+    assert column.states(np.array([-1.0, 1.0])).tolist() == [0, 1]
+
+
+def test_a_limit_that_no_value_passes_is_refused(tmp_path):
+    found = slips(tmp_path, slip=[0] * 200 + [1] * 200)
+    with pytest.raises(ValueError, match=r"--over 5: .* 0 to 1, so all of it is non-slip"):
+        propose(found, Answers(over=5.0))
+
+
+def test_a_column_of_slip_that_never_changes_is_told(tmp_path):
+    (question,) = propose(slips(tmp_path, slip=[0] * 400)).questions
+    assert "column slip holds only 0" in question.text
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("cup_1.csv,3,2", "line 2: the end, 2, is not after the start, 3"),
+        ("cup_1.csv,1,2\ncup_1.csv,1.5,3", "lines 2 and 3 overlap, of cup_1.csv"),
+    ],
+)
+def test_intervals_that_cannot_be_are_refused(rows, said, tmp_path):
+    slips(tmp_path)
+    (tmp_path / "labels.csv").write_text(f"file,start,end\n{rows}\n")
+    with pytest.raises(ValueError, match=said):
+        look(tmp_path)
+
+
+def test_a_pattern_that_lacks_what_is_needed_is_refused(tmp_path):
+    for name in ("slip/cup_1", "slip/box_1", "hold/cup_1", "hold/box_1"):
+        write(tmp_path / f"{name}.csv", ["a", "b"])
+    for pattern, lacks in (("{label}/*_{trial}", "material"), ("*/{material}_{trial}", "label")):
+        with pytest.raises(ValueError, match=f"has no {{{lacks}}}, which tells"):
+            propose(look(tmp_path), Answers(pattern=pattern))
 
 
 def test_a_table_of_intervals_becomes_a_manifest(tmp_path):

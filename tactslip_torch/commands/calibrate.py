@@ -170,8 +170,8 @@ def _kept_bins(config: DictConfig, detector: SlipDetector) -> KeptBins:
     rate = AlarmSettings.of(detector).target_per_hour
     if config.per_hour is None and rate is not None:
         raise ValueError(
-            f"the alarm is set for {rate:g} false alarms an hour, which holds no more after a "
-            "refit; give per_hour=RATE, and recordings without slip to set it by"
+            f"the alarm is set for {rate:g} false alarms an hour, and a refit changes that rate; "
+            "give per_hour=RATE, and recordings without slip, to set it again"
         )
     return KeptBins.load(Path(config.model).with_name(BINS), detector)
 
@@ -190,9 +190,9 @@ def _new_bins(
     num_slip = int(is_slip.sum())
     if len(new) < 2 or not 0 < num_slip < len(is_slip):
         raise ValueError(
-            "a refit is tried on new recordings left out: that needs two or more with labels, slip "
-            f"and no slip among them; got {len(new)} with {num_slip} bins of slip and "
-            f"{len(is_slip) - num_slip} of none"
+            "a refit is tested on new recordings, each left out in turn: it needs two or more with "
+            f"labels, with slip and without; got {len(new)}, with {num_slip} bins of slip and "
+            f"{len(is_slip) - num_slip} without"
         )
     return new
 
@@ -526,8 +526,8 @@ def _tell(report: Mapping[str, Any]) -> None:
             told = " %, after ".join(f"{100 * end:.1f}" for end in ends)
             old, new = refit["num_groups"]
             print(
-                "to be expected on objects of neither, by leaving out each group of training bins: "
-                f"before {told} % ({old} groups, {new} after; a hard one lowers it)"
+                "expected on other objects, where each group of training bins is left out in turn: "
+                f"before {told} % ({old} groups, {new} after; one hard group lowers it)"
             )
     print(f"left out: {report['left_out_words']}")
     if bins := report.get("bins"):

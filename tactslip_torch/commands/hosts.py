@@ -11,6 +11,8 @@ from tactslip_torch.commands import packaged_folder
 _SHARED = {"web": ("web", "node"), "native": ("native", "c")}
 """Hosts of several folders: the page shares the reader and the stream of ``node``, the C library
 the command line of ``c``."""
+_LINKS = {"../README.md": "options.md", "../../tactslip_torch/native/tactslip.h": "src/tactslip.h"}
+"""Of their pages: where a link of the checkout leads in a copy."""
 _LEFT_OUT = shutil.ignore_patterns("node_modules", "__pycache__", "build", "*.o")
 
 
@@ -39,6 +41,12 @@ def copy_host(name: str, folder: Path) -> Path:
             raise FileExistsError(f"{folder / part} is there already; give another folder")
     for part in parts:
         shutil.copytree(hosts_dir() / part, folder / part, ignore=_LEFT_OUT)
+        page = folder / part / "README.md"
+        text = page.read_text(encoding="utf-8")
+        for link, own in _LINKS.items():
+            text = text.replace(f"]({link})", f"]({own})")
+        page.write_text(text, encoding="utf-8")
+        shutil.copy(hosts_dir() / "README.md", page.with_name("options.md"))
     if name == "native":
         sources = folder / name / "src"
         sources.mkdir()

@@ -79,7 +79,7 @@ def _answered(answers: Answers, question: Question, answer: str) -> Answers:
         ValueError: if it is no answer.
     """
     if not (answer := answer.strip()):
-        raise ValueError(f"{question.text} Give {question.flag}")
+        raise ValueError(f"{_sentence(question)} Give {question.flag}")
     if question.name in ("slip", "non_slip"):
         words = {word.strip(): question.name == "slip" for word in answer.split(",")}
         return replace(answers, words={**answers.words, **words})
@@ -88,12 +88,17 @@ def _answered(answers: Answers, question: Question, answer: str) -> Answers:
     return replace(answers, **given)
 
 
+def _sentence(question: Question) -> str:
+    return question.text if question.text.endswith(("?", ")")) else f"{question.text}."
+
+
 def _number(text: str, flag: str) -> float:
     try:
         number = float(text.replace(",", "."))
     except ValueError:
         raise ValueError(f"{flag}: {text!r} is no number") from None
-    if not 0 <= number < float("inf"):
+    is_wrong = number == 0 and flag == "--rate HZ"
+    if is_wrong or not 0 <= number < float("inf"):
         raise ValueError(f"{flag}: expected a positive number, got {text}")
     return number
 
@@ -221,7 +226,7 @@ def main() -> None:
     )  # fmt: skip
     parser.add_argument(
         "--non-slip", action="append", default=[], metavar="WORD",
-        help="the same for what is no slip; all other words are slip",
+        help="the same for what is no slip; words that are not known are slip then",
     )  # fmt: skip
     parser.add_argument(
         "--pattern", help="how names are made, such as {label}/{material}_{trial} or {material}_*"
@@ -250,7 +255,7 @@ def _answers(given: argparse.Namespace) -> Answers:
             raise ValueError(f"--label must be WORD=slip or WORD=non-slip, got {pair!r}")
         words[word] = label_of(label) == "slip"
     return Answers(
-        rate_hz=None if given.rate is None else _number(given.rate, "--rate"),
+        rate_hz=None if given.rate is None else _number(given.rate, "--rate HZ"),
         units=given.units,
         time=given.time,
         time_unit=given.time_unit,
@@ -274,6 +279,6 @@ def _ask(takes_likely: bool) -> Callable[[Question], str]:
         try:
             return input(f"{question.text}{default}\n> ")
         except EOFError:  # nobody is there
-            raise ValueError(f"{question.text} Give {question.flag}, or --yes") from None
+            raise ValueError(f"{_sentence(question)} Give {question.flag}, or --yes") from None
 
     return likely if takes_likely else person

@@ -27,7 +27,15 @@ from tactslip_torch.live.mcap_log import McapLog
 from tactslip_torch.live.pump import watch
 from tactslip_torch.live.ros2 import RosTopic
 from tactslip_torch.live.server import PageServer, page_metadata
-from tactslip_torch.live.sinks import Callback, Counts, Event, JsonLines, LineServer, Sink, Source
+from tactslip_torch.live.sinks import (
+    Callback,
+    Counts,
+    Event,
+    JsonLines,
+    LineServer,
+    Sink,
+    Source,
+)
 from tactslip_torch.live.sources import FileInTime, address_of, source_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.streaming import StreamingDetector
@@ -92,6 +100,12 @@ def stream(config: DictConfig, folder: Path) -> Counts:
             watch(source, watching, sinks, queue_s=config.queue_s, counts=counts, events=events)
         except BrokenPipeError:  # whoever reads standard output has seen enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return counts
+    if not counts.received:
+        raise ValueError(
+            f"{source.name} ended before a sample came; check that it sends, and say what it sends "
+            "by frame.columns, frame.separator and so on (tactslip stream --help)"
+        )
     return counts
 
 

@@ -48,6 +48,7 @@ _MOST_FILES = 24  # that are read
 _MOST_BYTES = 200e6  # of files that are read, beside the first three
 _HEAD = 2**16  # characters that show the layout of a text
 _SAME_RATE = 0.01  # rates of files that differ by less are one
+_SAME_STEP = 0.05  # between mean and median step
 _EDGE_HZ, _SLOWEST_HZ = 5.0, 50.0
 _CLEARLY = 0.75  # of the variance on one side: channels of one name that disagree are two kinds
 _BIN_S, _LEAST_BIN, _MOST_BIN = 0.05, 32, 1024
@@ -77,7 +78,7 @@ class Answers:
         column: that has a label for each sample.
         over: slip is where that column is above it.
         words: of names, folders or the column, and whether each is slip; where words of one side
-            alone are given, all others are the other.
+            alone are given, all others that are not known are the other.
     """
 
     rate_hz: float | None = None
@@ -288,6 +289,9 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
         time = next((name for name in samples if isinstance(name, str) and is_time(name)), None)
     if time is not None:
         samples.pop(time)
+        is_told = answers.time_unit is not None or time_unit_in(str(time)) is not None
+        if times is not None and unit in (None, "s") and not is_told and _steps_are_ms(times):
+            times, unit = times * SECONDS["ms"], "ms"
     elif times is None and rate_hz is None and own is None:
         time, unit = _times_by_values(samples)
         if time is not None and unit is not None:
@@ -295,6 +299,11 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
     file, kept = path.relative_to(folder).as_posix(), (*samples, *words)
     is_native = own is not None
     return _Table(file, kept, samples, words, times, time, unit, rate_hz, delimiter, is_native)
+
+
+def _steps_are_ms(times: _Numbers) -> bool:
+    """Whether times without a unit have steps of 1 or more: nobody samples touch each second."""
+    return len(times) > 1 and float(np.median(np.diff(times))) >= 1
 
 
 def _is_of_package(path: Path) -> bool:
@@ -361,7 +370,21 @@ def _intervals(folder: Path, paths: Sequence[Path]) -> tuple[str, list[Mapping[s
                     "give seconds, or name the columns start_ms and end_ms"
                 )
             times[end] = f"{seconds * (1e-3 if row['unit'] == 'ms' else 1.0):.10g}"
+        if float(times["end"]) <= float(times["start"]):
+            raise ValueError(
+                f"{folder / name}: line {row['line']}: the end, {row['end']}, is not after the "
+                f"start, {row['start']}"
+            )
         table.append({**row, **times})
+    latest: dict[str, Mapping[str, str]] = {}
+    for each in sorted(table, key=lambda one: float(one["start"])):
+        before = latest.get(each["file"])
+        if before is not None and float(each["start"]) < float(before["end"]):
+            raise ValueError(
+                f"{folder / name}: lines {before['line']} and {each['line']} overlap, of "
+                f"{each['file']}; give intervals one after the other"
+            )
+        latest[each["file"]] = each
     return name, table
 
 
@@ -478,10 +501,9 @@ def _propose_rate(found: Look, given: Answers, draft: Proposal) -> float:
             draft.set(f"{reading}.time", None, why if wrong else "the files have no times")
         rate_hz = given.rate_hz or (rates[0] if rates and not wrong else 0.0)
         if not rate_hz:
-            own = [one.own_rate_hz for one in found.tables if one.own_rate_hz]
-            default = f"{nominal_rate(float(np.median(own)), 0.01):g}" if own else ""
+            default, told = _likely_rate(found.tables)
             why = f"the times are uneven ({wrong})" if wrong else "the files have no times"
-            text = f"How many samples a second does each channel have? ({why})"
+            text = f"How many samples a second does each channel have? ({why}{told})"
             draft.ask("rate_hz", text, "--rate HZ", default)
             return 0.0
         reason = "stated" if given.rate_hz else "the files say it"
@@ -502,10 +524,42 @@ def _propose_rate(found: Look, given: Answers, draft: Proposal) -> float:
     else:
         rate_hz = given.rate_hz or nominal_rate(common, max(off, 1e-4))
         reason = "by the times"
-        draft.set(f"{reading}.sample_rate_hz", rate_hz, reason)
+        if _is_read_at(found.tables, rate_hz):
+            draft.set(f"{reading}.sample_rate_hz", rate_hz, reason)
+        else:
+            reason = "the steps of the times vary: all files are resampled to even steps"
+            draft.set(f"{reading}.resample_hz", rate_hz, reason)
     missing = f"; {gaps} rows are missing in the files that were read" if gaps else ""
     draft.tell("rate", f"{rate_hz:g} Hz", reason + missing)
     return rate_hz
+
+
+def _likely_rate(tables: Sequence[_Table]) -> tuple[str, str]:
+    """The rate of files without even times, or ``""`` and how mean and median steps differ."""
+    own = []
+    for one in tables:
+        rate_hz = one.own_rate_hz
+        if not rate_hz:
+            continue
+        own.append(rate_hz)
+        if one.times_s is None:
+            continue
+        mean_hz = (len(one.times_s) - 1) / float(one.times_s[-1] - one.times_s[0])
+        if abs(mean_hz / rate_hz - 1) > _SAME_STEP:
+            mean, median = f"{mean_hz:.4g} Hz in the mean", f"{rate_hz:.4g} Hz by its median step"
+            return "", f"; {one.file} has {mean}, {median}"
+    return (f"{nominal_rate(float(np.median(own)), _SAME_RATE):g}" if own else ""), ""
+
+
+def _is_read_at(tables: Sequence[_Table], rate_hz: float) -> bool:
+    """Whether the times of all files are those of this rate."""
+    try:
+        for one in tables:
+            if one.times_s is not None:
+                even_clock(one.times_s, rate_hz, one.file)
+    except ValueError:
+        return False
+    return True
 
 
 def _propose_gaps(found: Look, channels: Sequence[str | int], draft: Proposal) -> None:
@@ -802,12 +856,18 @@ def _propose_label_column(
     classes: dict[str, set[bool]] = {}
     if label.words:
         known = {word: _is_slip(word, given.words) for word in label.words}
+        there = {word.lower() for word in label.words}
+        if no_words := [word for word in given.words if word.lower() not in there]:
+            raise ValueError(
+                f"column {label.name} has no word {', '.join(no_words)}; it holds "
+                f"{', '.join(label.words)}"
+            )
         if unknown := [word for word, slips in known.items() if slips is None]:
             text = (
                 f"Which words of column {label.name} mean slip, with commas between? It holds "
-                f"{', '.join(label.words)}"
+                f"{', '.join(label.words)}; not known: {', '.join(unknown)}"
             )
-            draft.ask("slip", text, f"--label {unknown[0]}=slip")
+            draft.ask("slip", text, "--label WORD=slip or --label WORD=non-slip for each")
         slips = [word for word, is_slip in known.items() if is_slip]
         if given.words and not unknown:
             draft.set("labels.slip", slips, "words of that column that mean slip; others do not")
@@ -820,7 +880,17 @@ def _propose_label_column(
     numbers = label.numbers
     over = given.over
     if over is None and len(numbers) == 2:
-        over = sum(numbers) / 2
+        if -numbers[0] == numbers[1]:  # slip goes by the magnitude otherwise
+            draft.set("labels.slip", [numbers[1]], "numbers of that column that are slip")
+            draft.tell(
+                "labels", f"column {label.name}, slip where it is {numbers[1]:g}", label.reason
+            )
+            for table in found.tables:
+                known_numbers = table.samples[label.name]
+                states = np.unique(known_numbers[np.isfinite(known_numbers)] == numbers[1])
+                classes[table.file] = set(map(bool, states))
+            return classes
+        over = sum(map(abs, numbers)) / 2
     if over is None:
         values, default = f"numbers from {numbers[0]:g} to {numbers[-1]:g}", ""
         if len(numbers) <= _MOST_STATES:
@@ -829,7 +899,12 @@ def _propose_label_column(
         text = f"Above which value of column {label.name} is it slip? It holds {values}"
         draft.ask("over", text, "--over NUMBER", default)
         over = float(default or "nan")
-    draft.set("labels.over", over, "slip is where that column is above it")
+    if given.over is not None and len({abs(number) > over for number in numbers}) < 2:
+        raise ValueError(
+            f"--over {over:g}: column {label.name} holds {numbers[0]:g} to {numbers[-1]:g}, so all "
+            f"of it is {'slip' if abs(numbers[0]) > over else 'non-slip'}; give a number between"
+        )
+    draft.set("labels.over", over, "slip is where the magnitude of that column is above it")
     lower = str(label.name).lower()
     unit = next((unit for end, unit in _SPEED_UNITS.items() if lower.endswith(end)), None)
     if unit is not None and len(numbers) > _MOST_STATES:
@@ -843,14 +918,24 @@ def _propose_label_column(
 
 
 def _is_slip(word: str, words: Mapping[str, bool]) -> bool | None:
-    """Whether a word means slip: as stated, all others the other side; else as people spell it."""
+    """Whether a word means slip: as stated, else as people spell it, else the other side."""
     stated = {one.lower(): slips for one, slips in words.items()}
     if word.lower() in stated:
         return stated[word.lower()]
-    if stated and len(set(stated.values())) == 1:
-        return not next(iter(stated.values()))
-    label = label_of(word)
-    return None if label is None else label == "slip"
+    if label := label_of(word):
+        return label == "slip"
+    is_one_side = stated and len(set(stated.values())) == 1
+    return not next(iter(stated.values())) if is_one_side else None
+
+
+def _constant_label(found: Look) -> str:
+    """That there is no column of labels, or the one whose value never changes."""
+    for name in found.tables[0].names:
+        if _SLIP_NAMES.search(str(name)):
+            label = _label_values(found, name, "")
+            held = label.words or tuple(f"{number:g}" for number in label.numbers)
+            return f"column {name} holds only {held[0]}" if held else f"column {name} is empty"
+    return "no column"
 
 
 def _words_of_names(found: Look, given: Answers, draft: Proposal) -> dict[str, bool]:
@@ -868,7 +953,7 @@ def _words_of_names(found: Look, given: Answers, draft: Proposal) -> dict[str, b
         both = {slips for slips in known.values() if slips is not None}
         if both == {True, False} and None not in known.values():
             labels = {word: "slip" if slips else "non-slip" for word, slips in known.items()}
-            reason = "stated; the others are the other" if stated else "by the words in names"
+            reason = "stated, and by known words" if stated else "by the words in names"
             draft.set("data.labels", labels, "what the words in names and folders mean")
             rest = ", ".join(word for word, slips in known.items() if not slips)
             draft.tell("labels", f"by names: {rest} is non-slip", reason)
@@ -879,10 +964,10 @@ def _words_of_names(found: Look, given: Answers, draft: Proposal) -> dict[str, b
             f"{' or '.join('|'.join(words) for words in choices) or 'nothing'}"
         )
     others = [file for file in found.problems if file.endswith(".csv") and "/" not in file]
+    no_table = f"; {others[0]} is none, or names a file that is no recording" if others else ""
     nothing = (
-        "Nothing tells where slip is: no column, no table of intervals (a CSV with the columns "
-        "file, which names a recording, start and end"
-        f"{f'; {others[0]} is none' if others else ''})"
+        f"Nothing tells where slip is: {_constant_label(found)}, no table of intervals (a CSV with "
+        f"the columns file, which names a recording, start and end{no_table})"
     )
     if not choices:
         text = f"{nothing}, no words in names. Which column says it?"
@@ -903,6 +988,12 @@ def _propose_pattern(
     """How names are read; what they tell of each file."""
     fields: dict[str, Mapping[str, str]]
     if given.pattern is not None:
+        for part in ("{material", *(["{label"] if by_name else [])):
+            if part not in given.pattern:
+                what = "objects" if part == "{material" else "what is slip"
+                raise ValueError(
+                    f"--pattern {given.pattern!r} has no {part}}}, which tells {what}; add it"
+                )
         draft.set("data.pattern", given.pattern, "how names are read; stated")
         read = {file: guessed(file, given.pattern) for file in found.files}
         fields = {file: each for file, each in read.items() if each}
