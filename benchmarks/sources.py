@@ -1,8 +1,9 @@
 """Which sources decide the numbers of a benchmark, and whether a section is of the present ones.
 
 The digest of a benchmark is of its module and of all that is imported from there inside this
-repository, without comments and docstrings; of the files beside these modules that are compiled or
-read; and of what ``SOURCES`` of a module names: patterns of files that it runs and does not import.
+repository, without comments, docstrings and the package's version; of the files beside these
+modules that are compiled or read; and of what ``SOURCES`` of a module names: patterns of files that
+it runs and does not import.
 A name that a module passes on counts as an import from where it is defined. What prints
 tables (``harness``, ``tables``) does not count. Needs the standard library alone.
 """
@@ -178,13 +179,18 @@ def _said(node: object) -> Iterable[str]:
             yield from _said(each)
     elif not isinstance(node, ast.AST):
         yield repr(node)
-    elif not _is_docstring(node):
+    elif not (_is_docstring(node) or _is_version(node)):
         yield f"({type(node).__name__}"
         for name, value in ast.iter_fields(node):
             if value not in (None, []):
                 yield f" {name}="
                 yield from _said(value)
         yield ")"
+
+
+def _is_version(node: object) -> bool:
+    """Whether a statement is the package's version, by which a release differs."""
+    return isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__version__"
 
 
 def _is_docstring(node: ast.AST) -> bool:

@@ -64,8 +64,9 @@ def test_a_change_of_what_a_benchmark_rests_on_changes_its_digest(
     assert digest_of(_replaced(name, old, new)) != digest_of({})
 
 
-def test_comments_docstrings_and_other_modules_do_not_change_a_digest(digest_of) -> None:
+def test_comments_docstrings_version_and_other_modules_do_not_change_a_digest(digest_of) -> None:
     changed = _replaced("tactslip_torch/b.py", '"""Twice."""', '"""Two times."""  # so')
+    changed["tactslip_torch/b.py"] += '__version__ = "9.9"\n'
     changed["tactslip_torch/unused.py"] = "x = 2\n"
     changed |= _replaced("conf/a.yaml", "source:", "# so\n\nsource:   # as it is")
     assert digest_of(changed) == digest_of({})
