@@ -21,7 +21,7 @@ ROLES = {"test": "test cycles", "unseen": "held-out materials"}
 """Of a split, in words."""
 MOST_BARS = 24
 """In a chart; more values are dots."""
-_UNIT = re.compile(r"[ ,](%|us|ms|s|kB|MB)$")
+_UNIT = re.compile(r"[ ,](%|us|ms|s|kB|MB)(?: |$)")
 _DASHES = ("-", "--", ":")
 
 
@@ -200,11 +200,11 @@ def limits(rows: Iterable[tuple[str, float, float, str]]) -> Table:
 
 
 def by_unit(columns: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Columns by the unit that ends their names, or ``""``.
+    """Columns by the unit in their names, or ``""``.
 
     Example:
-        >>> by_unit({"median ms": 1, "size, kB": 2, "p95 ms": 3})
-        {'ms': {'median ms': 1, 'p95 ms': 3}, 'kB': {'size, kB': 2}}
+        >>> by_unit({"median ms": 1, "size, kB": 2, "p95 ms of all": 3})
+        {'ms': {'median ms': 1, 'p95 ms of all': 3}, 'kB': {'size, kB': 2}}
     """
     found: dict[str, dict[str, Any]] = {}
     for name, values in columns.items():
