@@ -27,15 +27,7 @@ from tactslip_torch.live.mcap_log import McapLog
 from tactslip_torch.live.pump import watch
 from tactslip_torch.live.ros2 import RosTopic
 from tactslip_torch.live.server import PageServer, page_metadata
-from tactslip_torch.live.sinks import (
-    Callback,
-    Counts,
-    Event,
-    JsonLines,
-    LineServer,
-    Sink,
-    Source,
-)
+from tactslip_torch.live.sinks import Callback, Counts, Event, JsonLines, LineServer, Sink, Source
 from tactslip_torch.live.sources import FileInTime, address_of, source_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.streaming import StreamingDetector
