@@ -146,7 +146,7 @@ class Table(NamedTuple):
 
     def markdown(self) -> str:
         """A table of Markdown, columns of numbers to the right and of words to the left."""
-        header, *rows = style.cells(self._shown())
+        header, *rows = ([c.replace("|", "\\|") for c in row] for row in style.cells(self._shown()))
         rule = [
             "---:" if place and all(re.match(r"[+-]?\d|-?$", cell) for cell in column) else "---"
             for place, column in enumerate(zip(*rows, strict=True))

@@ -396,8 +396,8 @@ def test_where_float32_is_off_the_default_is_float64_and_says_why(typed, tmp_pat
         (["graph=native", "native.scale=0"], "native.scale must not be 0, got 0"),
         (["graph=native", "native.scale=[1.0,0]"], "native.scale must not be 0"),
         (["graph=native", "native.offset=abc"], "native.offset must be a number .* got 'abc'"),
-        (["native.scale=3e-5"], "need graph=native"),
-        (["native.source=true"], "need graph=native"),
+        (["native.scale=3e-5"], "native.scale=3e-05 .* are of graph=native"),
+        (["native.source=true"], "native.source=True, .* are of graph=native"),
     ],
 )
 def test_a_converter_that_makes_no_volts_is_refused(words, said, typed, tmp_path):

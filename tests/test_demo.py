@@ -1,6 +1,7 @@
 """What comes with the package: a detector, a recording, the demo, the hosts."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,10 @@ def test_hosts_are_copied_whole(typed, tmp_path, name):
     assert str(tmp_path / name / "README.md") in typed(hosts, name, tmp_path)[1]
     for path in (ROOT / "export" / name).glob("*.*"):
         if path.is_file():
-            assert (tmp_path / name / path.name).read_bytes() == path.read_bytes()
+            texts = [each.read_bytes() for each in (tmp_path / name / path.name, path)]
+            if path.name == "README.md":  # whose links lead into the copy
+                texts = [re.sub(rb"\]\([^)]*\)", b"]", text) for text in texts]
+            assert texts[0] == texts[1]
     if name == "native":  # with the library's sources
         assert {"stream.cpp", "tactslip.h"} <= {p.name for p in (tmp_path / "native/src").iterdir()}
     if name == "web":  # what it plays when it is started without arguments

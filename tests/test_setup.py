@@ -249,10 +249,33 @@ def test_labels_of_minus_one_and_one_are_not_all_slip(tmp_path):
     assert column.states(np.array([-1.0, 1.0])).tolist() == [0, 1]
 
 
-def test_a_limit_that_no_value_passes_is_refused(tmp_path):
-    found = slips(tmp_path, slip=[0] * 200 + [1] * 200)
-    with pytest.raises(ValueError, match=r"--over 5: .* 0 to 1, so all of it is non-slip"):
-        propose(found, Answers(over=5.0))
+@pytest.mark.parametrize(
+    ("labels", "answers", "said"),
+    [
+        ([0, 1], {"over": 5.0}, "--over 5: the magnitudes .* are 0 to 1, so all of it is non-slip"),
+        ([-2, 1], {"over": 0.0}, "the magnitudes .* are 1 to 2, so all of it is slip"),
+        ([0, 0], {"column": "slip"}, "column slip holds only 0; give --column"),
+        (["", ""], {"column": "slip", "over": 0.5}, "column slip is empty"),
+        ([0, 1], {"words": {"foo": True}}, "holds numbers, 0 to 1, no words; give --over"),
+        (["free", "stick"], {"words": {"free": False}}, "free, stick, would all mean non-slip"),
+    ],
+)
+def test_labels_of_one_side_are_refused(labels, answers, said, tmp_path):
+    found = slips(tmp_path, slip=[labels[0]] * 200 + [labels[1]] * 200)
+    with pytest.raises(ValueError, match=said):
+        propose(found, Answers(**answers))
+
+
+def test_words_of_names_that_are_one_side_are_refused(tmp_path):
+    for name in ("grasp/cup_1", "grasp/box_1", "stable/cup_1", "stable/box_1"):
+        write(tmp_path / f"{name}.csv", ["a", "b"])
+    with pytest.raises(ValueError, match="grasp, stable, would all mean non-slip; give --label"):
+        propose(look(tmp_path), Answers(words={"grasp": False}))
+
+
+def test_of_three_numbers_the_two_lowest_magnitudes_are_parted(tmp_path):
+    (question,) = propose(slips(tmp_path, slip=[-1] * 100 + [0] * 200 + [1] * 100)).questions
+    assert question.default == "0.5"
 
 
 def test_a_column_of_slip_that_never_changes_is_told(tmp_path):
@@ -260,10 +283,25 @@ def test_a_column_of_slip_that_never_changes_is_told(tmp_path):
     assert "column slip holds only 0" in question.text
 
 
+@pytest.mark.parametrize("last_is_first", [True, False])
+def test_times_that_go_back_are_asked_for_with_their_step(last_is_first, tmp_path):
+    times = 0.002 * np.arange(400)
+    times = (
+        np.where(np.arange(400) == 399, 0.0, times) if last_is_first else np.tile(times[:200], 2)
+    )
+    question, *_ = propose(slips(tmp_path, time=times, slip=[0] * 200 + [1] * 200)).questions
+    assert (question.name, question.default) == ("rate_hz", "500")
+
+
+def test_numbers_of_rows_are_no_milliseconds(tmp_path):
+    found = slips(tmp_path, time=np.arange(400), slip=[0] * 200 + [1] * 200)
+    assert propose(found).settings["data"]["reading"].get("time_unit") != "ms"
+
+
 @pytest.mark.parametrize(
     ("rows", "said"),
     [
-        ("cup_1.csv,3,2", "line 2: the end, 2, is not after the start, 3"),
+        ("cup_1.csv,3,2", "line 2: the end, 2 s, is not after the start, 3 s"),
         ("cup_1.csv,1,2\ncup_1.csv,1.5,3", "lines 2 and 3 overlap, of cup_1.csv"),
     ],
 )
@@ -271,7 +309,9 @@ def test_intervals_that_cannot_be_are_refused(rows, said, tmp_path):
     slips(tmp_path)
     (tmp_path / "labels.csv").write_text(f"file,start,end\n{rows}\n")
     with pytest.raises(ValueError, match=said):
-        look(tmp_path)
+        propose(look(tmp_path))
+    slips(tmp_path, slip=[0] * 200 + [1] * 200)  # the table is then of no use
+    assert propose(look(tmp_path)).settings["labels"]["column"] == "slip"
 
 
 def test_a_pattern_that_lacks_what_is_needed_is_refused(tmp_path):

@@ -44,7 +44,10 @@ def export(config: DictConfig, results: Path) -> None:
         _tell_tare(detector)
         return
     if with_source or given != {"scale": 1.0, "offset": 0.0}:
-        raise ValueError("native.source, native.scale and native.offset need graph=native")
+        raise ValueError(
+            f"native.source={with_source}, native.scale={given['scale']} and "
+            f"native.offset={given['offset']} are of graph=native; got graph={config.graph}"
+        )
     graphs = wanted_graphs(config.graph, detector)
     precision: Precision = "float32" if config.precision == "auto" else config.precision
     for path in export_detector(detector, folder, graphs, precision, source=source):

@@ -97,9 +97,10 @@ def _number(text: str, flag: str) -> float:
         number = float(text.replace(",", "."))
     except ValueError:
         raise ValueError(f"{flag}: {text!r} is no number") from None
-    is_wrong = number == 0 and flag == "--rate HZ"
-    if is_wrong or not 0 <= number < float("inf"):
-        raise ValueError(f"{flag}: expected a positive number, got {text}")
+    is_rate = flag == "--rate HZ"
+    wanted = "above 0" if is_rate else "of 0 or more"
+    if (is_rate and number == 0) or not 0 <= number < float("inf"):
+        raise ValueError(f"{flag}: expected a number {wanted}, got {text}")
     return number
 
 
@@ -219,7 +220,9 @@ def main() -> None:
     parser.add_argument(
         "--column", metavar="NAME", help="the column that says of each sample whether it is slip"
     )
-    parser.add_argument("--over", metavar="NUMBER", help="slip is where that column is above it")
+    parser.add_argument(
+        "--over", metavar="NUMBER", help="slip is where the magnitude of that column is above it"
+    )
     parser.add_argument(
         "--label", action="append", default=[], metavar="WORD=slip|non-slip",
         help="what a word of that column, of a folder or of a file's name means; again for more",

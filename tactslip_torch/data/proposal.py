@@ -302,8 +302,9 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
 
 
 def _steps_are_ms(times: _Numbers) -> bool:
-    """Whether times without a unit have steps of 1 or more: nobody samples touch each second."""
-    return len(times) > 1 and float(np.median(np.diff(times))) >= 1
+    """Whether times without a unit have steps of 1 or more, and are no numbers of rows."""
+    steps = np.diff(times)
+    return len(steps) > 0 and float(np.median(steps)) >= 1 and not (steps == 1).all()
 
 
 def _is_of_package(path: Path) -> bool:
@@ -370,22 +371,27 @@ def _intervals(folder: Path, paths: Sequence[Path]) -> tuple[str, list[Mapping[s
                     "give seconds, or name the columns start_ms and end_ms"
                 )
             times[end] = f"{seconds * (1e-3 if row['unit'] == 'ms' else 1.0):.10g}"
-        if float(times["end"]) <= float(times["start"]):
-            raise ValueError(
-                f"{folder / name}: line {row['line']}: the end, {row['end']}, is not after the "
-                f"start, {row['start']}"
-            )
         table.append({**row, **times})
-    latest: dict[str, Mapping[str, str]] = {}
-    for each in sorted(table, key=lambda one: float(one["start"])):
-        before = latest.get(each["file"])
-        if before is not None and float(each["start"]) < float(before["end"]):
-            raise ValueError(
-                f"{folder / name}: lines {before['line']} and {each['line']} overlap, of "
-                f"{each['file']}; give intervals one after the other"
-            )
-        latest[each["file"]] = each
     return name, table
+
+
+def _check_intervals(table: Path, rows: Sequence[Mapping[str, str]]) -> None:
+    """Raise ValueError if one ends before it starts, or two of a file overlap."""
+    latest: dict[str, Mapping[str, str]] = {}
+    for row in sorted(rows, key=lambda one: float(one["start"])):
+        if float(row["end"]) <= float(row["start"]):
+            raise ValueError(
+                f"{table}: line {row['line']}: the end, {row['end']} s, is not after the start, "
+                f"{row['start']} s; correct the line"
+            )
+        before = latest.get(row["file"])
+        if before is not None and float(row["start"]) < float(before["end"]):
+            lines = " and ".join(sorted((before["line"], row["line"]), key=int))
+            raise ValueError(
+                f"{table}: lines {lines} overlap, of {row['file']}; give intervals one after the "
+                "other"
+            )
+        latest[row["file"]] = row
 
 
 def _manifest_rows(
@@ -542,9 +548,10 @@ def _likely_rate(tables: Sequence[_Table]) -> tuple[str, str]:
         if not rate_hz:
             continue
         own.append(rate_hz)
-        if one.times_s is None:
+        times = one.times_s
+        if times is None or times[-1] <= times[0] or (np.diff(times) < 0).any():
             continue
-        mean_hz = (len(one.times_s) - 1) / float(one.times_s[-1] - one.times_s[0])
+        mean_hz = (len(times) - 1) / float(times[-1] - times[0])
         if abs(mean_hz / rate_hz - 1) > _SAME_STEP:
             mean, median = f"{mean_hz:.4g} Hz in the mean", f"{rate_hz:.4g} Hz by its median step"
             return "", f"; {one.file} has {mean}, {median}"
@@ -807,6 +814,7 @@ def _propose_labels_and_groups(
     if label is not None:
         classes = _propose_label_column(found, label, given, draft)
     elif intervals:
+        _check_intervals(found.folder / found.table_of_intervals, intervals)
         told = f"it names recordings; {MANIFEST} is made of it"
         draft.tell("labels", f"intervals of {found.table_of_intervals}", told)
         for row in intervals:
@@ -860,7 +868,7 @@ def _propose_label_column(
         if no_words := [word for word in given.words if word.lower() not in there]:
             raise ValueError(
                 f"column {label.name} has no word {', '.join(no_words)}; it holds "
-                f"{', '.join(label.words)}"
+                f"{', '.join(label.words)}: give these, or --column NAME of another column"
             )
         if unknown := [word for word, slips in known.items() if slips is None]:
             text = (
@@ -869,6 +877,8 @@ def _propose_label_column(
             )
             draft.ask("slip", text, "--label WORD=slip or --label WORD=non-slip for each")
         slips = [word for word, is_slip in known.items() if is_slip]
+        if not unknown and len(slips) in (0, len(known)):
+            raise ValueError(_one_side(f"the words of column {label.name}", known))
         if given.words and not unknown:
             draft.set("labels.slip", slips, "words of that column that mean slip; others do not")
         value = f"column {label.name}, slip where it says {' or '.join(slips) or '?'}"
@@ -877,8 +887,16 @@ def _propose_label_column(
             words = set(filter(None, table.words.get(label.name, ())))
             classes[table.file] = {bool(known.get(word)) for word in words}
         return classes
-    numbers = label.numbers
-    over = given.over
+    numbers, over = label.numbers, given.over
+    if not numbers or (over is None and len(numbers) == 1):
+        held = f"holds only {numbers[0]:g}" if numbers else "is empty"
+        raise ValueError(f"column {label.name} {held}; give --column NAME of another column")
+    if given.words:
+        raise ValueError(
+            f"column {label.name} holds numbers, {numbers[0]:g} to {numbers[-1]:g}, no words; give "
+            "--over NUMBER in place of --label and --non-slip, or --column NAME"
+        )
+    sizes = sorted({abs(number) for number in numbers})
     if over is None and len(numbers) == 2:
         if -numbers[0] == numbers[1]:  # slip goes by the magnitude otherwise
             draft.set("labels.slip", [numbers[1]], "numbers of that column that are slip")
@@ -890,26 +908,29 @@ def _propose_label_column(
                 states = np.unique(known_numbers[np.isfinite(known_numbers)] == numbers[1])
                 classes[table.file] = set(map(bool, states))
             return classes
-        over = sum(map(abs, numbers)) / 2
+        over = sum(sizes) / 2
     if over is None:
         values, default = f"numbers from {numbers[0]:g} to {numbers[-1]:g}", ""
         if len(numbers) <= _MOST_STATES:
             values = ", ".join(f"{number:g}" for number in numbers)
-            default = f"{(numbers[0] + numbers[1]) / 2:g}"
+            default = f"{(sizes[0] + sizes[1]) / 2:g}"
         text = f"Above which value of column {label.name} is it slip? It holds {values}"
         draft.ask("over", text, "--over NUMBER", default)
         over = float(default or "nan")
-    if given.over is not None and len({abs(number) > over for number in numbers}) < 2:
+    if len(sizes) > 1 and not sizes[0] <= over < sizes[-1]:
         raise ValueError(
-            f"--over {over:g}: column {label.name} holds {numbers[0]:g} to {numbers[-1]:g}, so all "
-            f"of it is {'slip' if abs(numbers[0]) > over else 'non-slip'}; give a number between"
+            f"--over {over:g}: the magnitudes of column {label.name} are {sizes[0]:g} to "
+            f"{sizes[-1]:g}, so all of it is {'slip' if over < sizes[0] else 'non-slip'}; give a "
+            "number between them"
         )
     draft.set("labels.over", over, "slip is where the magnitude of that column is above it")
     lower = str(label.name).lower()
     unit = next((unit for end, unit in _SPEED_UNITS.items() if lower.endswith(end)), None)
     if unit is not None and len(numbers) > _MOST_STATES:
         draft.set("labels.unit", unit, "of that column, a speed")
-    draft.tell("labels", f"column {label.name}, slip above {over:g}", label.reason)
+    draft.tell(
+        "labels", f"column {label.name}, slip above {over:g}, whatever the sign", label.reason
+    )
     for table in found.tables:
         values_of = table.samples[label.name]
         states = np.unique(np.abs(values_of[np.isfinite(values_of)]) > over)
@@ -938,6 +959,12 @@ def _constant_label(found: Look) -> str:
     return "no column"
 
 
+def _one_side(where: str, known: Mapping[str, bool | None]) -> str:
+    """What to say of words that are all slip, or all non-slip."""
+    side, other = ("slip", "non-slip") if all(known.values()) else ("non-slip", "slip")
+    return f"{where}, {', '.join(known)}, would all mean {side}; give --label WORD={other}"
+
+
 def _words_of_names(found: Look, given: Answers, draft: Proposal) -> dict[str, bool]:
     """The words of names or folders that are labels; asks where there is none that is known."""
     files = found.files
@@ -951,6 +978,8 @@ def _words_of_names(found: Look, given: Answers, draft: Proposal) -> dict[str, b
             continue
         known = {word: _is_slip(word, given.words) for word in words}
         both = {slips for slips in known.values() if slips is not None}
+        if stated and None not in known.values() and len(both) == 1:
+            raise ValueError(_one_side("the words of names", known))
         if both == {True, False} and None not in known.values():
             labels = {word: "slip" if slips else "non-slip" for word, slips in known.items()}
             reason = "stated, and by known words" if stated else "by the words in names"
