@@ -254,6 +254,7 @@ def test_labels_of_minus_one_and_one_are_not_all_slip(tmp_path):
     [
         ([0, 1], {"over": 5.0}, "--over 5: the magnitudes .* are 0 to 1, so all of it is non-slip"),
         ([-2, 1], {"over": 0.0}, "the magnitudes .* are 1 to 2, so all of it is slip"),
+        ([-1, 1], {"over": 0.0}, "are 1 to 1, so all of it is slip; leave --over out"),
         ([0, 0], {"column": "slip"}, "column slip holds only 0; give --column"),
         (["", ""], {"column": "slip", "over": 0.5}, "column slip is empty"),
         ([0, 1], {"words": {"foo": True}}, "holds numbers, 0 to 1, no words; give --over"),

@@ -917,11 +917,11 @@ def _propose_label_column(
         text = f"Above which value of column {label.name} is it slip? It holds {values}"
         draft.ask("over", text, "--over NUMBER", default)
         over = float(default or "nan")
-    if len(sizes) > 1 and not sizes[0] <= over < sizes[-1]:
+    if len(numbers) > 1 and not sizes[0] <= over < sizes[-1]:
         raise ValueError(
             f"--over {over:g}: the magnitudes of column {label.name} are {sizes[0]:g} to "
-            f"{sizes[-1]:g}, so all of it is {'slip' if over < sizes[0] else 'non-slip'}; give a "
-            "number between them"
+            f"{sizes[-1]:g}, so all of it is {'slip' if over < sizes[0] else 'non-slip'}; leave "
+            "--over out, or give a number between them"
         )
     draft.set("labels.over", over, "slip is where the magnitude of that column is above it")
     lower = str(label.name).lower()
