@@ -267,6 +267,14 @@ def test_labels_of_one_side_are_refused(labels, answers, said, tmp_path):
         propose(found, Answers(**answers))
 
 
+def test_the_limit_of_a_speed_is_asked(tmp_path):
+    speeds = np.linspace(0, 40, 400)
+    (question,) = propose(slips(tmp_path, slip_mm_s=speeds)).questions
+    assert (question.name, question.default) == ("over", "")
+    labels = propose(look(tmp_path), Answers(over=5.0)).settings["labels"]
+    assert (labels["over"], labels["unit"]) == (5.0, "mm/s")
+
+
 def test_words_of_names_that_are_one_side_are_refused(tmp_path):
     for name in ("grasp/cup_1", "grasp/box_1", "stable/cup_1", "stable/box_1"):
         write(tmp_path / f"{name}.csv", ["a", "b"])

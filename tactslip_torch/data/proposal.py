@@ -10,7 +10,7 @@ import csv
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
@@ -903,11 +903,7 @@ def _propose_label_column(
             draft.tell(
                 "labels", f"column {label.name}, slip where it is {numbers[1]:g}", label.reason
             )
-            for table in found.tables:
-                known_numbers = table.samples[label.name]
-                states = np.unique(known_numbers[np.isfinite(known_numbers)] == numbers[1])
-                classes[table.file] = set(map(bool, states))
-            return classes
+            return _states_by_file(found, label.name, lambda values: values == numbers[1])
         over = sum(sizes) / 2
     if over is None:
         values, default = f"numbers from {numbers[0]:g} to {numbers[-1]:g}", ""
@@ -917,7 +913,7 @@ def _propose_label_column(
         text = f"Above which value of column {label.name} is it slip? It holds {values}"
         draft.ask("over", text, "--over NUMBER", default)
         over = float(default or "nan")
-    if len(numbers) > 1 and not sizes[0] <= over < sizes[-1]:
+    if len(numbers) > 1 and (over < sizes[0] or over >= sizes[-1]):  # neither if it is asked
         raise ValueError(
             f"--over {over:g}: the magnitudes of column {label.name} are {sizes[0]:g} to "
             f"{sizes[-1]:g}, so all of it is {'slip' if over < sizes[0] else 'non-slip'}; leave "
@@ -931,11 +927,18 @@ def _propose_label_column(
     draft.tell(
         "labels", f"column {label.name}, slip above {over:g}, whatever the sign", label.reason
     )
-    for table in found.tables:
-        values_of = table.samples[label.name]
-        states = np.unique(np.abs(values_of[np.isfinite(values_of)]) > over)
-        classes[table.file] = set(map(bool, states))
-    return classes
+    return _states_by_file(found, label.name, lambda values: np.abs(values) > over)
+
+
+def _states_by_file(
+    found: Look, name: str | int, is_slip: Callable[[_Numbers], NDArray[np.bool_]]
+) -> dict[str, set[bool]]:
+    """Whether the files that were read hold slip, non-slip or both, by a column of numbers."""
+    columns = {table.file: table.samples[name] for table in found.tables}
+    return {
+        file: set(map(bool, np.unique(is_slip(values[np.isfinite(values)]))))
+        for file, values in columns.items()
+    }
 
 
 def _is_slip(word: str, words: Mapping[str, bool]) -> bool | None:
