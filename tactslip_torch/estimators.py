@@ -31,7 +31,13 @@ from torch.nn.functional import logsigmoid
 from tactslip_torch.deploy.export import export_detector, wanted_graphs
 from tactslip_torch.features.pool import MOST_BIN_SAMPLES, FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.features.sensing import Sensing, least_alive, longest_runs, most_stuck_samples
+from tactslip_torch.features.sensing import (
+    Sensing,
+    least_alive,
+    longest_run_of,
+    most_stuck_samples,
+    run_lengths,
+)
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.calibration import Platt, probability
 from tactslip_torch.model.detector import SlipDetector, counted_channels
@@ -620,7 +626,8 @@ def _spans(bins: Tensor) -> Tensor:
 
 def _stuck_samples(pool: FeaturePool, windows: Tensor) -> int:
     """Equal samples in a row that a working channel may have, by training windows."""
-    return most_stuck_samples(pool.sample_rate_hz, int(longest_runs(windows).max()))
+    longest_run, has_fast = longest_run_of(run_lengths(windows)), bool(pool.hand.fast)
+    return most_stuck_samples(pool.sample_rate_hz, longest_run, has_fast=has_fast)
 
 
 _MISSING = ("None", "nan", "<NA>", "NaT")

@@ -37,7 +37,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from tqdm.auto import tqdm
 
-__version__ = "0.3.0"
+__version__ = "0.3.1.dev0"
 PACKAGE = Path(__file__).resolve().parent
 
 log = logging.getLogger(__name__)

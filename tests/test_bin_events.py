@@ -27,8 +27,9 @@ def batch_of(onsets=(2.0, 6.0), ends=(4.0, 8.0), stretches=(), roles=None, slip_
     num, speed = len(bins.starts), torch.tensor([*speeds, 0.0])[bins.stroke]
     ends_s = (bins.starts + bins.bin_samples).double() / RATE_HZ
     columns = torch.zeros(num, 1), bins.is_slip, speed, bins.position, bins.stroke, ends_s
+    sensed = torch.ones(num, 1), torch.ones(num, 1)
     hop_s, roles = (rule.hop_ms or rule.bin_ms) / 1000, roles or {"test": torch.ones(num) > 0}
-    return RecordingFeatures(RecordingId("M1", 0), *columns, times, hop_s, roles)
+    return RecordingFeatures(RecordingId("M1", 0), *columns, *sensed, times, hop_s, roles)
 
 
 def events_of(batch, says_slip):

@@ -13,6 +13,7 @@ import torch
 
 from tactslip_torch.features.cache import (
     FeatureCache,
+    KeptFeatures,
     cache_key,
     default_cache_folder,
     features_digest,
@@ -33,8 +34,14 @@ def features(num_bins=7, num_features=11, seed=0):
     return torch.randn(num_bins, num_features, generator=torch.Generator().manual_seed(seed))
 
 
+def sensed(num_bins, num_channels=3):
+    random = torch.Generator().manual_seed(1)
+    span = torch.rand(num_bins, num_channels, generator=random, dtype=torch.float64)
+    return span, torch.randint(1, 9, span.shape, generator=random)
+
+
 def keep(cache, key, values):
-    cache.store(key, range(values.shape[1]), values, RUN)
+    cache.store(key, range(values.shape[1]), KeptFeatures(values, *sensed(len(values)), RUN))
 
 
 def kept(cache, key, num_features=11):
@@ -64,8 +71,9 @@ def test_what_is_stored_comes_back_bit_by_bit(cache, values):
     keep(cache, KEY, features(2, 2))
     keep(cache, KEY, values)  # replaces
     for _ in range(2):  # what is loaded may be written to
-        loaded, longest_run = kept(cache, KEY, values.shape[1])
+        loaded, span, run, longest_run = kept(cache, KEY, values.shape[1])
         assert longest_run == RUN
+        assert all(map(torch.equal, (span, run), sensed(len(values))))
         assert loaded.dtype == torch.float32
         assert torch.equal(loaded.view(torch.int32), values.contiguous().view(torch.int32))
         loaded.zero_()
@@ -73,7 +81,7 @@ def test_what_is_stored_comes_back_bit_by_bit(cache, values):
 
 
 def is_whole(found):
-    return torch.equal(found[0], features()) and found[1] == RUN
+    return torch.equal(found.features, features()) and found.longest_run == RUN
 
 
 DAMAGES = [

@@ -9,7 +9,7 @@ import torch
 from any_hands import own_kernels
 from scipy import signal
 
-from tactslip_torch.signals.filtering import ChannelFilter, extended
+from tactslip_torch.signals.filtering import ChannelFilter, extended, largest_in_frames
 
 FRAMES = [(1, 0), (3, 1), (5, 2), (11, 1), (51, 1), (51, 3), (11, 0), (7, 6)]
 LENGTHS = [51, 11, 51, 5]
@@ -151,3 +151,23 @@ def test_own_kernels_are_convolutions_that_keep_constants_and_come_back(align, r
 def test_what_is_no_kernel_is_refused_in_one_line(kernels, message):
     with pytest.raises(ValueError, match=message):
         ChannelFilter([11, 1, 5, 11], kernels=kernels)
+
+
+@aligned
+def test_the_largest_sample_of_a_bins_frames_is_what_its_filtered_samples_depend_on(align):
+    layer, generator = ChannelFilter([51, 11, 1], align=align), torch.Generator().manual_seed(0)
+    x = torch.rand(3, 400, generator=generator, dtype=torch.float64)
+    starts = torch.tensor([60, 61, 200, 290, 340])
+    found = largest_in_frames(x, starts, 10, layer.reaches)
+    expected = torch.zeros_like(found)
+    for sample in range(400):
+        other = x.clone()
+        other[:, sample] += 1.0
+        changed = (layer(other) != layer(x)).numpy()
+        for row, start in enumerate(starts):
+            uses = torch.from_numpy(changed[:, start : start + 10].any(1))
+            expected[row] = expected[row].maximum(torch.where(uses, x[:, sample], 0.0))
+    assert torch.equal(found, expected)
+    whole = torch.tensor([0, 390])  # frames that would leave the recording end with it
+    assert torch.equal(largest_in_frames(x, whole, 400, [(0, 0)] * 3)[0], x.amax(-1))
+    assert largest_in_frames(x, starts[:0], 10, layer.reaches).shape == (0, 3)

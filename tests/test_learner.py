@@ -11,11 +11,13 @@ from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.splits import random_bins, seen6, unseen4
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.sensing import without_stuck
 from tactslip_torch.onset.events import LatencyParts
-from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.signals.filtering import ChannelFilter, bins_at
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.evaluation import evaluated_bins, events_by_rule
 from tactslip_torch.training.learner import SlipLearner
+from tactslip_torch.training.recipe import General
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",
@@ -113,6 +115,41 @@ def test_events_are_of_the_detectors_own_decisions_and_the_exact_onset():
         assert {part.bins.times.onsets_s for part in parts} == {(1.1,)}
         for found in learner.events[role]["first_transition"]:  # from 1.12 - 0.01 - 1 on
             assert found.quiet_s == pytest.approx(0.9 - 0.11 - latency.look_ahead_s)
+
+
+class Dying(SmallSet):
+    """Of material c: a channel that sticks, all that stick, and a channel that falls silent."""
+
+    def shape(self, noise, time_s, recording, generator):
+        super().shape(noise, time_s, recording, generator)
+        middle = noise.shape[1] // 2 + 37
+        if recording.material == "c":
+            dies = slice(None) if recording.cycle == 1 else slice(0, 1)
+            silent = 1e-4 * noise[dies, middle:] if recording.cycle == 2 else 0.0
+            noise[dies, middle:] = silent + noise[dies, middle, None]
+
+
+@pytest.mark.parametrize("align", ["centred", "causal"])
+def test_a_test_decides_as_the_detector_does_where_channels_die(align, caplog, cache):
+    source = Dying()
+    layer = ChannelFilter([51, 11], align=align)
+    maker = FeatureMaker(source, FeaturePool(SMALL_HAND), layer, LabelRule(hop_ms=10), cache)
+    split = unseen_c(source)
+    learner = learn(source, split, maker, General(sample_bins=50))
+    detector, right, num_lost, num_invalid = learner.detector, [], 0, 0
+    for recording in split.having("unseen"):
+        labels = maker.lay_bins(source.timeline(recording))
+        samples = without_stuck(source.load(recording).samples, detector.sensing.stuck_samples)
+        before, behind = layer.context_before, layer.context_after
+        windows = bins_at(samples, labels.starts - before, before + 100 + behind)
+        found = detector.predict_raw(windows)
+        right.append((found.is_valid & (found.score >= 0)) == labels.is_slip)
+        num_lost += int(found.channels_lost.any(-1).sum())
+        num_invalid += int((~found.is_valid).sum())
+    assert num_lost > num_invalid > 50  # all three cases are there
+    accuracy = learner.metrics["splits"]["unseen"]["accuracy"]
+    assert accuracy == pytest.approx(float(torch.cat(right).double().mean()))
+    assert f"unseen: {num_invalid} of {len(torch.cat(right))} bins have too few" in caplog.text
 
 
 @pytest.mark.slow

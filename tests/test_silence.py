@@ -20,8 +20,9 @@ from tactslip_torch.features.sensing import (
     Sensing,
     StuckChannels,
     least_alive,
-    longest_runs,
+    longest_run_of,
     most_stuck_samples,
+    run_lengths,
 )
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.onset.decisions import AlarmSettings, joined_decisions, score_stream
@@ -275,12 +276,15 @@ def test_a_stuck_channel_is_missing_however_its_samples_come(seed, most, piece):
 
 def test_stuck_is_longer_than_twice_what_training_had_within_limits():
     x = torch.tensor([[0.0, 1, 1, 1, 2, 3], [4, 4, 4, 4, 4, 4]])
-    assert longest_runs(x).tolist() == [3, 0]  # one that never moves does not count
+    assert run_lengths(x).tolist() == [[1, 1, 2, 3, 1, 1], [1, 2, 3, 4, 5, 6]]
+    assert longest_run_of(run_lengths(x)) == 3  # a channel that never moves does not count
     assert most_stuck_samples(2000.0, 3) == 200  # .1 s
     assert most_stuck_samples(2000.0, 300) == 600
     assert most_stuck_samples(2000.0, 30000) == 2000  # 1 s
     assert most_stuck_samples(10.0, 30000) == 20
     assert most_stuck_samples(2000.0) == 2000
+    assert most_stuck_samples(500.0, 1, has_fast=False) == 5  # .01 s
+    assert most_stuck_samples(100.0, 3, has_fast=False) == 6
 
 
 # Other hands -------------------------------------------------------------------------------------
@@ -326,6 +330,25 @@ def test_channels_that_count_must_be_alive_on_any_hand(made, num_lost, is_valid)
         assert (classifier.predict(lost) == 0).all()
         assert (classifier.decision_function(lost) == 0).all()
         assert (classifier.predict_proba(lost) == 0.5).all()
+
+
+@pytest.mark.parametrize("level", [0.0, 99.0])
+@pytest.mark.parametrize("apart", [0, 25], ids=["at once", "one after the other"])
+def test_unplugging_a_hand_without_fast_channels_raises_no_alarm(level, apart):
+    rng, slow = np.random.default_rng(3), hand(["slow"] * 4)
+    y = np.arange(200) % 2
+    x = 50 + rng.standard_normal((200, 4, 25)) * (1 + 3 * y[:, None, None])
+    detector = SlipClassifier(features=TactileFeatures(500.0, slow)).fit(x, y).detector_
+    samples = torch.from_numpy(50 + rng.standard_normal((1500, 4)))
+    slips = samples.clone()
+    slips[750:] = 50 + 4 * (slips[750:] - 50)
+    for channel in range(4):
+        samples[750 + apart * channel :, channel] = level
+    settings = AlarmSettings.of(detector)
+    assert len(decided(detector, settings, slips)[1]) == 1
+    made, alarms, _ = decided(detector, settings, samples)
+    assert alarms == []
+    assert not made.is_valid[-1]
 
 
 def test_short_windows_of_whole_counts_are_never_silent():

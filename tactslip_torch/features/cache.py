@@ -11,7 +11,7 @@ import os
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -31,7 +31,6 @@ _MAKE_FEATURES = (
     "training/bins.py",
     "training/datamodule.py",
 )
-_KEPT = ("features", "columns", "longest_run")
 _reported: set[tuple[str, str]] = set()
 
 
@@ -81,8 +80,28 @@ def versions() -> dict[str, str]:
     }
 
 
+class KeptFeatures(NamedTuple):
+    """What is kept of the bins of a recording.
+
+    Attributes:
+        features: ``[N, F]``, float32.
+        span: of each filtered channel, 0 if it is within the rounding of the raw samples,
+            ``[N, C]``, float64.
+        run: most equal raw samples in a row of each channel, ``[N, C]``, int64.
+        longest_run: of all channels that move, of the whole recording.
+    """
+
+    features: Tensor
+    span: Tensor
+    run: Tensor
+    longest_run: int
+
+
+_ARRAYS = (*KeptFeatures._fields, "columns")
+
+
 class FeatureCache:
-    """Float32 features by key, in NPZ files, which have a checksum.
+    """Features of recordings by key, in NPZ files, which have a checksum.
 
     It never ends a run: what cannot be read counts as absent, what cannot be written is left out,
     and the log warns once for each cause and folder.
@@ -96,8 +115,8 @@ class FeatureCache:
         self.folder = Path(folder)
         self.most_bytes = most_bytes
 
-    def load(self, key: str, columns: Sequence[int]) -> tuple[Tensor, int] | None:
-        """Features ``[N, F]`` and the longest run of equal samples.
+    def load(self, key: str, columns: Sequence[int]) -> KeptFeatures | None:
+        """What is kept of a recording.
 
         Args:
             key: of the file.
@@ -109,8 +128,8 @@ class FeatureCache:
         path = self._path(key)
         try:
             with zipfile.ZipFile(path) as content:  # to their ends, where the checksums are
-                features, stored, longest_run = (
-                    np.load(io.BytesIO(content.read(f"{name}.npy"))) for name in _KEPT
+                features, span, run, longest_run, stored = (
+                    np.load(io.BytesIO(content.read(f"{name}.npy"))) for name in _ARRAYS
                 )
         except FileNotFoundError:
             return None
@@ -127,15 +146,16 @@ class FeatureCache:
             if not place.keys() >= set(columns):
                 return None
             features = features[:, [place[column] for column in columns]]
-        return torch.from_numpy(features), int(longest_run)
+        features, span, run = map(torch.from_numpy, (features, span, run))
+        return KeptFeatures(features, span, run, int(longest_run))
 
-    def store(self, key: str, columns: Sequence[int], features: Tensor, longest_run: int) -> None:
-        """Write features ``[N, F]``, their numbers and the longest run, whole or not at all."""
-        array, run = features.numpy().astype("<f4", order="C"), np.int64(longest_run)
-        places = np.array(columns, dtype=np.int64)
+    def store(self, key: str, columns: Sequence[int], made: KeptFeatures) -> None:
+        """Write what is kept of a recording and its features' numbers, whole or not at all."""
+        arrays: dict[str, Any] = {"columns": np.array(columns, dtype=np.int64), **made._asdict()}
+        arrays["features"] = made.features.numpy().astype("<f4", order="C")
         try:
             with whole_file(self._path(key)) as temporary, temporary.open("wb") as file:
-                np.savez(file, features=array, columns=places, longest_run=run)
+                np.savez(file, **arrays)
         except OSError as error:
             self._warn(f"cannot be stored: {_cause(error)}", self._path(key))
 

@@ -41,6 +41,7 @@ LARGEST_SAMPLE = torch.finfo(torch.float64).max / 64
 REST_QUANTILE = 0.01
 """Of the spans of training bins: the smallest span at rest, without the odd bin."""
 _STUCK_S = (0.1, 1.0)
+_SLOW_STUCK_S = 0.01  # in place of .1: known before a step of all channels at once raises an alarm
 _STUCK_SAMPLES = 20
 _RANGE_OF = {"slow": "raw", "fast": "A1"}  # the component whose range is the span in training
 
@@ -140,26 +141,35 @@ def least_alive(num_counted: int, fraction: float = 0.5) -> int:
     return max(1, min(math.floor(fraction * num_counted), num_counted - 1))
 
 
-def most_stuck_samples(sample_rate_hz: float, longest_run: int | None = None) -> int:
+def most_stuck_samples(
+    sample_rate_hz: float, longest_run: int | None = None, *, has_fast: bool = True
+) -> int:
     """Equal samples in a row that a working channel may have.
 
-    Twice the longest run in training, at least .1 s, at most 1 s or 20 samples, whichever is
-    longer; without training that most.
+    Twice the longest run in training, at least .1 s (.01 s on a hand without fast channels), at
+    most 1 s or 20 samples, whichever is longer; without training that most.
     """
-    shortest, longest = (math.ceil(seconds * sample_rate_hz) for seconds in _STUCK_S)
+    shortest_s, longest_s = _STUCK_S if has_fast else (_SLOW_STUCK_S, _STUCK_S[1])
+    shortest, longest = (math.ceil(round(s * sample_rate_hz, 6)) for s in (shortest_s, longest_s))
     longest = max(longest, _STUCK_SAMPLES)
     return longest if longest_run is None else min(max(2 * longest_run, shortest, 1), longest)
 
 
-def longest_runs(samples: Tensor) -> Tensor:
-    """The longest run of equal samples of each channel, ``[*, C, T] -> [*, C]``; 0 if all are."""
+def run_lengths(samples: Tensor) -> Tensor:
+    """Equal samples in a row that end at each sample, ``[*, C, T]``, int64."""
     x = samples.detach().cpu().numpy()
     is_new = np.ones(x.shape, bool)
     is_new[..., 1:] = x[..., 1:] != x[..., :-1]
     place = np.arange(x.shape[-1])
-    run = place - np.maximum.accumulate(np.where(is_new, place, 0), -1) + 1
-    moves = is_new[..., 1:].any(-1)
-    return torch.from_numpy(np.where(moves, run.max(-1, initial=0), 0))
+    return torch.from_numpy(place - np.maximum.accumulate(np.where(is_new, place, 0), -1) + 1)
+
+
+def longest_run_of(runs: Tensor) -> int:
+    """The longest of ``run_lengths`` ``[*, C, T]`` of the channels that move; 0 if none does."""
+    if not runs.numel():
+        return 0
+    longest = runs.amax(-1)
+    return int(longest.where(longest < runs.shape[-1], 0).max())
 
 
 def is_alive(span: Bools, loudest: Bools, is_known: Bools, inverse: Tensor, floor: Tensor) -> Bools:

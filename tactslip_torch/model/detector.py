@@ -323,6 +323,25 @@ class SlipDetector(nn.Module):
         scaled: Tensor = self.scaler(columns).to(self.imputation.dtype)
         return scaled if is_lost is None else self.imputed(scaled, is_lost)
 
+    def sensed(self, span: Tensor, run: Tensor) -> tuple[Tensor, Tensor]:
+        """Channels that are lost and bins that are valid, as ``predict_raw`` finds them.
+
+        Args:
+            span: of filtered bins, 0 if it is within the rounding of the raw samples.
+            run: most equal samples in a row in the frames of the bins.
+
+        Shape:
+            - span, run: ``[N, C]``
+            - output: ``[N, C]`` and ``[N]``, bool
+        """
+        alive = run <= self.sensing.stuck_samples
+        if self.pool.bin_samples >= FEWEST_SAMPLES:
+            floor = torch.tensor(self.sensing.floor, dtype=torch.float64, device=span.device)
+            alive &= (span > 0) & (span >= floor)
+        sensing, channels = self.sensing, range(len(self.pool.hand))
+        is_valid, _ = is_enough(alive & self._is_used, span, self.counted, sensing, channels)
+        return ~alive & self._is_used, is_valid
+
     def scaled_bins(self, bins: Tensor, is_lost: Tensor) -> Tensor:
         """Scaled columns of filtered bins, for other heads on the same columns.
 

@@ -21,6 +21,7 @@ from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple, get_args
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -571,3 +572,30 @@ def bins_at(x: Tensor, starts: Tensor, bin_samples: int) -> Tensor:
         )
     index = starts[:, None] + torch.arange(bin_samples, device=starts.device)  # [N, n]
     return x[:, index].movedim(0, 1)
+
+
+def largest_in_frames(
+    x: Tensor, starts: Tensor, bin_samples: int, reaches: Sequence[tuple[int, int]]
+) -> Tensor:
+    """The largest value of each channel that the filtered bins are made of.
+
+    Args:
+        x: of every raw sample.
+        starts: of bins.
+        bin_samples: their length.
+        reaches: of each channel, as ``ChannelFilter`` has them.
+
+    Shape:
+        - x: ``[C, T]``
+        - starts: ``[N]``, integers
+        - output: ``[N, C]``
+    """
+    values = np.concatenate([x.numpy(), x[:, -1:].numpy()], 1)  # a frame may end with the last one
+    found = np.empty((len(x), len(starts)), values.dtype)
+    for before, after in dict.fromkeys(reaches) if len(starts) else ():
+        own = [channel for channel, of in enumerate(reaches) if of == (before, after)]
+        first = (starts - before).clamp(min=0)
+        stop = (starts + bin_samples + after).clamp(max=x.shape[-1])
+        places = torch.stack([first, stop], 1).flatten().numpy()
+        found[own] = np.maximum.reduceat(values[own], places, axis=-1)[:, ::2]
+    return torch.from_numpy(found.T)

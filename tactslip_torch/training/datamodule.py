@@ -24,12 +24,12 @@ from tactslip_torch.data.labels import (
 )
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource, Timeline
 from tactslip_torch.data.splits import ROLES, Split
-from tactslip_torch.features.cache import FeatureCache, cache_key, features_digest
+from tactslip_torch.features.cache import FeatureCache, KeptFeatures, cache_key, features_digest
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.sensing import longest_runs
+from tactslip_torch.features.sensing import longest_run_of, run_lengths
 from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import bar, check_number, num_processes, one_thread
-from tactslip_torch.signals.filtering import ChannelFilter, bins_at
+from tactslip_torch.signals.filtering import ChannelFilter, bins_at, largest_in_frames
 from tactslip_torch.training.bins import RecordingBins
 
 
@@ -47,6 +47,7 @@ class RecordingFeatures(NamedTuple):
         - position, stroke: ``[N]``, place beside the onset and number of the stroke, as
           ``LabelledBins`` has them
         - ends_s: ``[N]``, float64, when the last sample of each bin is in
+        - span, run: ``[N, C]``, as ``KeptFeatures`` has them
         - roles: role to ``[N]``, bool; of no split empty
         - longest_run: most equal samples in a row of a channel that moves
     """
@@ -58,6 +59,8 @@ class RecordingFeatures(NamedTuple):
     position: Tensor
     stroke: Tensor
     ends_s: Tensor
+    span: Tensor
+    run: Tensor
     times: Timeline
     hop_s: float
     roles: dict[str, Tensor] = {}  # noqa: RUF012  # a NamedTuple replaces, it does not change
@@ -71,7 +74,7 @@ class RecordingFeatures(NamedTuple):
         """Some of its bins, by a mask ``[N]``; itself where they are all."""
         if bool(mask.all()):
             return self
-        names = ("features", "is_slip", "speed_mm_s", "position", "stroke", "ends_s")
+        names = (*self._fields[1 : self._fields.index("times")],)
         kept = {name: getattr(self, name)[mask] for name in names}
         roles = {role: own[mask] for role, own in self.roles.items()}
         return self._replace(**kept, roles=roles)
@@ -169,7 +172,7 @@ class FeatureMaker:
             return kept
         times = self.source.timeline(recording) if times is None else times
         bins = self.lay_bins(times)
-        features, longest_run = self._features(recording, times, bins)
+        made = self._features(recording, times, bins)
         is_slip = bins.is_slip
         if self.rule.shuffle_seed is not None:
             place = self.source.ids.index(recording)
@@ -177,15 +180,17 @@ class FeatureMaker:
         speeds = torch.tensor([*times.speeds_mm_s, 0.0])[bins.stroke]  # -1, of no stroke: the 0
         return RecordingFeatures(
             recording,
-            features,
+            made.features,
             is_slip,
             speeds,
             bins.position,
             bins.stroke,
             (bins.starts + bins.bin_samples).double() / self.source.sample_rate_hz,
+            made.span,
+            made.run,
             times,
             (self.rule.bin_ms if self.rule.hop_ms is None else self.rule.hop_ms) / 1000,
-            longest_run=longest_run,
+            longest_run=made.longest_run,
         )
 
     def filtered_bins(self, recording: RecordingId) -> tuple[Tensor, LabelledBins]:
@@ -207,18 +212,30 @@ class FeatureMaker:
         recording: RecordingId,
         times: Timeline,
         bins: LabelledBins,
-    ) -> tuple[Tensor, int]:
+    ) -> KeptFeatures:
         key = self._key(recording, bins)
         cached = None if self.cache is None else self.cache.load(key, self.pool.selected)
-        if cached is not None and len(cached[0]) == len(bins.starts):
+        if cached is not None and len(cached.features) == len(bins.starts):
             return cached
         loaded = self._load(recording, times, bins)
         with torch.no_grad():
-            features: Tensor = self.extractor(self._filter(recording, loaded, bins)).float()
-        longest_run = int(longest_runs(loaded.samples).max())
+            cut = self._filter(recording, loaded, bins)
+            features: Tensor = self.extractor(cut).float()
+        made = KeptFeatures(features, *self._sensed(loaded.samples, cut, bins))
         if self.cache is not None:
-            self.cache.store(key, self.pool.selected, features, longest_run)
-        return features, longest_run
+            self.cache.store(key, self.pool.selected, made)
+        return made
+
+    def _sensed(
+        self, samples: Tensor, cut: Tensor, bins: LabelledBins
+    ) -> tuple[Tensor, Tensor, int]:
+        """What ``KeptFeatures`` says of samples ``[C, T]`` and filtered bins ``[N, C, n]``."""
+        runs = run_lengths(samples)
+        frames = bins.starts, bins.bin_samples, self.channel_filter.reaches
+        loudest = largest_in_frames(samples.abs().double(), *frames)
+        span = (cut.amax(-1) - cut.amin(-1)).double()
+        is_more = span * self.pool.inverse_span(samples.dtype, is_raw=True) > loudest
+        return span.where(is_more, 0.0), largest_in_frames(runs, *frames), longest_run_of(runs)
 
     def _load(self, recording: RecordingId, times: Timeline, bins: LabelledBins) -> Recording:
         context = self.channel_filter.context_before  # never fewer than behind

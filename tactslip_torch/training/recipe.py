@@ -289,7 +289,7 @@ class _Recipe(ABC):
         return Sensing.fit(
             SpanFeatures(pool.hand, pool.names, pool.bin_samples)(features),
             self.min_alive or least_alive(num_counted, alive_fraction),
-            most_stuck_samples(pool.sample_rate_hz, longest_run),
+            most_stuck_samples(pool.sample_rate_hz, longest_run, has_fast=bool(pool.hand.fast)),
         )
 
 
