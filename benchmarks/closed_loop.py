@@ -137,16 +137,16 @@ class ClosedLoop(Benchmark):
             for name, row in numbers["methods"].items()
         ]
         note = (
-            f"{numbers['lifts']} lifts. In brackets 95 % of the bootstrap over lifts. *More "
-            "than with the alarm*: difference of drops to the alarm at the same delay, in the same "
-            "lifts. *Slid* and *peak grip*: median and, in brackets, 95 % quantile; grips are "
-            "divided by the least grip that holds the largest load. *Late*: from the begin of a "
-            "slide to the first tightening in it, median. *False*: the grip was tightened where no "
-            "pad had slid in the quarter second before. Thresholds of energy and CUSUM: the "
-            f"largest values in {numbers['calibration']} lifts of seen materials without slip."
+            f"{numbers['lifts']} lifts. *Dropped*: with 95 % intervals of a bootstrap over lifts. "
+            "*More than with the alarm*: the difference to the alarm at the same delay. *Slid* and "
+            "*peak grip*: median and, in brackets, 95 % quantile. Grips are multiples of the "
+            "lowest grip that holds the largest load. *Late*: from the begin of a slide to the "
+            "first tightening in it, median. *False*: the grip was tightened although no pad had "
+            "slid in the quarter second before. The thresholds of energy and CUSUM are the highest "
+            f"values in {numbers['calibration']} lifts of seen materials without slip."
         )
         kinds = [
-            {"dropped %, load": kind}
+            {"dropped %, by load": kind}
             | {_words(name): percent(share, 0) for name, share in of.items()}
             for kind, of in numbers["kinds"].items()
         ]

@@ -190,8 +190,8 @@ class Crossval(Benchmark):
         for run in runs:
             seed = f", seed {run['seed']}" if len(runs) > 1 else ""
             note = (
-                f"Balanced accuracy, %, seed {run['seed']}; machines fitted on "
-                f"{run['train_bins']} bins of each material and class."
+                f"Seed {run['seed']}. The machines are fitted on {run['train_bins']} bins of each "
+                "material and class."
             )
             found[f"By choice{seed}"] = Table(split_rows(run), note)
             found[f"By material{seed}"] = Table(material_rows(run), f"Seed {run['seed']}.")
@@ -259,9 +259,9 @@ def _worst_rows(run: Report) -> list[dict[str, object]]:
                 "held-out materials": f"{recipe}, seed {run['seed']}",
                 "mean %": percent(mean(split["unseen"] for split in known)),
                 "lowest choice %": percent(worst["unseen"]),
-                "choice": ", ".join(worst["materials"]),
+                "its materials": ", ".join(worst["materials"]),
                 "lowest single material %": percent(score),
-                "material, of choice": f"{material}, of {', '.join(beside)}",
+                "that material, of its choice": f"{material}, of {', '.join(beside)}",
             }
         )
     return rows

@@ -128,8 +128,8 @@ class Deployment(Benchmark):
                     row["kB"] = f"{(place / name).stat().st_size / 1e3:,.0f}"
                     files.append(row | {"s to make both and check them": f"{seconds:.1f}"})
             note = (
-                "Error of scores in standard deviations of the reference's; flips: bins that are "
-                "decided otherwise."
+                "*Error*: the largest difference to the scores of the reference, in their standard "
+                "deviations. *Flips*: bins whose decision differs from the reference."
             )
             tables = {
                 "Bins": Table(_bins(Path(folder), self), note),

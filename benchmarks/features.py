@@ -79,11 +79,12 @@ class Features(Benchmark):
                 row = {"way": name, "features": found.shape[1], "us a bin": us, "bins a call": num}
                 rows.append(row | {"error": _error(found, truth) if is_same else None})
         note = (
-            f"{self.threads} threads where a way takes threads. Error: the largest, over "
-            "the larger of the reference's magnitude and its column's standard deviation; of "
-            "entropy and mode, which step, the 99th percentile."
+            f"{self.threads} threads where a library takes threads. *Error*: the largest "
+            "difference to the reference, divided by the larger of the reference's magnitude and "
+            "the standard deviation of its column; for entropy and mode, which are discontinuous, "
+            "the 99th percentile."
         )
-        lengths = Table(self._by_length(), "Noise in float64, one thread.")
+        lengths = Table(self._by_length(), "Noise in float64, on one thread.")
         return {"tables": {"Time and error": Table(rows, note), "Length of bins": lengths}}
 
     @torch.inference_mode()

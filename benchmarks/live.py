@@ -62,8 +62,9 @@ class Live(Benchmark):
     about = (
         "`tactslip stream` in a process of its own with the detector of the main job "
         "(`+exp=unseen4`, the default recipe), fed the sample recording again and again: 24 "
-        f"channels at 2 kHz, {FRAME_SAMPLES} samples a frame, a line for each decision; from when "
-        "a sample was sent to when the line of the first decision on it could be read"
+        f"channels at 2 kHz, {FRAME_SAMPLES} samples a frame, a line for each decision. "
+        "Measured: the time from sending a sample until the line of the first decision on it can "
+        "be read"
     )
     quick = "seconds=2.0 settled_s=0.5 checked_s=2.0"
     charts: ClassVar = {"": ()}
@@ -103,7 +104,7 @@ class Live(Benchmark):
                 }
             )
         parts = f"{row['look_ahead_ms']:g} ms of look-ahead, {row['hop_ms']:g} ms of hop"
-        note = f"Of the limit {parts} and {MARGIN_MS:g} ms of margin."
+        note = f"The limit is the sum of {parts} and {MARGIN_MS:g} ms of margin."
         tables = {"Limits": limits(goals), "From a sample to its line": Table(shown, note)}
         return {"tables": tables, "rows": rows}
 

@@ -71,11 +71,16 @@ class Model(Benchmark):
             "s to solve": of["solve_s"],
             "peak memory, MB": f"{of['peak_bytes'] / 1e6:,.0f}",
         }
-        note = "A score: one bin on 1 thread. Off: the largest difference of scores."
+        note = (
+            "*A score*: of one bin, on 1 thread. *Off KernelRidge*: the largest difference of "
+            "scores."
+        )
         return {
             "tables": {
                 "Fits": Table(fits, note),
-                "Folds": Table(folds, f"Largest difference of held-out scores: {number(off)}."),
+                "Folds": Table(
+                    folds, f"Largest difference between closed form and refits: {number(off)}."
+                ),
                 "Any number of bins": listed("statistics in a process of its own", whole),
             }
         }

@@ -167,7 +167,9 @@ def _here(detectors: Mapping[str, SlipDetector], folder: Path, rounds: int) -> T
     detector = detectors[NAME]
     for way, us in _others(detector, folder, samples, rounds).items():
         rows.append({**dict.fromkeys(rows[0], "-"), "way": way, "us a decision": f"{us:.1f}"})
-    return Table(rows, "CPU time of a decision, the median; from start to a score: of the process.")
+    return Table(
+        rows, "Median CPU time of a decision; CPU time of a new process until its first score."
+    )
 
 
 def _others(detector: SlipDetector, folder: Path, samples: Array, rounds: int) -> dict[str, float]:
@@ -243,7 +245,7 @@ def _float32(detector: SlipDetector) -> Table:
                 "decisions with another status": f"{changed} of {len(score)}",
             }
         )
-    return Table(rows, "Against the package, which computes in float64.")
+    return Table(rows, "Compared with the package in float64. *Status*: whether the alarm stands.")
 
 
 def _test_set(detector: SlipDetector, every: int) -> Table:
@@ -293,8 +295,8 @@ def _test_set(detector: SlipDetector, every: int) -> Table:
         )
     return Table(
         rows,
-        f"{len(chosen)} recordings of materials seen in training and held out (simulated), against "
-        "the package; the margin is "
+        f"{len(chosen)} simulated recordings of materials seen in training and held out, compared "
+        "with the package. *Status*: whether the alarm stands. The margin is "
         f"{LARGEST_ERROR['float32']:g} of the scores' standard deviation in float32, "
         f"{LARGEST_ERROR['float64']:g} in float64.",
     )
@@ -344,8 +346,8 @@ def _boards(detectors: Mapping[str, SlipDetector], folder: Path) -> Table:
             )
     return Table(
         rows,
-        "float32; flash with the detector, RAM with stack, both without the recording. The "
-        "network's weights are drawn at random: costs alone.",
+        "In float32. Flash includes the detector and RAM the stack; neither includes the "
+        "recording. The networks have random weights: these rows show costs only.",
     )
 
 

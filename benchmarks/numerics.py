@@ -106,9 +106,9 @@ class Numerics(Benchmark):
                     row[name] = float(off)
                 rows.append(row | {"other decision": flips})
         note = (
-            "The largest difference of scores to torch in float64, in their standard deviations; "
-            f"{self.bins} bins, rounded to float32, of each kind. *Other decision*: bins whose "
-            "sign or validity differs, of all backends together."
+            "Largest difference to the scores of torch in float64, in standard deviations of these "
+            f"scores; {self.bins} bins of each kind, rounded to float32. *Other decision*: bins "
+            "with another sign or validity, all backends together."
         )
         return Table(rows, note)
 
@@ -142,8 +142,8 @@ class Numerics(Benchmark):
                 }
             )
         note = (
-            f"The {len(nearest)} bins with the scores nearest to 0 of {self.bins}; changes in "
-            "standard deviations of the scores."
+            f"The {len(nearest)} bins whose scores are nearest to 0, of {self.bins}. Changes are "
+            "in standard deviations of the scores."
         )
         return Table(rows, note)
 
@@ -174,7 +174,11 @@ class Numerics(Benchmark):
                     "fits refused": refused,
                 }
             )
-        note = f"Scores of training bins, root mean square; {self.systems} systems a row."
+        note = (
+            "Root mean square error of the scores of training bins, against a solution with 80 "
+            f"digits; {self.systems} systems for each row. *Stated*: the error that the fit "
+            "reports."
+        )
         return Table(rows, note)
 
 

@@ -1,4 +1,4 @@
-"""What a folder of one's own costs: ``python -m benchmarks.own_folder [KEY=VALUE ...]``.
+"""What a folder of your own costs: ``python -m benchmarks.own_folder [KEY=VALUE ...]``.
 
 ``detect`` on many short files and on a recording of hours, and ``train`` on many objects: processor
 time of the whole process with its workers, and the most memory of it, also above what a short file
@@ -71,7 +71,7 @@ class OwnFolder(Benchmark):
         folds: of the estimate.
     """
 
-    title = "A folder of one's own"
+    title = "A folder of your own"
     about = "processor time and memory of commands on many files, long files and many objects"
     quick = "files=3 hours=0.05 kinds=[csv] objects=3 recordings=4 folds=2"
     charts: ClassVar = {"": [("Commands", ("CPU",))]}
@@ -104,9 +104,9 @@ class OwnFolder(Benchmark):
             num = self.objects * self.recordings
             rows.append(_row(f"train, {num} files of {self.objects} objects", cost, idle))
         note = (
-            "24 channels, at 2 kHz, for *train* at 1 kHz; with reading the files and making their "
-            "features. *Above one file*: the most memory of any one process, less that of the "
-            "first row."
+            "24 channels at 2 kHz, for *train* at 1 kHz. Reading the files and computing their "
+            "features is included. *Memory*: the most of any one process. *Above one file*: the "
+            "same less that of the first row."
         )
         return {"tables": {"Commands": Table(rows, note)}}
 

@@ -435,12 +435,12 @@ def _widths(seeds: Sequence[Report]) -> Table:
     for first in seeds[0]["widths"]:
         row = {"bin, ms": first["width"], "levels": first["level"], "features": first["pool"]}
         row |= {f"{ROLES[role]}, %": _spread(by[first["width"]]) for role, by in found.items()}
-        row["machine on, bins"] = f"{first['bins']:,}"
+        row["bins fitted on"] = f"{first['bins']:,}"
         rows.append(row)
     note = (
-        f"SIMULATED; balanced accuracy, mean (least to largest) over {len(seeds)} seeds; "
-        f"{NUM_FEATURES} features by the t-test on all training bins, the machine on a sample of "
-        "them. Short bins allow fewer wavelet levels."
+        f"SIMULATED; balanced accuracy, mean (lowest to highest) over {len(seeds)} seeds. "
+        f"{NUM_FEATURES} features, by the t-test on all training bins; the machine is fitted on a "
+        "sample of them. Short bins allow fewer wavelet levels."
     )
     return Table(rows, note)
 
@@ -453,9 +453,9 @@ def _sizes(seeds: Sequence[Report], role: str) -> Table:
         for size in sizes
     ]
     note = (
-        f"SIMULATED; balanced accuracy, mean (least to largest) over {len(seeds)} seeds; machines "
-        f"of degree 2 on {_bins(seeds, 'forward')} bins, as many of each material and class, C by "
-        "materials left out."
+        f"SIMULATED; balanced accuracy, mean (lowest to highest) over {len(seeds)} seeds. Machines "
+        f"of degree 2 are fitted on {_bins(seeds, 'forward')} bins, equally many of each material "
+        "and class; C is chosen by leaving out materials."
     )
     return Table(rows, note)
 
@@ -477,7 +477,7 @@ def _costs(seeds: Sequence[Report]) -> Table:
     gib = 8 * most**2 / 2**30
     why = f"extrapolated, as the square of the bins; one matrix of bins by bins is {gib:.1f} GiB"
     rows.append(last | {"bins": f"{most:,}", "CPU s": number(grown), "": why})
-    note = "SIMULATED bins; one thread, mean over seeds; making the features is not counted."
+    note = "SIMULATED bins; one thread, mean over seeds, without the time to make the features."
     return Table(rows, note)
 
 
@@ -495,9 +495,9 @@ def _choices(seeds: Sequence[Report]) -> Table:
         what = f"ranking by t-test ({size} features)"
         rows.append(_choice(what, "", RANKINGS["t-test"], at, role))
     note = (
-        "SIMULATED; balanced accuracy, mean (least to largest) over seeds. Confirmed: yes, if it "
-        "has the best mean; no, if others are better in every seed (named); else open. As good: "
-        f"within {AS_GOOD} points of the best mean."
+        "SIMULATED; balanced accuracy, mean (lowest to highest) over seeds. *Confirmed*: *yes* if "
+        "the paper's choice has the best mean; *no* if others, which are named, are better in "
+        f"every seed; else *open*. *As good*: within {AS_GOOD} points of the best mean."
     )
     return Table(rows, note)
 
@@ -523,10 +523,10 @@ def _choice(
     return {
         "the paper's choice": what,
         "evaluated on": ROLES[role],
-        "there, %": _spread(found[taken]),
+        "its accuracy, %": _spread(found[taken]),
         "best": f"{best}{unit}",
-        "best - the choice, points": _spread(gained[best], "+"),
-        "first that is as good": f"{as_good}{unit}",
+        "best - the paper's, points": _spread(gained[best], "+"),
+        "first that is as good as the best": f"{as_good}{unit}",
         "confirmed": verdict,
     }
 
@@ -570,7 +570,7 @@ def _trial(
     _draw_trial(maker, recording, filtered, says, str(name), path)
     note = (
         f"SIMULATED; {name}, a test recording of the first seed, from its first sample on; bins "
-        "that a slide begins or ends in are in neither count."
+        "in which a slide begins or ends are not counted."
     )
     return rows, note
 

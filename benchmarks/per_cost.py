@@ -91,9 +91,9 @@ class PerCost(Benchmark):
                     "test %": mean_sd(of["test"]),
                     "held-out materials %": mean_sd(of["unseen"]),
                     "M7, M instructions": f"{mean(of['m7']) / 1e6:.2f}",
-                    "computed": f"{mean(of['m7 computed']) / 1e6:.2f}",
+                    "computed, M instructions": f"{mean(of['m7 computed']) / 1e6:.2f}",
                     "x86-64, us": f"{mean(of['x86']):.1f}",
-                    "us computed": f"{mean(of['x86 computed']):.1f}",
+                    "computed, us": f"{mean(of['x86 computed']):.1f}",
                 }
             )
         seeds = list(dict.fromkeys(str(row["seed"]) for row in numbers["rows"]))

@@ -133,7 +133,7 @@ class Real(Benchmark):
                         ours["interval"], 1, scale=100
                     ),
                     "best baseline": best,
-                    "its %": style.interval(other["interval"], 1, scale=100),
+                    "its balanced accuracy %": style.interval(other["interval"], 1, scale=100),
                     "ours ahead by, points": style.interval(
                         other["lead"]["recordings"], 1, scale=100
                     ),
@@ -414,7 +414,7 @@ def _scores(sets: Mapping[str, Any]) -> Table:
         row["balanced accuracy %"] = mean_sd(times(found["balanced_accuracy"], 100))
         row["AUC %"] = mean_sd(times(found["auc"], 100))
         whole = found["recordings"]
-        row["of recordings, balanced accuracy %"] = (
+        row["whole recordings, balanced accuracy %"] = (
             "-" if whole is None else style.interval(whole, 2, scale=100)
         )
         leads = found["lead"]
@@ -425,13 +425,13 @@ def _scores(sets: Mapping[str, Any]) -> Table:
         row["ours is"] = "-" if method == OURS else word(leads)
         rows.append(row)
     note = (
-        "Mean and standard deviation over seeds where a method draws at random. A recording is "
-        "decided by the mean of its windows' scores; - where it has windows of several classes. "
-        "Intervals are by "
-        "a paired bootstrap: recordings are drawn with all their windows, the same for both "
-        "methods, once from all and once within each left-out group. *ahead* or *behind* stands "
-        "where neither interval includes 0. Scores are held: other training recordings and other "
-        "objects are not in the intervals."
+        "Mean and standard deviation over seeds where a method draws at random. *Whole "
+        "recordings* are decided by the mean of their windows' scores; - where a recording has "
+        "windows of several classes. Intervals are by a paired bootstrap: recordings are drawn "
+        "with all their windows, the same for both methods, once from all and once within each "
+        "left-out group. *ahead* or *behind*: neither interval includes 0. The bootstrap does not "
+        "fit again: variation between training recordings and between objects is not in the "
+        "intervals."
     )
     return Table(rows, note)
 
@@ -461,9 +461,9 @@ def _costs(sets: Mapping[str, Any]) -> Table:
         row["model.onnx, MB"] = None if found is None else found["onnx_bytes"] / 1e6
         rows.append(row)
     note = (
-        "On one thread; fits with all that is chosen inside. Limits on `biotacsp`: a fold 15 CPU "
-        "s, a window 300 us and 1,200 us in onnxruntime, files 8 MB. More than two classes make no "
-        "detector."
+        "On one thread. A fit includes the choice of its parameters. Limits on `biotacsp`: 15 CPU "
+        "s for a fold, 300 us for a window (1,200 us in onnxruntime), 8 MB for a file. With more "
+        "than two classes there is no detector to export."
     )
     return Table(rows, note)
 

@@ -191,11 +191,12 @@ class RealOnsets(Benchmark):
                 rows.append(_row(f"{name}, {per_hour:g} /h", pooled_metrics(events), len(runs)))
         quiet_min = 60 * pooled_metrics(events)["quiet_hours"]
         note = (
-            f"{len(source.ids)} trials of {len(objects)} objects, {quiet_min:.1f} min are quiet; "
-            f"{len(self.seeds)} seeds of the alarm together. Behind each name the false alarms an "
-            "hour on the other objects that all methods are set to; the alarm's threshold comes of "
-            "classifiers that were fitted without the object that is scored. Delays: median and "
-            "95 % quantile in brackets; other brackets are 95 % of the bootstrap over trials."
+            f"{len(source.ids)} trials of {len(objects)} objects, {quiet_min:.1f} min without "
+            f"slip; {len(self.seeds)} seeds of the alarm together. After each name: the false "
+            "alarms an hour on the other objects, to which the threshold is set. For this, the "
+            "alarm scores each of these objects by a classifier that was fitted without it. "
+            "Delays: median and, in brackets, 95 % quantile. Other brackets: 95 % intervals of a "
+            "bootstrap over trials."
         )
         return {"tables": {"Real onsets": Table(rows, note)}}
 

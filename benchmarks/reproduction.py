@@ -298,22 +298,27 @@ def gains(after: BySeed, before: BySeed) -> list[float]:
 
 # ------------------------------------------------------------------------------------- tables
 CALIBRATED, PREDICTED, NOT_COMPARABLE = "*calibrated*", "*predicted*", "*not comparable*"
-_HALF = "the published matrices do not fit half a second on either side"
+_HALF = "the published confusion matrices do not fit this layout of bins"
 SETTINGS = {
     "random_bins": ("Split at random over bins, as the authors did, the paper's recipe", ""),
     "unseen4": ("Split by cycle, whole slides, the paper's recipe", ""),
-    "half_second random_bins": ("Split at random, half a second on either side", _HALF),
-    "half_second": ("Split by cycle, half a second on either side", _HALF),
+    "half_second random_bins": (
+        "Split at random, half a second on either side of the onset",
+        _HALF,
+    ),
+    "half_second": ("Split by cycle, half a second on either side of the onset", _HALF),
 }
 """By experiment its title, and why nothing of it compares with the paper, if so."""
 WHERE = {"train": "training bins", "test": "test bins", "unseen": "held-out materials"}
+ROLES = {"train": "train", "test": "test", "unseen": "held-out materials"}
+"""In words, of bins and of experiments."""
 ABLATIONS = {
     "unseen4": "everything",
     "PVDF only": "PVDF films only",
     "SG means only": "means of the SGs only",
     "motor_off": "everything, motors and jolts of the arm off",
-    "motor_only": "motors and jolts of the arm, the contact as good as silent",
-    "shuffled": "everything, labels permuted; must show 50 %",
+    "motor_only": "motors and jolts of the arm, the contact nearly silent",
+    "shuffled": "everything, labels permuted; must give 50 %",
 }
 LAYOUTS = {
     "whole slides": ("random_bins", "unseen4"),
@@ -368,7 +373,7 @@ def _beside(numbers: Report, scores: Scores, experiment: str) -> Table:
         if paper.non_slip_recall is not None and quiet:
             alarms = (1 - paper.non_slip_recall) * published.BINS_PER_MINUTE
             ours_a_minute = [(100 - value) / 100 * published.BINS_PER_MINUTE for value in quiet]
-            what = f"false slips a minute of non-slip, {WHERE[role]}"
+            what = f"false slips a minute without slip, {WHERE[role]}"
             row(what, alarms, ours_a_minute, 0, role, "")
     runs = numbers["runs"][experiment]
     classes = [[sum(of) for of in run["splits"]["test"]["confusion"]] for run in runs]
@@ -386,14 +391,14 @@ def _mark(experiment: str, role: str, score: str, calibrated: Mapping[str, Any])
     if SETTINGS[experiment][1]:
         return NOT_COMPARABLE, SETTINGS[experiment][1]
     if role == "labels":
-        return PREDICTED, "follows from where bins are laid"
+        return PREDICTED, "follows from the layout of bins"
     if role == "unseen":
-        return PREDICTED, "calibration looked at none"
+        return PREDICTED, "calibration used no held-out material"
     if role == "test" and experiment == "unseen4":
         return NOT_COMPARABLE, "the paper's test bins have neighbours among its training bins"
     if (experiment, role, score) == ("random_bins", "test", "accuracy") and "target" in calibrated:
-        return CALIBRATED, f"three parameters were set by it: {calibrated['outcome']}"
-    return PREDICTED, "no parameter was calibrated by it"
+        return CALIBRATED, f"three parameters were set by it: {_outcome(calibrated)}"
+    return PREDICTED, "not used in calibration"
 
 
 def _selected(runs: Runs) -> Table:
@@ -418,8 +423,8 @@ def _selected(runs: Runs) -> Table:
         for what, of in paper.items()
     ]
     note = (
-        f"Counts; the paper selects {published.NUM_SELECTED}, and gives only an order of "
-        "descriptors. Its features were ranked on all bins, ours on training bins."
+        f"Counts. The paper selects {published.NUM_SELECTED} features, and of descriptors it gives "
+        "the order only. Its features were ranked on all bins, ours on training bins."
     )
     return Table(rows, note)
 
@@ -444,25 +449,28 @@ def _signals(signals: Sequence[Sequence[Mapping[str, Any]]]) -> Table:
         low, high = checks[0]["low"], checks[0]["high"]
         row = {"the paper's signals": checks[0]["says"]}
         row["ours, simulated"] = f"{min(values):.3g} to {max(values):.3g}"
-        row["asked"] = f"above {low:g}" if high is None else f"{low:g} to {high:g}"
+        row["limits"] = f"above {low:g}" if high is None else f"{low:g} to {high:g}"
         holds = sum(bool(check["holds"]) for check in checks)
-        rows.append(row | {"holds, seeds": f"{holds} of {len(checks)}"})
-    return Table(rows, "Least to largest over materials and seeds.")
+        rows.append(row | {"met, seeds": f"{holds} of {len(checks)}"})
+    return Table(rows, "Lowest to highest over materials and seeds.")
 
 
 def _places(runs: Runs, scores: Scores) -> Table:
     columns = [(name, role) for name in BY_CYCLE if name in runs for role in ("test", "unseen")]
     rows = [
-        {"bin beside its onset": f"{words} ({'non-slip' if words.startswith('-') else 'slip'})"}
-        | {", ".join(of): mean_sd(scores.beside_onset(*of, places)) for of in columns}
+        {"bin": f"{words} ({'non-slip' if words.startswith('-') else 'slip'})"}
+        | {
+            f"{name}, {ROLES[role]}": mean_sd(scores.beside_onset(name, role, places))
+            for name, role in columns
+        }
         for words, places in PLACES.items()
     ]
-    return Table(rows, "Recall, %. A bin is 50 ms; 0 is the first that is labelled slip.")
+    return Table(rows, "Recall, %. A bin is 50 ms; bin 0 is the first that is labelled slip.")
 
 
 def _strokes(scores: Scores) -> Table:
     rows = [
-        {"stroke": f"{name}, {role}, {speed} mm/s"}
+        {"stroke": f"{name}, {ROLES[role]}, {speed} mm/s"}
         | {
             f"{words}, %": mean_sd(scores.of(name, role, of, group=("per_speed", speed)).values())
             for of, words in SCORES.items()
@@ -484,16 +492,19 @@ def _ablations(runs: Runs, scores: Scores) -> Table:
         row: dict[str, object] = {"trained and evaluated with": words}
         for role in ("test", "unseen"):
             own, whole = scores.of(name, role, baseline=baseline), scores.of("unseen4", role)
-            row[f"{role} %"] = mean_sd(own.values())
-            row[f"{role}: to everything"] = mean_sd(gains(own, whole), sign="+")
+            row[f"{ROLES[role]} %"] = mean_sd(own.values())
+            row[f"{ROLES[role]}: change"] = mean_sd(gains(own, whole), sign="+")
         rows.append(row | {"seeds": len(runs[name])})
-    note = "Balanced accuracy; differences in points at the same seeds; the paper's recipe."
+    note = (
+        "Balanced accuracy, with the paper's recipe. *Change*: the difference to *everything* at "
+        "the same seeds, in points."
+    )
     return Table(rows, note)
 
 
 def _baselines(runs: Runs, scores: Scores) -> Table:
     rows = [
-        {"balanced accuracy, %": f"{name}, {role}"}
+        {"balanced accuracy, %": f"{name}, {ROLES[role]}"}
         | {
             words: mean_sd(scores.of(name, role, baseline=baseline).values())
             for baseline, words in {"": "detector", **BASELINES}.items()
@@ -501,7 +512,7 @@ def _baselines(runs: Runs, scores: Scores) -> Table:
         for name in runs
         for role in scores.roles(name)
     ]
-    note = "All are fitted on the same training recordings; baselines on a sample of their bins."
+    note = "All are fitted on the same training recordings, baselines on a sample of their bins."
     return Table(rows, note)
 
 
@@ -510,9 +521,12 @@ def _validation(runs: Runs) -> Table:
     for name in BY_CYCLE:
         percents = [100 * run["validation"] for run in runs.get(name, []) if run["validation"]]
         if percents:
-            row = {"recipe": name, "left-out training materials, %": mean_sd(percents)}
+            row = {"experiment": name, "training materials left out, %": mean_sd(percents)}
             rows.append(row | {"by seed": ", ".join(f"{of:.2f}" for of in percents)})
-    note = "Balanced accuracy of the best choice of K and C; no test and no held-out bin is in it."
+    note = (
+        "Balanced accuracy of the best choice of K and C, without any bin of test cycles or of "
+        "held-out materials."
+    )
     return Table(rows, note)
 
 
@@ -527,7 +541,7 @@ def _leakage(scores: Scores) -> Table:
                         "test bins": f"{name}, {layout}",
                         "at random over bins, %": mean_sd(at_random.values()),
                         "by cycle, %": mean_sd(by_cycle.values()),
-                        "leak, points": mean_sd(found, sign="+"),
+                        "leakage, points": mean_sd(found, sign="+"),
                         "seeds": len(found),
                     }
                 )
@@ -551,11 +565,11 @@ def _confound(runs: Runs, scores: Scores) -> dict[str, Table]:
     rows = []
     for scene, fold in product(scenes, FOLDS):
         is_known = scene == PAPER_SCENE or (fold == "with_scenes" and scene in trained_on)
-        mark = " (trained on)" if is_known else ""
+        mark = " (in training)" if is_known else ""
         row = {"scene": f"{scene}, trained on {FOLDS[fold]}{mark}"}
         for role in roles:
             for words, of in recalls(fold, role, scene).items():
-                row[f"{role}: {words}, %"] = mean_sd(of.values())
+                row[f"{ROLES[role]}: {words}, %"] = mean_sd(of.values())
         rows.append(row)
 
     def scene_gains(role: str, scene: str) -> list[float]:
@@ -571,16 +585,16 @@ def _confound(runs: Runs, scores: Scores) -> dict[str, Table]:
     changes = {role: scene_gains(role, PAPER_SCENE) for role in roles}
     gained: dict[str, object] = {
         "scenes, test cycles, mean of all but the protocol": mean_sd(on_scenes, sign="+"),
-        **{f"the protocol, {role}": mean_sd(changes[role], sign="+") for role in roles},
+        **{f"the protocol, {ROLES[role]}": mean_sd(changes[role], sign="+") for role in roles},
         "clearly better on scenes": min(on_scenes) > CLEARLY,
-        "no worse on the protocol": min(map(mean, changes.values())) >= -NO_WORSE,
+        "not worse on the protocol": min(map(mean, changes.values())) >= -NO_WORSE,
     }
     note = (
-        f"Clearly better: more than {CLEARLY:g} points in every seed; no worse: a mean loss of at "
+        f"Clearly better: more than {CLEARLY:g} points in every seed. Not worse: a mean loss of at "
         f"most {NO_WORSE:g}. Training on such scenes is recommended only if both hold."
     )
     return {
-        "Slip or the arm": Table(rows, "Recalls; - where a scene has no bin of a class."),
+        "Slip or the arm": Table(rows, "Recall; - where a scene has no bins of a class."),
         "What training on such scenes gains": Table(
             [{"points": name, "gain": gain} for name, gain in gained.items()], note
         ),
@@ -593,14 +607,26 @@ def _parameters(calibrated: Mapping[str, Any]) -> Table:
         {"parameter": name, "frozen value": " to ".join(f"{of:g}" for of in value)}
         for name, value in values.items()
     ]
-    note = f"Provenance: {calibrated['provenance'].rstrip('.')}."
+    note = (
+        "Set once, by a command of version 0.1.0, from the test accuracy on simulated seen "
+        "materials and the signal checks alone."
+    )
     if "target" in calibrated:
         target = calibrated["target"]
         note += (
-            f" Aim: {100 * target['accuracy']:.2f} % ({target['row']}); reached: "
-            f"{100 * calibrated['accuracy']:.2f} %, mean over other seeds: {calibrated['outcome']}."
+            f" Target: {100 * target['accuracy']:.2f} % ({target['row']}). Reached: "
+            f"{100 * calibrated['accuracy']:.2f} %, mean over other seeds. This is "
+            f"{_outcome(calibrated)}."
         )
     return Table(rows, note)
+
+
+def _outcome(calibrated: Mapping[str, Any]) -> str:
+    """How far from its target the calibration of 0.1.0 ended."""
+    gap = 100 * (calibrated["accuracy"] - calibrated["target"]["accuracy"])
+    is_at_limit = calibrated["difficulty"] in calibrated["protocol"]["bounds"]
+    why = ", at the limit of the priors (two standard deviations)" if is_at_limit else ""
+    return f"{gap:+.2f} points from the target{why}"
 
 
 def _short_table(runs: Runs) -> Table:
@@ -609,16 +635,18 @@ def _short_table(runs: Runs) -> Table:
 
     def row(what: str, cells: Mapping[str, str], pooled: str) -> None:
         titled = {f"{words} %": cells[of] for of, words in SCORES.items()}
-        rows.append({"experiment": what} | titled | {"best pooled number, balanced %": pooled})
+        rows.append(
+            {"experiment": what} | titled | {"best pooled number, balanced accuracy %": pooled}
+        )
 
     shown = [(name, role) for name, roles in SHORT.items() if name in runs for role in roles]
     for name, role in shown:
         cells = {of: mean_sd(scores.of(name, role, of).values()) for of in SCORES}
         pooled = mean_sd(scores.of(name, role, baseline=POOLED).values())
-        row(f"`{name}` {role}, simulated, {_seeds(len(runs[name]))}", cells, pooled)
+        row(f"`{name}`, {ROLES[role]}, simulated, {_seeds(len(runs[name]))}", cells, pooled)
         if (name, role) in COMPARED:
             paper = {of: percent(getattr(published.SPLITS[role], of)) for of in SCORES}
-            row(f"paper, real hand, {role}", paper, "")
+            row(f"paper, real hand, {ROLES[role]}", paper, "")
     return Table(rows)
 
 

@@ -62,10 +62,11 @@ class Simulation(Benchmark):
     def measure(self, job: Job) -> dict[str, Any]:
         """Costs and differences by level and step; accuracies by level."""
         note = (
-            "Off: the root mean square difference of samples to those of the smallest step, over "
-            "their standard deviation, the worst kind of channel; and the largest of onsets."
+            "*Samples off*: root mean square difference to the samples at the smallest step, "
+            "divided by their standard deviation, for the worst kind of channel. *Onset off*: the "
+            "largest difference of an onset."
         )
-        about = "Held-out cycles of seen materials; the same cycles on every level."
+        about = "Test cycles of seen materials, the same on every level."
         with on_threads(1):
             accuracies = Table(_accuracies(self, job.overrides), about)
             return {

@@ -93,11 +93,13 @@ class StatedRates(Benchmark):
                 rows.append({"false alarms": name, "set": f"{hours:g} h"})
                 rows[-1] |= self._row(made, scored, round(hours / _STRETCH_H))
         note = (
-            f"{self.sets} sets of segments of {60 * _STRETCH_H:g} min out of {self.hours:g} h; at "
-            f"most {self.per_hour:g} false alarms an hour with a confidence of 0.95. *Holds*: the "
-            "rate in the other hours is at most that. *Without dispersion*: as if alarms came one "
-            "by one. *Refused*: sets with too few hours for such bunches; they are not in *holds*. "
-            "*Counted / stated*: the rate in the other hours by the stated one, median."
+            f"{self.sets} sets of segments of {60 * _STRETCH_H:g} min, drawn from {self.hours:g} "
+            f"h. Stated: at most {self.per_hour:g} false alarms an hour, with a confidence of "
+            "0.95. *Holds*: sets for which the rate in the other hours was at most that. *Without "
+            "dispersion*: the same, if the bound takes the alarms as independent. *Dispersion*: "
+            "the median. *Refused*: sets with too few hours for such bunches; they are not counted "
+            "in *holds*. *Counted / stated*: the rate in the other hours divided by the stated "
+            "rate, median."
         )
         return {"tables": {"Stated rates": Table(rows, note)}}
 

@@ -70,8 +70,7 @@ class Streaming(Benchmark):
     title = "Streams"
     about = (
         "a simulated stream of 24 channels at 2 kHz in float32, watched by the detector of the "
-        "main job (`+exp=unseen4`, the default recipe), on 1 thread; times faster than the stream "
-        "runs"
+        "main job (`+exp=unseen4`, the default recipe), on 1 thread. *Times faster*: than real time"
     )
     quick = (
         "recordings=1 pushes=[200] hops=[20] rounds=1 watched_s=4.0 settled_s=2.0 onset_hops=310"
@@ -141,9 +140,13 @@ class Streaming(Benchmark):
         }
         tables = {
             "Limits": limits(goals),
-            "Speed": Table(speed, "naive: a bin with all its context for every decision."),
+            "Speed": Table(
+                speed, "*Naive*: each decision computes its whole bin with all its context again."
+            ),
             "Hops of an onset classifier": Table(
-                hops, "CPU time of one thread, pushes of 5 ms; every fifth completes a bin too."
+                hops,
+                "CPU time on one thread. A push is one hop, 5 ms; every fifth push also completes "
+                "a bin.",
             ),
             "Memory": listed("memory", held),
         }

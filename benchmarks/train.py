@@ -77,10 +77,10 @@ class Train(Benchmark):
             for name, (key, factor) in _TOTALS.items()
         ]
         note = (
-            f"`train {' '.join(overrides)}`, repeats: {self.repeats}, medians; "
-            f"{runs[0]['num_bins']} bins; start-up: imports, configuration and figures; "
-            "features of training bins are in *other*, those of test bins in *test*; "
-            f"memory: {runs[0]['memory'].upper()}."
+            f"`train {' '.join(overrides)}`, medians, repeats: {self.repeats}; "
+            f"{runs[0]['num_bins']} bins. *Start-up*: imports, configuration and figures. *Other* "
+            "includes the features of training bins, *test* those of test bins. "
+            f"Memory is {runs[0]['memory'].upper()}."
         )
         found = {"Stages": Table(rows, note), "Whole runs": Table(totals)}
         if overrides == ["+exp=unseen4"]:
