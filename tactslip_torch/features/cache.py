@@ -151,7 +151,7 @@ class FeatureCache:
 
     def store(self, key: str, columns: Sequence[int], made: KeptFeatures) -> None:
         """Write what is kept of a recording and its features' numbers, whole or not at all."""
-        arrays: dict[str, Any] = {"columns": np.array(columns, dtype=np.int64), **made._asdict()}
+        arrays: dict[str, Any] = made._asdict() | {"columns": np.array(columns, dtype=np.int64)}
         arrays["features"] = made.features.numpy().astype("<f4", order="C")
         try:
             with whole_file(self._path(key)) as temporary, temporary.open("wb") as file:
