@@ -205,7 +205,8 @@ class Listening:
     """A ``StreamingDetector``, its alarm and, where its decisions have one, its hint.
 
     Attributes:
-        highest: statistic of the rule so far, once the grip has closed.
+        highest: what has a threshold so far, once the grip has closed: the score of slipping now,
+            or the statistic of the rule on bins.
     """
 
     def __init__(self, detector: SlipDetector, settings: AlarmSettings | None = None) -> None:
@@ -218,7 +219,9 @@ class Listening:
         if not len(decisions.number):
             return 2 * int(self._is_on)
         self._is_on = bool(decisions.is_on[-1])
-        late = decisions.statistic[decisions.available_s > WATCHED_S].nan_to_num(-math.inf)
+        has_onset = self._stream.settings.onset is not None
+        values = decisions.onset_score if has_onset else decisions.statistic
+        late = values[decisions.available_s > WATCHED_S].nan_to_num(-math.inf)
         self.highest = max([self.highest, *late.tolist()])
         if self._is_on or bool(decisions.is_alarm.any()):
             return 2
