@@ -144,6 +144,15 @@ def test_a_clock_that_runs_otherwise_or_drifts_loses_nothing_and_says_how_far_it
     assert 0.3 * most / RATE < found.jitter_s < most / RATE
 
 
+def test_jitter_does_not_contradict_the_rate_that_is_stated():
+    for seed in range(8):
+        late = np.random.default_rng(seed).uniform(-0.3, 0.3, 400)
+        found = clock_of((np.arange(400) + late) / RATE, RATE)
+        assert (found.sample_rate_hz, found.num_samples) == (RATE, 400)
+        with pytest.raises(ValueError, match=r"its times are (1999|200\d)\S* Hz, but 1000 Hz"):
+            clock_of((np.arange(400) + late) / RATE, 1000.0)
+
+
 def at_random(times):
     late = torch.rand(4000, generator=torch.Generator().manual_seed(0)).double() * 4
     return (torch.arange(4000) + late).sort().values / RATE

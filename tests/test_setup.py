@@ -206,23 +206,23 @@ def slips(tmp_path, **labels):
     return look(tmp_path)
 
 
-def test_jitter_that_the_rate_does_not_fit_is_resampled(tmp_path):
-    """A set that setup reads is read by train."""
-    for seed, name in ((0, "cup_1"), (2, "cup_2")):
-        times = 0.002 * np.arange(400) + np.random.default_rng(seed).uniform(-6e-4, 6e-4, 400)
-        write(tmp_path / f"{name}.csv", ["a", "b"], time=times, slip=[0] * 200 + [1] * 200)
+@pytest.mark.parametrize("jitter_s", [6e-4, 0.0])
+def test_a_set_that_setup_reads_is_read_by_train(jitter_s, tmp_path):
+    """Times with jitter, and rates that are one, but not within 1 % of the rate they are called."""
+    rates = (500.0, 500.0) if jitter_s else (98.6, 99.2, 100.1)
+    files = [f"cup_{number}.csv" for number in range(len(rates))]
+    for seed, (name, rate) in enumerate(zip(files, rates, strict=True)):
+        late = np.random.default_rng(2 * seed).uniform(-jitter_s, jitter_s, 400)
+        times = np.arange(400) / rate + late
+        write(tmp_path / name, ["a", "b"], time=times, slip=[0] * 200 + [1] * 200)
     reading = propose(look(tmp_path)).settings["data"]["reading"]
-    files = ("cup_1.csv", "cup_2.csv")
+    key, rate_hz = ("sample_rate_hz", 500.0) if jitter_s else ("resample_hz", 100.0)
+    assert reading[key] == rate_hz
     listing = Listing(tuple(Entry(name, name, RecordingId(name, 0), None) for name in files))
-
-    def lengths(how):
-        source = FileRecordings(tmp_path, manifest=listing, reading={"time": "time", **how})
-        return [source.load(name).samples.shape[1] for name in source.ids]
-
-    rates = {key: reading.get(key) for key in ("sample_rate_hz", "resample_hz")}
-    assert lengths(rates) == pytest.approx([400, 400], abs=2)
-    with pytest.raises(ValueError, match="but 500 Hz is stated"):
-        lengths({"sample_rate_hz": 500.0})
+    how = {"time": "time", key: rate_hz}
+    source = FileRecordings(tmp_path, manifest=listing, reading=how)
+    for name in source.ids:
+        assert source.load(name).samples.shape[1] == pytest.approx(400, abs=6)
 
 
 def test_times_without_a_unit_that_step_by_tens_are_milliseconds(tmp_path):

@@ -102,6 +102,10 @@ def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "tim
     start = times[:_MOST_FOR_STEP] - times[0]
     _refuse_bursts(np.diff(start), name)
     step_s, unit_s = _step_of(start, name)
+    late = _Lateness(times, step_s)
+    gaps, jitter = _gaps_in(late, step_s, unit_s / step_s, name)
+    slope, drift = _drift_in(late, gaps)
+    step_s *= 1 + slope
     if stated_hz is not None and abs(stated_hz * step_s - 1) > _RATE_ERR:
         raise ValueError(
             f"{name}: its times are {1 / step_s:.6g} Hz, but {stated_hz:g} Hz is stated; "
@@ -109,10 +113,6 @@ def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "tim
             f"correct it where it is stated: in {setting('reading.sample_rate_hz')} (null takes "
             "the rate of the times), the manifest or the file"
         )
-    late = _Lateness(times, step_s)
-    gaps, jitter = _gaps_in(late, step_s, unit_s / step_s, name)
-    slope, drift = _drift_in(late, gaps)
-    step_s *= 1 + slope
     rate_hz = stated_hz if stated_hz is not None else 1 / step_s
     num_samples = len(times) + sum(gap.missing for gap in gaps)
     return Clock(rate_hz, num_samples, gaps, step_s * max(jitter, drift if drift > 1 else 0.0))

@@ -518,9 +518,8 @@ def _propose_rate(found: Look, given: Answers, draft: Proposal) -> float:
         return rate_hz
     common = float(np.median(rates))
     off = max(abs(rate / common - 1) for rate in rates)
-    if given.rate_hz:
-        off = max(off, abs(given.rate_hz / common - 1))
-    if off > _SAME_RATE:
+    rate_hz = given.rate_hz or nominal_rate(common, min(max(off, 1e-4), _SAME_RATE))
+    if max(abs(rate_hz / rate - 1) for rate in rates) > _SAME_RATE:  # train refuses such files
         each = sorted({nominal_rate(rate, _SAME_RATE) for rate in rates})
         rate_hz = given.rate_hz or each[-1]
         shown = ", ".join(f"{rate:g}" for rate in each)
@@ -528,13 +527,8 @@ def _propose_rate(found: Look, given: Answers, draft: Proposal) -> float:
         reason = f"the files have {shown} Hz: all are resampled to {which}"
         draft.set(f"{reading}.resample_hz", rate_hz, reason)
     else:
-        rate_hz = given.rate_hz or nominal_rate(common, max(off, 1e-4))
         reason = "by the times"
-        if _is_read_at(found.tables, rate_hz):
-            draft.set(f"{reading}.sample_rate_hz", rate_hz, reason)
-        else:
-            reason = "the steps of the times vary: all files are resampled to even steps"
-            draft.set(f"{reading}.resample_hz", rate_hz, reason)
+        draft.set(f"{reading}.sample_rate_hz", rate_hz, reason)
     missing = f"; {gaps} rows are missing in the files that were read" if gaps else ""
     draft.tell("rate", f"{rate_hz:g} Hz", reason + missing)
     return rate_hz
@@ -556,17 +550,6 @@ def _likely_rate(tables: Sequence[_Table]) -> tuple[str, str]:
             mean, median = f"{mean_hz:.4g} Hz in the mean", f"{rate_hz:.4g} Hz by its median step"
             return "", f"; {one.file} has {mean}, {median}"
     return (f"{nominal_rate(float(np.median(own)), _SAME_RATE):g}" if own else ""), ""
-
-
-def _is_read_at(tables: Sequence[_Table], rate_hz: float) -> bool:
-    """Whether the times of all files are those of this rate."""
-    try:
-        for one in tables:
-            if one.times_s is not None:
-                even_clock(one.times_s, rate_hz, one.file)
-    except ValueError:
-        return False
-    return True
 
 
 def _propose_gaps(found: Look, channels: Sequence[str | int], draft: Proposal) -> None:
