@@ -24,7 +24,8 @@ def score_bins(session, facts, recording):
     bin_samples, before = facts["bin_samples"], facts["context_before_samples"]
     window = before + bin_samples + facts["context_after_samples"]
     starts = np.arange(0, len(recording) - window + 1, bin_samples)
-    for some in np.split(starts, range(BATCH, len(starts), BATCH)):
+    for first in range(0, len(starts), BATCH):  # none of a recording shorter than a window
+        some = starts[first : first + BATCH]
         bins = np.stack([recording[start : start + window].T for start in some])
         columns = session.run(names, {"samples": bins.astype(facts["precision"])})
         rows = zip(*(column.tolist() for column in columns), strict=True)

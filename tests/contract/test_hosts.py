@@ -375,5 +375,12 @@ def test_bins_are_scored_as_the_package_scores_them(stream, paper, tmp_path):
     np.testing.assert_allclose(found, predicted.score, rtol=0, atol=close)
 
 
+def test_a_recording_shorter_than_a_window_has_no_bins(stream, tmp_path):
+    path = saved(tmp_path / "recording.npy", SAMPLES[:50])
+    command = [*map(str, SCORE), stream.with_name(names.BIN_GRAPH), path]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")
+
+
 def test_a_stream_graph_is_refused_for_bins(stream, recording):
     assert_refused(run_host(SCORE, stream, recording), "give model.onnx", 1)
