@@ -157,7 +157,7 @@ def test_a_file_that_is_not_ours_is_never_replaced(tmp_path, content):
         (["materials=[]", "scene=paper"], "no recording to write; give at least one"),
         (["cycles=0", "scene=paper"], "data: cycles must be a whole number of at least 1, got 0"),
         (["scene=paper", "scene.name=a/b", "materials=[M1]"], "cannot name a file; give the scene"),
-        (["format=xls"], "format must be one of npz, text, "),
+        (["format=xls"], "format must be one of npz, csv, h5, mat, parquet, mcap, got 'xls'"),
         (["num_workers=-1"], "num_workers must be null or a number from 0, got -1"),
         (["~features.frames.PVDF"], "features.frames has no frame for PVDF channels"),
     ],

@@ -170,8 +170,8 @@ FORMATS = {
         Format("text", ("csv", "tsv", "txt", "dat", "lvm"), "_text"),
         Format("hdf5", ("h5", "hdf5", "he5"), "_arrays", "_hdf5"),
         Format("mat", ("mat",), "_arrays", "_mat"),
-        Format("mcap", ("mcap",), "_messages", "_mcap"),
         Format("parquet", ("parquet",), "_parquet"),
+        Format("mcap", ("mcap",), "_messages", "_mcap"),
     )
 }
 """By name; all are written and read."""
@@ -244,7 +244,8 @@ def named_format(name: str) -> Format:
     for form in FORMATS.values():
         if name == form.name or name in form.endings:
             return form
-    raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {name!r}")
+    known = ", ".join(form.endings[0] for form in FORMATS.values())
+    raise ValueError(f"format must be one of {known}, got {name!r}")
 
 
 @contextmanager
