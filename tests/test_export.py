@@ -62,7 +62,7 @@ def test_a_model_says_of_itself_what_its_sidecar_says(detector, exported):
         assert {name: metadata[name] for name in said} == said
         worst_sd = metadata["check"]["worst_sd"]
         assert 0 < worst_sd < 1e-3
-        assert f"{worst_sd:.1e} of their spread" in summary(path)
+        assert f"{worst_sd:.1e} standard deviations of those that torch" in summary(path)
     sidecar = exported[1].with_name("stream.onnx.json").read_text()
     lines = [line.strip(" ,") for line in sidecar.splitlines()]
     for name, value in read_sidecar(exported[1]).items():  # a scalar a line: for hosts in C
@@ -98,6 +98,15 @@ def test_a_calibration_of_training_and_a_curve_are_told_and_what_json_has_not_is
     (path,) = export_detector(made, tmp_path, ["stream"])
     assert read_sidecar(path)["threshold"] is None
     assert read_sidecar(path)["threshold_curve"] == curve["threshold_curve"]
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("tare_s", [None, [0.1, 0.5]])
+def test_the_rest_whose_mean_is_taken_off_is_told(tmp_path, tare_s):
+    made = small_detector()
+    made.info["reading"] = {"tare_s": tare_s}
+    (path,) = export_detector(made, tmp_path, ["bin"])
+    assert read_sidecar(path)["tare_s"] == tare_s
 
 
 # What is wrong ---------------------------------------------------------------------------------

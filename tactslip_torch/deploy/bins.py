@@ -315,6 +315,7 @@ def host_metadata(detector: SlipDetector, kind: str, precision: Precision) -> di
         "kinds": [channel.kind for channel in hand.channels],
         "unit": info.get("units", "V"),
         "sample_rate_hz": detector.pool.sample_rate_hz,
+        "tare_s": (info.get("reading") or {}).get("tare_s"),
         "bin_samples": raw.bin,
         "context_before_samples": raw.before,
         "context_after_samples": raw.after,

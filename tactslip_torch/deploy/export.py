@@ -127,8 +127,8 @@ def summary(path: Path) -> str:
     metadata = read_sidecar(path)
     return (
         f"{path}: {metadata['onnx_bytes'] / 1000:.0f} kB, {metadata['precision']}, scores "
-        f"within {metadata['check']['worst_sd']:.1e} of their spread of torch's in float64, on a "
-        "simulated slip"
+        f"within {metadata['check']['worst_sd']:.1e} standard deviations of those that torch "
+        "computes in float64, on a simulated slip"
     )
 
 
