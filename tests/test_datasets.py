@@ -14,6 +14,7 @@ from test_commands import composed
 
 from tactslip_torch.data.file_recordings import FileRecordings, _file_digest
 from tactslip_torch.data.formats import named_format
+from tactslip_torch.data.manifest import Listing
 from tactslip_torch.data.public_sets import STEMS, authors_raw, named_recordings, nominal
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.hand import Channel, HandLayout
@@ -541,12 +542,14 @@ def test_a_rate_that_no_sensor_has_is_asked_for(tmp_path, rate, is_read):
     if is_read:
         assert FileRecordings(tmp_path).sample_rate_hz == rate
     else:
-        said = re.escape(f"a.csv: is of {rate:g} Hz, which is no sample rate")
+        said = re.escape(f"a.csv: is of {rate:g} Hz, and tactile sensors of 1 Hz to 1 MHz;")
         refused(f"{said} .* say data.reading.time_unit=", tmp_path)
 
 
 REFUSED = [
     ({"materials": ["steel", "iron"]}, r"data\.materials steel; the set has wood, iron"),
+    ({"materials": []}, r"data\.materials is empty; the set has wood, iron"),
+    ({"manifest": Listing(())}, "no recording of .* is listed; list one or more"),
     ({"cycles": 0}, r"data\.cycles must be a number of trials or null, got 0"),
     ({"reading": {"gaps": "ignore"}}, r"reading\.gaps must be one of refuse, missing, bridge"),
     ({"reading": {"tare_s": [1.0, 0.5]}}, r"reading\.tare_s must be \[start, end\] in seconds"),

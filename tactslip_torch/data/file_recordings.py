@@ -203,7 +203,7 @@ def _head_of(opened: Opened, path: Path, given: _Given, stated_hz: float | None 
     rate = stated or clock.sample_rate_hz
     if not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
         raise ValueError(
-            f"{path} is of {rate:g} Hz, which is no sample rate of tactile sensors, 1 Hz to 1 MHz; "
+            f"{path} is of {rate:g} Hz, and tactile sensors of 1 Hz to 1 MHz; "
             f"if its times are in another unit, say {setting('reading.time_unit')}=s, ms, us or ns"
         )
     return _Head(
@@ -261,7 +261,7 @@ def _hand_of(opened: Opened, given: _Given) -> tuple[HandLayout, Sequence[int]]:
     has = _some(own) if own else f"{num} without names"
     if rows and not is_ordered:
         lacking = [name for name, place in places.items() if place is None]
-        what = f"no channel {_some(lacking)}" if lacking else "a column that is two channels"
+        what = f"no channel {_some(lacking)}" if lacking else "two channels in one column"
         raise ValueError(f"has {what} of data.channels; it has {has}")
     how = (
         "; name its columns so, or list them in the order of the hand as "
@@ -613,6 +613,8 @@ class FileRecordings:
         self._skip_s, self._slide_s = skip_s, slide_s
         if not isinstance(manifest, Listing):
             manifest = read_manifest(manifest_of(self.root, manifest), self.root)
+        if not (manifest.entries or manifest.problems):
+            raise ValueError(f"no recording of {self.root} is listed; list one or more")
         self._files: dict[RecordingId, _File] = {}
         problems, warnings = self._look_at_all(_chosen(manifest.entries, materials, cycles))
         self.problems = (*manifest.problems, *problems)
@@ -925,10 +927,9 @@ def _chosen(
     """
     known = list(dict.fromkeys(entry.recording.material for entry in entries))
     unknown = [material for material in materials or () if material not in known]
-    if unknown and entries:
-        raise ValueError(
-            f"no recording of data.materials {', '.join(unknown)}; the set has {', '.join(known)}"
-        )
+    if entries and materials is not None and (unknown or not materials):
+        none = "data.materials is empty" if not materials else "no recording of data.materials "
+        raise ValueError(f"{none}{', '.join(unknown)}; the set has {', '.join(known)}")
     if cycles is not None and not (isinstance(cycles, int) and cycles > 0):
         raise ValueError(f"data.cycles must be a number of trials or null, got {cycles!r}")
     taken: Counter[RecordingId] = Counter()

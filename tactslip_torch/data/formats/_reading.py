@@ -92,12 +92,12 @@ def check_plausible(what: str, claimed: int, stored: int, most: int | None = Non
     """
     if claimed > max(FREE_BYTES, MOST_RATIO * stored):
         raise Refused(
-            f"{what} claims {claimed} bytes and stores {stored}, of which {MOST_RATIO} times are "
-            "believed; write it again without compression"
+            f"{what} claims {claimed} bytes and stores {stored}; at most {MOST_RATIO} times as many "
+            "are read; write it again without compression"
         )
     if most is not None and claimed > most:
         raise Refused(
-            f"{what} has {claimed} bytes, of its format at most {most} are read; convert it to .h5"
+            f"{what} has {claimed} bytes; at most {most} are read in its format; convert it to .h5"
         )
 
 
