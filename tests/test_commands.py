@@ -17,6 +17,7 @@ from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.stopping import one_line
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import RecordingId, Timeline
+from tactslip_torch.training.recipe import General
 
 BAD_INPUT = (ValueError, KeyError, TypeError, OSError, InstantiationException)
 
@@ -198,6 +199,14 @@ def test_bad_input_is_refused_before_anything_is_simulated(overrides, line, tmp_
     with pytest.raises(BAD_INPUT) as caught:
         train(config, tmp_path / "run")
     assert_one_line(caught.value, line)
+
+
+def test_a_run_that_fails_leaves_the_configuration_of_an_earlier_one(tmp_path, monkeypatch):
+    (tmp_path / "config.yaml").write_text("seed: 7\n")
+    monkeypatch.setattr(General, "fit", lambda *given, **named: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        train(composed(*TINY, f"cache={tmp_path / 'cache'}"), tmp_path)
+    assert (tmp_path / "config.yaml").read_text() == "seed: 7\n"
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def test_a_signal_is_a_line_and_a_status(number, capsys):
 
 
 STOPPED = [
-    (signal.SIGTERM, TRAIN, "config.yaml", "in the cache; start it again"),
+    (signal.SIGTERM, TRAIN, "../cache", "in the cache; start it again"),
     (signal.SIGINT, "generate materials=M1 cycles=20", "M1_paper_00.npz", "are whole"),
 ]
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,13 +73,16 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         raise ValueError(f"seed must be a whole number, got {config.seed!r}")
     L.seed_everything(config.seed, verbose=False)
     experiment = _experiment(config)
-    is_first = is_first_process()
-    if is_first:
-        save_config(config, folder)
-    metrics = common_metadata(experiment.maker, config) | run_experiment(experiment, folder)
+
+    def after_save(detector: SlipDetector) -> dict[str, Any]:
+        save_config(config, folder)  # not before: the results of an earlier run may be there
+        return experiment.alarm(detector) if experiment.alarm else {}
+
+    found = run_experiment(replace(experiment, alarm=after_save), folder)
+    metrics = common_metadata(experiment.maker, config) | found
     metrics["timing_s"]["total"] = time.perf_counter() - started
     features = metrics.pop("features")
-    if is_first:
+    if is_first_process():
         write_results(folder, metrics, features)
         write_tensorboard(folder, config, metrics)
         print_results(metrics, features)
