@@ -204,10 +204,10 @@ def test_help_comes_without_torch(line):
     assert "tactslip train +exp=quick" in done.stdout
 
 
-@pytest.mark.parametrize("name", ["c", "native", "python", "web"])
+@pytest.mark.parametrize("name", ["c", "native", "node", "python", "web"])
 def test_the_links_of_a_copied_page_lead_into_the_copy(name, tmp_path):
     copy_host(name, tmp_path)
-    for page in tmp_path.glob("*/README.md"):
+    for page in tmp_path.glob("*/*.md"):
         links = re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8"))
         assert [link for link in links if not (page.parent / link).exists()] == []
 

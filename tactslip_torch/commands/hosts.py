@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 from tactslip_torch.commands import packaged_folder
@@ -46,7 +48,7 @@ def copy_host(name: str, folder: Path) -> Path:
         for link, own in _LINKS.items():
             text = text.replace(f"]({link})", f"]({own})")
         page.write_text(text, encoding="utf-8")
-        shutil.copy(hosts_dir() / "README.md", page.with_name("options.md"))
+        page.with_name("options.md").write_text(_options(parts), encoding="utf-8")
     if name == "native":
         sources = folder / name / "src"
         sources.mkdir()
@@ -54,6 +56,17 @@ def copy_host(name: str, folder: Path) -> Path:
             if path.suffix in (".cpp", ".h"):
                 shutil.copy(path, sources)
     return folder / name
+
+
+def _options(parts: Sequence[str]) -> str:
+    """The page of all hosts, with links to those that are copied."""
+
+    def linked(link: re.Match[str]) -> str:
+        text, part = link.groups()
+        return f"[{text}](../{part}/README.md)" if part in parts else str(text)
+
+    text = (hosts_dir() / "README.md").read_text(encoding="utf-8")
+    return re.sub(r"\[([^]]*)\]\((\w+)/README\.md\)", linked, text)
 
 
 def _add_sample(page: Path) -> None:
