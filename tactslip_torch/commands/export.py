@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +33,6 @@ def export(config: DictConfig, results: Path) -> None:
     check_choice("precision", config.precision, ("auto", "float32", "float64"))
     given: Any = OmegaConf.to_container(config.native)
     with_source = given.pop("source")
-    _check_counts(given)
     if config.graph == "native":
         made = NativeFile.checked(detector, config.precision, **given)
         reason = f", as in float32 {made.why_double}" if made.why_double else ""
@@ -53,16 +50,6 @@ def export(config: DictConfig, results: Path) -> None:
     for path in export_detector(detector, folder, graphs, precision, source=source):
         print(summary(path))
     _tell_tare(detector)
-
-
-def _check_counts(given: Mapping[str, Any]) -> None:
-    """Raise ValueError unless scale and offset are numbers, and no scale is 0."""
-    for name, value in given.items():
-        for one in value if isinstance(value, list) else [value]:
-            if type(one) not in (int, float) or not math.isfinite(one):
-                raise ValueError(f"native.{name} must be a number or a list of them, got {value!r}")
-            if name == "scale" and one == 0:
-                raise ValueError(f"native.scale must not be 0, got {value!r}: it is volts a count")
 
 
 def _tell_tare(detector: SlipDetector) -> None:

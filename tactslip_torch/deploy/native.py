@@ -118,20 +118,15 @@ class NativeFile:
             offset: likewise.
 
         Raises:
-            ValueError: if the detector has no alarm settings, or a number is none of these.
+            ValueError: if the detector has no alarm settings, a number is none of these, or a scale
+                is 0.
         """
         dtype, settings = dtype_of(precision), AlarmSettings.of(detector)
         given = torch.float32 if precision == "float32" else torch.float64
         out, num_channels = _Writer(dtype), len(detector.pool.hand)
         _write_stream(out, detector, settings)
         for name, values in (("scale", scale), ("offset", offset)):
-            numbers = np.asarray(values, np.float64)
-            if numbers.shape not in ((), (num_channels,)) or not np.isfinite(numbers).all():
-                raise ValueError(
-                    f"native.{name} must be finite, one number or one for each of {num_channels} "
-                    f"channels, got {values}"
-                )
-            out.table(np.broadcast_to(numbers, num_channels))
+            out.table(np.broadcast_to(_of_converter(name, values, num_channels), num_channels))
         _write_filters(out, detector, given, settings)
         features, machine = detector.engine_tables()
         _write_plan(out, features)
@@ -208,6 +203,23 @@ class NativeFile:
             OSError: if the library is not available.
         """
         return _NativeStream(self.content)
+
+
+def _of_converter(name: str, values: float | Sequence[float], num_channels: int) -> Array:
+    """Scale or offset as float64: one number, or one a channel."""
+    try:
+        numbers = np.asarray(values)
+    except ValueError:  # lists of several lengths
+        numbers = np.empty(0)
+    is_number = numbers.dtype.kind in "iuf" and np.isfinite(numbers).all()
+    if not is_number or numbers.shape not in ((), (num_channels,)):
+        raise ValueError(
+            f"native.{name} must be a finite number, or one for each of {num_channels} channels, "
+            f"got {values!r}"
+        )
+    if name == "scale" and not numbers.all():
+        raise ValueError(f"native.scale must not be 0, got {values!r}: it is volts a count")
+    return numbers.astype(np.float64)
 
 
 def _write_stream(out: _Writer, detector: SlipDetector, settings: AlarmSettings) -> None:
