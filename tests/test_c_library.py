@@ -396,7 +396,10 @@ def test_where_float32_is_off_the_default_is_float64_and_says_why(typed, tmp_pat
         (["graph=native", "native.scale=0"], "native.scale must not be 0, got 0"),
         (["graph=native", "native.scale=[1.0,0]"], "native.scale must be .* of 24 channels, got"),
         (["graph=native", "native.scale=true"], "native.scale must be a finite number.* got True"),
-        (["graph=native", "native.offset=abc"], "native.offset must be a finite number, .* got 'abc'"),
+        (
+            ["graph=native", "native.offset=abc"],
+            "native.offset must be a finite number, .* got 'abc'",
+        ),
         (["native.scale=3e-5"], "native.scale=3e-05 .* are of graph=native"),
         (["native.source=true"], "native.source=True, .* are of graph=native"),
     ],

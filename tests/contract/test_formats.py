@@ -236,7 +236,9 @@ def test_formats_are_known_by_their_ending(tmp_path):
     assert refused(tmp_path / "a.csv", error=FileNotFoundError).startswith("no file")
     (tmp_path / "a.png").touch()
     assert "must end in .npz or " in refused(tmp_path / "a.png")
-    with pytest.raises(ValueError, match=r"must be one of npz, csv, h5, mat, parquet, mcap, got 'png'"):
+    with pytest.raises(
+        ValueError, match=r"must be one of npz, csv, h5, mat, parquet, mcap, got 'png'"
+    ):
         named_format("png")
 
 

@@ -92,8 +92,8 @@ def check_plausible(what: str, claimed: int, stored: int, most: int | None = Non
     """
     if claimed > max(FREE_BYTES, MOST_RATIO * stored):
         raise Refused(
-            f"{what} claims {claimed} bytes and stores {stored}; at most {MOST_RATIO} times as many "
-            "are read; write it again without compression"
+            f"{what} claims {claimed} bytes and stores {stored}; at most {MOST_RATIO} times as "
+            "many are read; write it again without compression"
         )
     if most is not None and claimed > most:
         raise Refused(
