@@ -212,12 +212,21 @@ def test_a_long_gap_ends_the_stream_and_begins_another(cuts, caplog):
     assert (found.number == 0).sum() == 3
     assert stream.num_gaps == 2
     assert [record.getMessage() for record in caplog.records] == [
-        "the stream begins anew at 0.9005 s, behind a gap",
-        "the stream begins anew at 3601.2505 s, behind a gap",
+        "the stream begins anew at 0.9005 s, behind a gap (time_s is in seconds)",
+        "the stream begins anew at 3601.2505 s, behind a gap (time_s is in seconds)",
     ]
     stream.reset()
     assert stream.num_gaps == 0
     assert_same(in_pieces(stream, samples), in_pieces(stream_of(), samples))
+
+
+def test_times_in_milliseconds_are_one_warning(caplog):
+    stream, times_ms = stream_of(), np.arange(1000) * 1000 / RATE
+    caplog.set_level(logging.WARNING)
+    for first in range(0, 1000, 100):
+        stream.push(signal(100, 6).T, times_ms[first : first + 100])
+    assert stream.num_gaps == 999
+    assert len(caplog.records) == 1
 
 
 BACK = [0.2495, 0.0, -1e12, *(np.array([0.25, *then]) for then in ((0.2505, 0.2505), (-7.0, 9.0)))]
@@ -272,6 +281,17 @@ def test_samples_may_come_in_any_form(form):
     found = joined_decisions([stream.push(FORMS[form](samples.T)), stream.flush()])
     assert_same(found, expected)
     assert not found.score.requires_grad
+
+
+def test_masked_samples_are_missing():
+    samples = signal(1000, 6, torch.float32).double().T.numpy()
+    masked = np.ma.array(samples, mask=False)
+    masked[300:400, 1] = np.ma.masked
+    stream, other = stream_of(), stream_of()
+    found = joined_decisions([stream.push(masked), stream.flush()])
+    expected = joined_decisions([other.push(masked.filled(np.nan)), other.flush()])
+    assert_same(found, expected)
+    assert found.channels_lost[:, 1].any()
 
 
 @pytest.mark.parametrize(

@@ -54,11 +54,12 @@ class StreamingDetector:
     pushes. A decision needs the samples of its bin and ``look_ahead`` more, and is returned by the
     push that brings the last of them. Not for several threads at once.
 
-    **Missing samples** are NaN. Two more count as missing: a gap in the times of samples, up to
-    ``settings.hold_s``, and a channel that keeps one value for too long. Decisions that need
-    missing samples of a channel are made without it. With too few channels they are not valid, and
-    do not change the rule (``features.sensing``). A longer gap ends the stream, as ``flush`` does,
-    and begins another, from decision number 0; ``num_gaps`` counts them, and the log warns.
+    **Missing samples** are NaN, or masked (``numpy.ma``). Two more count as missing: a gap in the
+    times of samples, up to ``settings.hold_s``, and a channel that keeps one value for too long.
+    Decisions that need missing samples of a channel are made without it. With too few channels they
+    are not valid, and do not change the rule (``features.sensing``). A longer gap ends the stream,
+    as ``flush`` does, and begins another, from decision number 0; ``num_gaps`` counts them, and the
+    log warns, but not again before a decision.
 
     Args:
         detector: fitted on this hand.
@@ -167,8 +168,9 @@ class StreamingDetector:
 
         Args:
             samples: what came next, in volts.
-            time_s: when the first sample was taken, or each; on one clock, good to a quarter of a
-                sample. Without, samples follow the last ones, and the first of all is at 0.
+            time_s: when the first sample was taken, or each, in seconds; on one clock, good to a
+                quarter of a sample. Without, samples follow the last ones, and the first of all is
+                at 0.
 
         Shape:
             - samples: ``[n, C]``, any floating dtype, ``n`` from 0: a row is an instant
@@ -247,6 +249,8 @@ class StreamingDetector:
         if isinstance(samples, Tensor):  # NumPy does not know all of their dtypes
             kind = self.dtype if samples.is_floating_point() else samples.dtype
             samples = samples.detach().to("cpu", kind).numpy()
+        elif isinstance(samples, np.ma.MaskedArray) and samples.dtype.kind == "f":
+            samples = samples.filled(np.nan)
         array, names = np.asarray(samples), self.detector.pool.hand.names
         if array.ndim != 2 or array.shape[1] != len(names):
             raise ValueError(
@@ -260,7 +264,9 @@ class StreamingDetector:
 
     def _begin_anew(self, time_s: float) -> Decisions:
         """Another stream behind a gap."""
-        _LOG.warning("the stream begins anew at %.4f s, behind a gap", time_s)
+        if self._number or not self.num_gaps:  # not of each sample, where times are no seconds
+            text = "the stream begins anew at %.4f s, behind a gap (time_s is in seconds)"
+            _LOG.warning(text, time_s)
         decisions = self.flush()
         self.num_gaps += 1
         return decisions
