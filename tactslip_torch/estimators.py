@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from statistics import mean
@@ -370,6 +371,9 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             ValueError: if there is no rate, or one beside ``features``; for other shapes, NaN, a
                 single class, labels that do not say which is slip, or groups of which no two parts
                 with all labels can be made.
+
+        Warns:
+            UserWarning: if no feature differs between windows, as of constant X.
         """
         features = self._described_by()
         windows = features._lay_out(X)
@@ -399,6 +403,9 @@ class SlipClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         pool, (group, names) = features._pool, _groups(y, groups)
         with torch.no_grad():
             x = pool(features._bins(windows), torch.float64)
+            if torch.equal(x, x[:1].expand_as(x)):
+                what = "no feature of X differs between windows, so nothing is learned"
+                warnings.warn(f"{what}; check that X holds samples", UserWarning, stacklevel=2)
             if is_binary:
                 is_slip = torch.from_numpy(np.asarray(y == self.slip_label_))
                 fit = _fitted(recipe, pool, x, is_slip, group, names)

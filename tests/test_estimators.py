@@ -185,6 +185,12 @@ def test_parameters_are_checked_in_the_fit(data: Any, options: Any, message: str
         SlipClassifier(features=features_of(**options)).fit(*data)
 
 
+def test_windows_that_do_not_differ_are_a_warning(data: Any) -> None:
+    X, y, groups = data
+    with pytest.warns(UserWarning, match="no feature of X differs between windows"):
+        SlipClassifier(features=features_of()).fit(np.ones_like(X), y, groups)
+
+
 def test_what_the_fit_is_given_is_checked(data: Any) -> None:
     X, y, groups = data
     model = SlipClassifier(features=features_of())
