@@ -251,10 +251,20 @@ LINES = {
         [[1, 2, 3, 4], NAN, [1, 2, 3, 4]],
         "anew, with the columns PVDF2",
     ),
-    "other names": ("a,b,c,d\n1,2,3,4\n", [[1, 2, 3, 4]], "no number: 'a,b,c,d'"),
+    "no names": ("Booting from flash now\n1,2,3,4\n", [[1, 2, 3, 4]], "no number: 'Booting"),
     "names twice": ("SG1,SG1,SG2,PVDF1,PVDF2\n1,2,3,4\n", [[1, 2, 3, 4]], "has 5 values"),
 }
 """What a device writes, the rows that it is, and a part of what is told."""
+
+
+@pytest.mark.parametrize("line", ["a,b,c,d", "SG1;SG2;PVDF1;x", "'a'\t'b'\t'c'\t'd'"])
+def test_names_of_other_columns_are_refused(line):
+    reader = Frames().reader(NAMES, RATE)
+    with pytest.raises(ValueError, match=r"names its columns .*PVDF2 of the detector; .*frame.col"):
+        reader.feed(f"{line}\n1,2,3,4\n".encode())
+    for names, frames in ((NAMES, Frames(columns=NAMES)), (("ch1", "ch2", "ch3", "ch4"), Frames())):
+        found, _ = fed(frames.reader(names, RATE), [f"{line}\n1,2,3,4\n".encode()])
+        np.testing.assert_array_equal(found, [[1, 2, 3, 4]])
 
 
 @pytest.mark.parametrize("case", LINES)

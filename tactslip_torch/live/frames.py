@@ -38,6 +38,7 @@ _MOST_OTHERS = 64  # columns of a header beside the channels
 _MOST_MISSING_S = 10.0  # by a counter; what lacks more is another stream
 _BETWEEN = re.compile(r"[ \t]{0,99}[,;][ \t]{0,99}| *\t *| +")
 """Between the values of a line; what is empty between two of them is missing."""
+_NUMBERED = re.compile(r"(ch|C)\d+")  # names of channels of recordings that have none
 _MARKS = re.compile(r"[,;\t]")
 """Between names, which may have blanks within where there are such marks."""
 
@@ -55,7 +56,8 @@ class Frames:
         columns: names of the values of an instant, in order; other names than the detector's
             channels are left out, ``"counter"`` counts lines of text. ``None``: the channels in the
             order of the detector, or as a line names them, whatever their case and the unit in
-            brackets behind them. Such a line may come again, as when a device restarts.
+            brackets behind them. Such a line may come again, as when a device restarts; one of
+            other names before the first sample is refused.
         scale: from a value to the detector's unit, one for all or one for each of its channels.
         offset: added to that.
         separator: between the values of a line; ``None``: blanks, tabs, commas and semicolons.
@@ -272,6 +274,8 @@ class _LineReader(FrameReader):
         wrong = [part for part in parts if part and not NUMBER.fullmatch(part)]
         if wrong and self._is_header(line):
             return
+        if len(wrong) == len(parts) == wanted and not self._has_begun:
+            self._refuse_others(line)
         if is_first and self._begins_inside:  # a part of a line may look like a whole one
             if wrong:
                 self._lose(line, "the first line may be cut")
@@ -320,6 +324,23 @@ class _LineReader(FrameReader):
             self.forget()
             self._set_columns(cells)
         return True
+
+    def _refuse_others(self, line: str) -> None:
+        """Raise ValueError if a line names as many columns as there are, but not the channels.
+
+        Not where somebody says what the columns are, and not of channels that only have numbers.
+        """
+        is_known = self._frames.columns is not None or all(map(_NUMBERED.fullmatch, self._channels))
+        if is_known or not (self._frames.separator or _MARKS.search(line)):  # it may be a sentence
+            return
+        cells = [part.strip("\"'") for part in self._parts(line, _MARKS)]
+        lacking = [name for name in self._channels if place_of(name, cells) is None]
+        if len(set(cells)) == len(cells) and lacking:
+            raise ValueError(
+                f"the sender names its columns {', '.join(cells[:8])}, but has no "
+                f"{', '.join(lacking[:5])} of the detector; name them so, or say by frame.columns "
+                "which channel each column is"
+            )
 
     def _lose(self, line: str, why: str) -> None:
         self._pass_over(len(line) + 1, f"{why}: {line[:40]!r}")
