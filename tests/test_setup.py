@@ -307,6 +307,32 @@ def test_numbers_of_rows_are_no_milliseconds(tmp_path):
     assert propose(found).settings["data"]["reading"].get("time_unit") != "ms"
 
 
+def test_a_time_that_counts_the_rows_asks_for_the_rate(tmp_path):
+    found = slips(tmp_path, time=np.arange(400), slip=[0] * 200 + [1] * 200)
+    question, *_ = propose(found).questions
+    assert (question.name, question.flag, question.default) == ("rate_hz", "--rate HZ", "")
+    assert "column time counts rows: 0, 1, 2; if in seconds, add --time-unit s" in question.text
+    data = propose(found, Answers(rate_hz=100.0)).settings["data"]
+    assert (data["reading"]["time"], data["reading"]["sample_rate_hz"]) == (None, 100.0)
+    assert [row["name"] for row in data["channels"]] == ["a", "b"]
+    told = Answers(time_unit="s")
+    reading = propose(look(tmp_path, told), told).settings["data"]["reading"]
+    assert (reading["time"], reading["sample_rate_hz"]) == ("time", 1.0)
+
+
+def test_a_column_that_is_taken_for_labels_can_be_left_out(tmp_path):
+    for name in ("slip/cup_1", "slip/box_1", "hold/cup_1", "hold/box_1"):
+        write(tmp_path / f"{name}.csv", ["a", "b"], slip_sensor=[0] * 200 + [1] * 200)
+    assert propose(look(tmp_path)).settings["labels"]["column"] == "slip_sensor"
+    done = propose(look(tmp_path), Answers(column="none"))
+    assert not done.questions
+    assert "column" not in done.settings["labels"]
+    assert done.settings["data"]["labels"] == {"hold": "non-slip", "slip": "slip"}
+    slips(tmp_path / "flat", slip_sensor=[0] * 200 + [1] * 200)
+    question, *_ = propose(look(tmp_path / "flat"), Answers(column="none")).questions
+    assert question.text.startswith("Nothing tells where slip is: no column, no table")
+
+
 @pytest.mark.parametrize(
     ("rows", "said"),
     [

@@ -218,8 +218,9 @@ def main() -> None:
     parser.add_argument("--time-unit", choices=("s", "ms", "us", "ns"), help="of the times")
     parser.add_argument("--units", help="of the samples, such as N or V")
     parser.add_argument(
-        "--column", metavar="NAME", help="the column that says of each sample whether it is slip"
-    )
+        "--column", metavar="NAME",
+        help="the column that says of each sample whether it is slip; none: no column says it",
+    )  # fmt: skip
     parser.add_argument(
         "--over", metavar="NUMBER", help="slip is where the magnitude of that column is above it"
     )

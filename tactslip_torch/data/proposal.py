@@ -75,7 +75,7 @@ class Answers:
         time: the column of times.
         time_unit: of them.
         pattern: of the names of files, as ``folder.guessed`` reads it.
-        column: that has a label for each sample.
+        column: that has a label for each sample; ``"none"``: no column has.
         over: slip is where that column is above it.
         words: of names, folders or the column, and whether each is slip; where words of one side
             alone are given, all others that are not known are the other.
@@ -173,6 +173,7 @@ class _Table:
         rate_hz: that the file states.
         delimiter: of a text.
         is_native: whether this package wrote it.
+        row_number: what is called a time and counts the rows, in words; ``""``: nothing.
     """
 
     file: str
@@ -185,6 +186,7 @@ class _Table:
     rate_hz: float | None = None
     delimiter: str | None = None
     is_native: bool = False
+    row_number: str = ""
 
     @property
     def own_rate_hz(self) -> float | None:
@@ -287,7 +289,11 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
     time: str | int | None = answers.time
     if time not in samples:
         time = next((name for name in samples if isinstance(name, str) and is_time(name)), None)
-    if time is not None:
+    row_number = ""
+    if times is not None and unit is None and len(times) > 2 and (np.diff(times) == 1).all():
+        row_number, times = "the times" if time is None else f"column {time}", None
+        samples.pop(time, None)
+    elif time is not None:
         samples.pop(time)
         is_told = answers.time_unit is not None or time_unit_in(str(time)) is not None
         if times is not None and unit in (None, "s") and not is_told and _steps_are_ms(times):
@@ -298,7 +304,9 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
             times = samples.pop(time) * SECONDS[unit]
     file, kept = path.relative_to(folder).as_posix(), (*samples, *words)
     is_native = own is not None
-    return _Table(file, kept, samples, words, times, time, unit, rate_hz, delimiter, is_native)
+    return _Table(
+        *(file, kept, samples, words, times, time, unit, rate_hz, delimiter, is_native, row_number)
+    )
 
 
 def _steps_are_ms(times: _Numbers) -> bool:
@@ -502,13 +510,16 @@ def _propose_rate(found: Look, given: Answers, draft: Proposal) -> float:
         how = "stated" if given.time else "by its name" if is_time(str(name)) else "it rises evenly"
         draft.tell("time", f"column {name}{unit}", how)
     if not has_times:
-        if wrong or not table.rate_hz:
+        no_times = "the files have no times"
+        if table.row_number:
+            no_times = f"{table.row_number} counts rows: 0, 1, 2; if in seconds, add --time-unit s"
+        if wrong or table.row_number or not table.rate_hz:
             why = "the times are uneven; samples are taken as even"
-            draft.set(f"{reading}.time", None, why if wrong else "the files have no times")
+            draft.set(f"{reading}.time", None, why if wrong else no_times)
         rate_hz = given.rate_hz or (rates[0] if rates and not wrong else 0.0)
         if not rate_hz:
             default, told = _likely_rate(found.tables)
-            why = f"the times are uneven ({wrong})" if wrong else "the files have no times"
+            why = f"the times are uneven ({wrong})" if wrong else no_times
             text = f"How many samples a second does each channel have? ({why}{told})"
             draft.ask("rate_hz", text, "--rate HZ", default)
             return 0.0
@@ -578,6 +589,8 @@ class _Label(NamedTuple):
 def _label_column(found: Look, given: Answers) -> _Label | None:
     """The column that says of each sample whether it is slip, if one does."""
     names = found.tables[0].names
+    if given.column == "none":
+        return None
     if given.column is not None:
         wanted: str | int = int(given.column) if given.column.isdecimal() else given.column
         if wanted not in names:
@@ -980,8 +993,9 @@ def _words_of_names(found: Look, given: Answers, draft: Proposal) -> dict[str, b
         )
     others = [file for file in found.problems if file.endswith(".csv") and "/" not in file]
     no_table = f"; {others[0]} is none, or names a file that is no recording" if others else ""
+    no_column = "no column" if given.column == "none" else _constant_label(found)
     nothing = (
-        f"Nothing tells where slip is: {_constant_label(found)}, no table of intervals (a CSV with "
+        f"Nothing tells where slip is: {no_column}, no table of intervals (a CSV with "
         f"the columns file, which names a recording, start and end{no_table})"
     )
     if not choices:
