@@ -292,8 +292,7 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
     row_number = ""
     if times is not None and unit is None and len(times) > 2 and (np.diff(times) == 1).all():
         row_number, times = "the times" if time is None else f"column {time}", None
-        samples.pop(time, None)
-    elif time is not None:
+    if time is not None:
         samples.pop(time)
         is_told = answers.time_unit is not None or time_unit_in(str(time)) is not None
         if times is not None and unit in (None, "s") and not is_told and _steps_are_ms(times):

@@ -274,8 +274,6 @@ class _LineReader(FrameReader):
         wrong = [part for part in parts if part and not NUMBER.fullmatch(part)]
         if wrong and self._is_header(line):
             return
-        if len(wrong) == len(parts) == wanted and not self._has_begun:
-            self._refuse_others(line)
         if is_first and self._begins_inside:  # a part of a line may look like a whole one
             if wrong:
                 self._lose(line, "the first line may be cut")
@@ -283,6 +281,8 @@ class _LineReader(FrameReader):
             what = f"a line has {counted(len(parts), 'value')}, expected {wanted}"
             self._lose(line, f"{what}, {names[0]} to {names[-1]}; frame.columns says which")
         elif len(wrong) == wanted:
+            if not self._has_begun:
+                self._refuse_others(line)
             self._lose(line, "a line holds no number")
         else:
             if wrong:
