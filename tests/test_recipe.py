@@ -190,6 +190,7 @@ BAD = [
     (Paper, {"feature_filter": {"kinds": "SG"}}, "recipe.feature_filter: unknown 'kinds'"),
     (Paper, {"feature_filter": "SG"}, r"recipe.feature_filter must be like .*, got 'SG'"),
     (General, {"views": ("pooled", "all")}, r"recipe.views must be one of .*, got 'all'"),
+    (General, {"views": ["foo"]}, r"recipe.views must be one of .*, got 'foo'"),
     (General, {"views": ()}, "recipe.views must be some of simple, channel, pooled, got none"),
     (General, {"threshold": "most"}, r"recipe.threshold must be one of .*, got 'most'"),
     (General, {"penalties": float("inf")}, "recipe.penalties must be finite"),

@@ -359,10 +359,10 @@ class General(_Recipe):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.views_in_order:
-            raise ValueError(f"recipe.views must be some of {', '.join(VIEWS)}, got none")
         for view in _several(self.views):
             check_choice("recipe.views", view, VIEWS)
+        if not self.views_in_order:
+            raise ValueError(f"recipe.views must be some of {', '.join(VIEWS)}, got none")
         check_choice("recipe.threshold", self.threshold, tuple(THRESHOLDS))
         if self.num_features is not None:
             check_number("recipe.num_features", self.num_features, whole=True)
