@@ -131,12 +131,12 @@ def memory_sizes(onset: OnsetClassifier) -> list[int]:
 
 
 def memory_shapes(onset: OnsetClassifier) -> list[tuple[int, int]]:
-    """Rows kept of log powers, products, means, sizes of steps and scaled columns."""
+    """Rows kept of power with products, means, sizes of steps and scaled columns."""
     evidence = onset.evidence
     num_slow, num_steps = len(evidence.hand.slow), evidence.step_matrix.shape[1]
+    num_fast = len(evidence.hand.fast) + evidence.pairs.shape[1]
     return [
-        (evidence.delay, evidence.num_filters * len(evidence.hand.fast)),
-        (evidence.delay, evidence.num_filters * evidence.pairs.shape[1]),
+        (evidence.delay, evidence.num_filters * num_fast),
         (len(evidence.step_matrix) - 1, num_slow),
         (evidence.delay, num_steps * num_slow),
         (max(onset.lags, default=0), evidence.num_columns),

@@ -62,15 +62,15 @@ def stream_graph(
     threshold that of the settings counts. Where nothing can be decided, next to nothing is
     computed.
 
-    State, in float64: samples and decisions so far, where the run of positive ratios began, whether
-    an alarm stands, decisions in a row that were low, decisions since the last alarm, decisions in
-    a row that are not valid, the last sample of each channel, how many were equal to it, and the
-    memory of the rule.
+    State, in float64: samples and decisions so far, where the run of positive ratios began,
+    decisions in a row that are not valid, and the memory of the rule; whether an alarm stands,
+    decisions in a row that were low, and decisions since the last alarm; the last sample of each
+    channel, and where those that are equal to it began, counted from the next.
 
     With an onset classifier there are ``onset_score``, float64, ``by_onset`` and ``hint`` too, the
-    threshold is the classifier's, and behind the memory of the rule the state has decisions of the
-    alarm in a row that are not valid, the last bin's columns (``OF_LAST_BIN``, and the channels
-    that were lost) and the memory of blocks (``_onset_scores``).
+    threshold is the classifier's, and behind that the state has decisions of the alarm in a row
+    that are not valid, the last bin's columns (``OF_LAST_BIN``, and the channels that were lost)
+    and the memory of blocks (``memory_sizes``).
 
     Args:
         detector: that scores the bins.
@@ -91,21 +91,31 @@ def stream_graph(
     before = 0.0 if onset is None else math.nan  # what no stream has is no evidence
     nothing = graph.constant(np.full((timing.tail, num_channels), before), dtype)
     no_sample = [math.nan] * num_channels + [0.0] * num_channels
-    starts = [0, 0, 0, *_LATCH_START, 0, *no_sample, *rule_start(settings.rule)]
-    start = graph.constant(starts, F64)
+    starts = [[0.0], [0.0, 0.0, 0.0, *rule_start(settings.rule)], _LATCH_START, no_sample]
+    sizes = list(map(len, starts))
     if onset is not None:
-        no_bin = [0.0, *([math.nan] * 3), 0.0, 0.0, math.inf, *([0.0] * num_channels)]
-        start, given = graph.concat(start, graph.constant(no_bin, F64), axis=0), state
-        small = timing.state_size - sum(memory_sizes(onset))
-        state = given.slice(0, small, 0)
-    else:
-        small = timing.state_size
-    state = graph.concat(state, start, axis=0).slice(0, small, 0)
-    marked, stuck = _without_stuck(
-        samples, state.slice(7, 7 + 2 * num_channels, 0), detector.sensing.stuck_samples
+        no_bin = [*([math.nan] * 3), 0.0, 0.0, math.inf, *([0.0] * num_channels)]
+        starts += [[0.0], no_bin]
+        sizes += [1, len(no_bin), *filter(None, memory_sizes(onset))]
+
+    def begun() -> list[Value]:
+        known = [graph.constant(start, F64) for start in starts]
+        nan = numpy_helper.from_array(np.array([np.nan]))  # on which no score rests
+        memory = [
+            graph.op("ConstantOfShape", graph.axes(size), dtype=F64, value=nan)
+            for size in sizes[len(starts) :]
+        ]
+        if memory:  # neither lost nor known blocks
+            memory[:2] = [graph.constant([0.0], F64)] * 2
+        return known + memory
+
+    before, of_bins, of_latch, of_samples, *of_onset = graph.if_(
+        state.length(0) > 0, lambda: state.split(sizes, 0), begun
     )
+    num = samples.length(0).cast(F64)
+    marked, stuck = _without_stuck(samples, num, of_samples, detector.sensing.stuck_samples)
     held = graph.concat(nothing, tail, marked, axis=0)
-    seen = state.slice(0, 1, 0) + samples.length(0).cast(F64)
+    seen, made = before + num, of_bins.slice(0, 1, 0)
     decided = ((seen + float(timing.hop - timing.first)) / float(timing.hop)).floor().clamp(min=0.0)
     if timing.frame > timing.first:
         decided = graph.where(seen >= float(timing.frame), decided, 0.0)
@@ -126,7 +136,7 @@ def stream_graph(
         known = graph.concat(threshold, graph.constant([own], F64), axis=0)
         return known.slice(0, 1, 0).cast(of_dtype)
 
-    def bins(made: Value) -> tuple[Value, Scored, Value]:
+    def bins() -> tuple[Value, Scored, Value]:
         """Number, scores and ratios of the next bins; a ratio counts where the score is valid."""
         places = _count_up((decided - made).cast(I64))
         number = places.cast(F64) + made
@@ -136,10 +146,9 @@ def stream_graph(
         llr: Any = settings.calibration.llr(known)
         return number, scored, llr.clamp(-LARGEST, LARGEST)
 
-    def gathered(
-        number: Value, scored: Scored, llr: Value, run: Value, of_rule: Value, lost: Value
-    ) -> list[Value]:
-        """Statistics, where runs of positive ratios began, and what rule and ``lost`` are then."""
+    def gathered(number: Value, scored: Scored, llr: Value) -> tuple[Value, Value, Value]:
+        """Statistics, where runs of positive ratios began, and what is kept of bins then."""
+        _, run, lost, of_rule = of_bins.split([1, 1, 1, len(rule_start(settings.rule))], 0)
 
         def simply() -> list[Value]:
             statistic, after = _statistic_of(settings.rule, llr, of_rule)
@@ -151,12 +160,22 @@ def stream_graph(
             is_end = ((llr <= 0.0) & scored.is_valid) | gaps.is_over
             return [statistic, _latest(is_end, run, number + 1.0), after, gaps.lost_after]
 
-        return graph.if_(_is_whole(scored.is_valid, lost), simply, with_gaps)
+        is_whole = _is_whole(scored.is_valid, lost)
+        statistic, runs, after, now_lost = graph.if_(is_whole, simply, with_gaps)
+        return statistic, runs, graph.concat(decided, _last(runs), now_lost, after, axis=0)
 
     def raised(
-        statistic: Value, high: Value, number: Value, of_latch: Value, valid: Value, lost: Value
+        statistic: Value, high: Value, number: Value, valid: Value, lost: Value
     ) -> list[Value]:
-        """Alarms, whether one stands, and what latch and ``lost`` are then."""
+        """Alarms, whether one stands, and what latch and ``lost`` are then.
+
+        Next to nothing is to be done while all is valid and low, and no alarm stands.
+        """
+        is_whole, is_on = _is_whole(valid, lost), of_latch.slice(0, 1, 0) > 0.0
+
+        def quietly() -> list[Value]:
+            none, since = statistic >= high, graph.constant([0, 0, 1], F64)
+            return [none, none, of_latch + since * number.length(0).cast(F64), lost]
 
         def simply() -> list[Value]:
             return [*_latched(statistic, high, number, of_latch, *latch_times), lost]
@@ -165,7 +184,11 @@ def stream_graph(
             gaps = _Gaps.of(valid, number, lost, most_lost(window, hold, decision_samples))
             return [*gaps.latched(statistic, high, number, of_latch, *latch_times), gaps.lost_after]
 
-        return graph.if_(_is_whole(valid, lost), simply, with_gaps)
+        return graph.if_(
+            is_whole & (statistic.amax(0, keepdim=True) < high) & ~is_on,
+            quietly,
+            lambda: graph.if_(is_whole, simply, with_gaps),
+        )
 
     def only_valid(value: Any, scored: Scored) -> Value:
         return graph.where(scored.is_valid, value, math.nan)
@@ -174,15 +197,12 @@ def stream_graph(
         return probability(ratio, settings.slip_share)
 
     most = most_lost(window, hold, timing.hop)
-    sizes_before = [1, 1, 1, 3, 1, 2 * num_channels, len(rule_start(settings.rule))]
 
     def decide() -> list[Value]:
-        parts = graph.ops("Split", state, graph.axes(*sizes_before), dtypes=[F64] * 7, axis=0)
-        _, made, run, of_latch, lost, _, of_rule = parts
-        number, scored, llr = bins(made)
-        high = level(settings.threshold, dtype)
-        statistic, runs, after, _ = gathered(number, scored, llr, run, of_rule, lost)
-        alarm, on, memory, lost = raised(statistic, high, number, of_latch, scored.is_valid, lost)
+        number, scored, llr = bins()
+        high, lost = level(settings.threshold, dtype), of_bins.slice(2, 3, 0)
+        statistic, runs, after = gathered(number, scored, llr)
+        alarm, on, memory, _ = raised(statistic, high, number, scored.is_valid, lost)
         return [
             scored.score,
             only_valid(stated(llr), scored),
@@ -193,7 +213,7 @@ def stream_graph(
             on,
             *_times_s(number, runs, settings, timing, rate_hz),
             scored.channels_lost,
-            graph.concat(seen, decided, _last(runs), memory, lost, stuck, after, axis=0),
+            graph.concat(seen, after, memory, stuck, axis=0),
         ]
 
     def nothing_made() -> list[Value]:
@@ -203,20 +223,16 @@ def stream_graph(
         return empty
 
     def wait() -> list[Value]:
-        rest = state.slice(7 + 2 * num_channels, END, 0)
-        return [*nothing_made(), graph.concat(seen, state.slice(1, 7, 0), stuck, rest, axis=0)]
+        return [*nothing_made(), graph.concat(seen, of_bins, of_latch, stuck, axis=0)]
 
     def join(onset: OnsetClassifier) -> list[Value]:
         """Decisions a hop of the classifier apart, from its scores and the last bin by then."""
-        num_kept = len(OF_LAST_BIN) + num_channels
-        sizes = graph.axes(*sizes_before, 1, num_kept)
-        parts = graph.ops("Split", state, sizes, dtypes=[F64] * 9, axis=0)
-        before, made, run, of_latch, lost, _, of_rule, alarm_lost, last_bin = parts
-        memory = _onset_memory(given, small, onset)
+        alarm_lost, last_bin, *memory = of_onset
+        last_bin = last_bin.unsqueeze(0)
 
         def decide_bins() -> list[Value]:
-            number, scored, llr = bins(made)
-            statistic, runs, after, now_lost = gathered(number, scored, llr, run, of_rule, lost)
+            number, scored, llr = bins()
+            statistic, runs, after = gathered(number, scored, llr)
             unwaiting = replace(timing, frame=0)
             onset_s = _times_s(number, runs, settings, unwaiting, rate_hz)[1]
             columns = (
@@ -229,58 +245,45 @@ def stream_graph(
             )
             of_bins = [x.cast(F64).unsqueeze(1) for x in columns]
             made_rows = graph.concat(*of_bins, scored.channels_lost.cast(F64), axis=1)
-            rows = graph.concat(last_bin.unsqueeze(0), made_rows, axis=0)
-            return [rows, decided, _last(runs), after, now_lost]
+            return [graph.concat(last_bin, made_rows, axis=0), after]
 
-        rows, *of_bins = graph.if_(
-            decided > made, decide_bins, lambda: [last_bin.unsqueeze(0), made, run, of_rule, lost]
-        )
+        rows, now_of_bins = graph.if_(decided > made, decide_bins, lambda: [last_bin, of_bins])
         hop, of_bin = float(onset.evidence.hop_samples), float(timing.hop)
         hops, first = (seen / hop).floor(), (before / hop).floor()
 
         def next_state(of_latch: Value, alarm_lost: Value, memory: Sequence[Value]) -> Value:
-            now_decided, run, after, lost = of_bins
-            kept = (seen, now_decided, run, of_latch, lost, stuck, after, alarm_lost)
-            return graph.concat(*kept, _last(rows).squeeze(0), *memory, axis=0)
+            kept = (seen, now_of_bins, of_latch, stuck, alarm_lost, _last(rows).reshape(-1))
+            return graph.concat(*kept, *memory, axis=0)
 
         def decide_hops() -> list[Value]:
-            places = _count_up((hops - first).cast(I64))
-            number = places.cast(F64) + first
-            origin = first * hop - seen - float(onset.evidence.context)  # counted from the end
-            x = held.slice(origin.cast(I64), END, 0)
-            most_blocks = most_lost(onset.evidence.context + int(hop), hold, int(hop))
-            onset_score, after = _onset_scores(x, places, memory, onset, most_blocks)
-            by_onset = onset_score >= level(onset.threshold, F64)
+            number = _from_to(first, hops)
             samples = (number + 1.0) * hop
-            last = ((samples - float(timing.first)) / of_bin).floor()
+            most_blocks = most_lost(onset.evidence.context + int(hop), hold, int(hop))
+            onset_score, after = _onset_scores(held, samples - seen, memory, onset, most_blocks)
+            by_onset = onset_score >= level(onset.threshold, F64)
+            num_bins = ((samples + (of_bin - float(timing.first))) / of_bin).floor()
             if timing.frame > timing.first:
-                last = graph.where(samples >= float(timing.frame), last, -1.0)
-            place = (last - made + 1.0).clamp(min=0.0).cast(I64)  # row 0 is what was known before
+                num_bins = graph.where(samples >= float(timing.frame), num_bins, 0.0)
+            place = (num_bins - made).clamp(min=0.0).cast(I64)  # row 0 is what was known before
             at_hop = graph.op("Gather", rows, place, axis=0)
-            score, stated, statistic, valid, in_range, onset_s = (
-                at_hop[..., i] for i in range(len(OF_LAST_BIN))
-            )
-            statistic, time_s = statistic.cast(dtype), samples / rate_hz
+            given, flags, time_s = at_hop.cast(dtype), at_hop.cast(BOOL), samples / rate_hz
             is_known = onset_score > NOTHING_YET
             hinted = onset_score >= onset.hint
             if math.isfinite(onset.hint):
                 hinted |= by_onset  # as a threshold that is given may be below it
-            is_high = by_onset.cast(F64)
-            one = graph.constant([1.0], F64)
-            alarm, on, of_alarm, now_lost = raised(
-                is_high, one, number, of_latch, is_known, alarm_lost
-            )
+            high = level(onset.threshold, F64)
+            alarm, on, of_alarm, now_lost = raised(onset_score, high, number, is_known, alarm_lost)
             return [
-                score.cast(dtype),
-                stated.cast(dtype),
-                statistic,
-                valid.cast(BOOL) | is_known,
-                in_range.cast(BOOL),
+                given[..., 0],
+                given[..., 1],
+                given[..., 2],
+                flags[..., 3] | is_known,
+                flags[..., 4],
                 alarm,
                 on,
                 time_s,
-                graph.where(by_onset, time_s - onset.lead_s, onset_s).minimum(time_s),
-                at_hop.slice(len(OF_LAST_BIN), END, 1).cast(BOOL),
+                graph.where(by_onset, time_s - onset.lead_s, at_hop[..., 5]).minimum(time_s),
+                flags[..., len(OF_LAST_BIN) :],
                 onset_score,
                 by_onset,
                 hinted,
@@ -293,7 +296,7 @@ def stream_graph(
         return graph.if_(hops > first, decide_hops, wait_for_hop)
 
     if onset is None:
-        *made, next_state = graph.if_(decided > state.slice(1, 2, 0), decide, wait)
+        *made, next_state = graph.if_(decided > made, decide, wait)
     else:
         *made, next_state = join(onset)
     for name, value in zip(outputs, made, strict=True):
@@ -371,128 +374,97 @@ def _times_s(
     return waited_s, waited_s - (time_s - onset_s)
 
 
-def _without_stuck(samples: Value, known: Value, most: int) -> tuple[Value, Value]:
+def _without_stuck(samples: Value, num: Value, known: Value, most: int) -> tuple[Value, Value]:
     """Samples with NaN where a channel is stuck (``StuckChannels``), and what is kept.
 
     Args:
         samples: that came next.
-        known: the last sample of each channel, and how many were equal to it, one behind the other.
+        num: how many, ``[1]``, float64.
+        known: the last sample of each channel, and where those that are equal to it began, counted
+            from the next sample; one behind the other.
         most: equal samples in a row that are let pass.
 
     Shape:
         - samples: ``[n, C]``, n may be 0; known: ``[2 C]``, float64
     """
     graph = samples.graph
-    num = samples.length(0)
+    last, began = known.reshape(2, -1).split([1, 1], 0)
+    last = last.cast(samples.dtype)
+    rows = graph.concat(last, last, samples, axis=0)
+    is_same = rows.slice(1, END, 0).eq(rows.slice(0, -1, 0))  # [1 + n, C]
+    place = _from_to(graph.constant([-1.0], F64), num).unsqueeze(1)
+    now_began = graph.where(is_same, began, place).amax(0, keepdim=True) - num
 
-    def mark() -> list[Value]:
-        sizes = graph.op("Div", known.length(0), graph.axes(2))
-        last, run = (
-            each.unsqueeze(0) for each in (known.slice(0, sizes, 0), known.slice(sizes, END, 0))
-        )
-        before = graph.concat(last.cast(samples.dtype), samples.slice(0, -1, 0), axis=0)
-        is_new = ~samples.eq(before)
-        places = (_count_up(num).cast(F64) + 1.0).unsqueeze(1)  # [n, 1]
-        counted = num.cast(F64)
-        began = graph.where(is_new, places, 0.0).amax(0, keepdim=True)
-        run_after = graph.where(began > 0.0, counted + 1.0 - began, run + counted)
+    def marked() -> list[Value]:
+        num_new = (~is_same).cast(I64).cumsum(0)
+        passed = place.slice(1, END, 0) + 1.0
+        ago = (passed - float(most)).clamp(min=0.0).squeeze(1).cast(I64)
+        earlier = graph.op("Gather", num_new, ago, axis=0)
+        keeps = num_new.slice(1, END, 0).eq(earlier) & (passed - began > float(most))
+        return [graph.where(keeps, math.nan, samples)]
 
-        def is_stuck() -> list[Value]:
-            seen = is_new.cast(I64).cumsum(0)
-            none = graph.op("Sub", seen.slice(0, 1, 0), seen.slice(0, 1, 0))
-            ago = (places - float(most)).maximum(0.0).squeeze(1).cast(I64)
-            earlier = graph.op("Gather", graph.concat(none, seen, axis=0), ago, axis=0)
-            keeps = seen.eq(earlier) & ((run + places) > float(most))
-            return [graph.where(keeps, math.nan, samples)]
-
-        may_be = (run.amax(1) + counted).squeeze(0) > float(most)
-        marked = graph.if_(may_be, is_stuck, lambda: [samples])[0]
-        now = samples.slice(-1, END, 0).cast(F64).squeeze(0)
-        return [marked, graph.concat(now, run_after.squeeze(0), axis=0)]
-
-    marked, after = graph.if_(num.squeeze(0) > 0, mark, lambda: [samples, known])
-    return marked, after
+    may_be = num - began.amin(1) > float(most)
+    after = graph.concat(_last(rows).cast(F64), now_began, axis=0).reshape(-1)
+    return graph.if_(may_be, marked, lambda: [samples])[0], after
 
 
 # Onset scores ----------------------------------------------------------------------------------
-
-
-def _onset_memory(state: Value, start: int, onset: OnsetClassifier) -> list[Value]:
-    """What is kept of a stream's evidence (``memory_sizes``); flat, but for empty parts.
-
-    Args:
-        state: in which they lie last; empty: of no stream yet, NaN, on which no score rests.
-        start: where they begin.
-        onset: whose they are.
-    """
-    graph = state.graph
-    sizes = [size for size in memory_sizes(onset) if size]
-
-    def known() -> list[Value]:
-        dtypes = [F64] * (1 + len(sizes))
-        return list(graph.ops("Split", state, graph.axes(start, *sizes), dtypes=dtypes, axis=0))[1:]
-
-    def nothing() -> list[Value]:
-        nan = numpy_helper.from_array(np.array([np.nan]))
-        none = [graph.constant([0.0], F64)] * 2
-        return none + [
-            graph.op("ConstantOfShape", graph.axes(n), dtype=F64, value=nan) for n in sizes[2:]
-        ]
-
-    return graph.if_(state.length(0) > 0, known, nothing)
 
 
 class _Measured(NamedTuple):
     """Rows of blocks, ``[k, width]`` each; of no channels None.
 
     Attributes:
-        logs: half the log powers, filter by filter.
-        products: mean products of pairs.
+        power: of each filter that of fast channels, and mean products of pairs behind it.
         means: of slow channels.
         is_known: which blocks are not lost, ``[k]``, bool.
     """
 
-    logs: Value | None
-    products: Value | None
+    power: Value | None
     means: Value | None
     is_known: Value
 
 
-def _measured(samples: Value, places: Value, evidence: OnsetEvidence) -> _Measured:
+def _measured(held: Value, ends: Value, evidence: OnsetEvidence) -> _Measured:
     """``OnsetEvidence.blocks`` and which are not lost; arguments as of ``_onset_scores``."""
-    graph, first = samples.graph, places.unsqueeze(1)
+    graph = held.graph
     fast, slow = evidence.hand.fast, evidence.hand.slow
     hop, context, num_filters = evidence.hop_samples, evidence.context, evidence.num_filters
-    logs = products = means = None
+    frames = _rows(held, ends.cast(I64).unsqueeze(1), range(-context - hop, 0)).cast(F64)
+    own = frames.slice(context, END, 1)
+    power = means = None
     if fast:
-        frames = _rows(samples.take(fast, 1), first * hop, range(context + hop)).cast(F64)
-        filters = evidence.filter_matrix.reshape(context + hop, -1).T
-        heard = graph.constant(filters, F64) @ (frames - frames.slice(0, 1, 1))
-        to_mean = graph.constant(np.kron(np.eye(num_filters), np.full(hop, 1 / hop)), F64)
-        of_fast = (to_mean @ (heard * heard) + evidence.rounding).log() * 0.5  # [k, B, F]
-        logs = of_fast.reshape(0, num_filters * len(fast))
-        if len(fast) > 1:
-            one, other = (heard.take(of.tolist(), 2) for of in evidence.pairs)
-            products = (to_mean @ (one * other)).reshape(0, -1)
-        known = of_fast.sum(1).isfinite()
-        moves = (of_fast - evidence.silence).amax(1) > 0.0
+        of_fast = frames.take(fast, 2)
+        x = (of_fast - of_fast.slice(0, 1, 1)).transpose(0, 2, 1)
+        heard = x @ evidence.filter_matrix.reshape(context + hop, -1)  # [k, F, B * hop]
+        each = np.stack([np.arange(len(fast))] * 2)  # power: the product of each with itself
+        one, other = (
+            heard.take(of.tolist(), 1) for of in np.concatenate([each, evidence.pairs], 1)
+        )
+        to_mean = np.kron(np.eye(num_filters), np.full((hop, 1), 1 / hop))
+        rounding = np.zeros((num_filters, len(fast) + evidence.pairs.shape[1]))
+        rounding[:, : len(fast)] = evidence.rounding
+        both = (one * other @ to_mean).transpose(0, 2, 1) + rounding  # [k, B, F + P]
+        of_fast = both[..., : len(fast)]
+        moves = (of_fast - (2.0 * evidence.silence).exp()).amax(1) > 0.0
         if hop >= FEWEST_BLOCK_SAMPLES:
-            own = frames.slice(context, END, 1)
-            moves = moves & ~(own - own.slice(0, 1, 1)).abs().amax(1).eq(0.0)
-        is_still = graph.constant(evidence.is_still or [False] * len(fast), BOOL)
-        known = known & (moves | is_still)
+            of_own = own.take(fast, 2)
+            moves = moves & (of_own.amax(1) > of_own.amin(1))
+        if any(evidence.is_still):
+            moves = moves | graph.constant(evidence.is_still, BOOL)
+        known = moves & (of_fast.sum(1) < math.inf)
+        power = both.reshape(0, -1)
     if slow:
-        block = _rows(samples.take(slow, 1), first * hop, range(context, context + hop))
-        means = block.cast(F64).mean(1)
+        means = own.take(slow, 2).mean(1)
         if not fast:
             known = means.isfinite()
     is_known = known.cast(F64).sum(1) >= float(evidence.min_alive)
-    return _Measured(logs, products, means, is_known)
+    return _Measured(power, means, is_known)
 
 
 def _onset_scores(
-    samples: Value,
-    places: Value,
+    held: Value,
+    ends: Value,
     memory: Sequence[Value],
     onset: OnsetClassifier,
     most: int,
@@ -500,151 +472,121 @@ def _onset_scores(
     """Scores of hops, ``NOTHING_YET`` where there is no evidence, and what is kept.
 
     Args:
-        samples: from ``context`` samples before the first of these hops on; NaN before a stream.
-        places: of the hops, from 0.
-        memory: of ``_onset_memory`` or the call before.
+        held: samples, NaN before a stream.
+        ends: where the blocks of these hops end, counted from the end of the samples.
+        memory: ``memory_sizes``, but for empty parts.
         onset: that scores.
         most: lost blocks in a row, beyond which the memory begins anew.
 
     Shape:
-        - samples: ``[m, C]``; places: ``[k]``, int64, k at least 1
+        - held: ``[m, C]``; ends: ``[k]``, float64, k at least 1
         - output: ``[k]``, float64, and as memory
     """
-    evidence, graph = onset.evidence, samples.graph
-    made = _measured(samples, places, evidence)
-    lost, filled, of_hops, *rows = memory
-    shapes = [shape for shape in memory_shapes(onset) if all(shape)]
-    *kept, floors = rows
-    kept = [x.reshape(*shape) for x, shape in zip(kept, shapes, strict=True)]
-
-    def scores_of(measured: _Measured, begins: Value) -> list[Value]:
-        """Scores of known blocks, the first of whose streams stand at ``begins``, below 0 before.
-
-        And what is kept, but for ``lost``.
-        """
-        num = begins.length(0)
-        number = _count_up(num).cast(F64) - begins.cast(F64) + 1.0  # of each block in its stream
-        scores, after = _scores_of_known(measured, begins, number, kept, floors, onset)
-        scores = graph.concat(of_hops, scores, axis=0)
-        mean = _rows(scores, _count_up(num).unsqueeze(1), range(MEAN_HOPS)).mean(1)
-        mean = graph.where(mean.isfinite(), mean, NOTHING_YET)
-        return [mean, _last(number), scores.slice(1 - MEAN_HOPS, END, 0), *after]
-
-    before = (filled * -1.0).cast(I64)  # where the stream of before began
+    graph, made = held.graph, _measured(held, ends, onset.evidence)
+    lost, filled, *kept = memory
 
     def all_known() -> list[Value]:
-        mean, *after = scores_of(made, before + places * 0)
-        return [mean, lost * 0.0, *after]
+        begins = -filled - ends.length(0).cast(F64)
+        return [*_scores_of_known(made, begins, kept, onset), lost * 0.0]
 
     def some_lost() -> list[Value]:
-        gaps = _Gaps.of(made.is_known, places.cast(F64), lost, most)
+        gaps = _Gaps.of(made.is_known, _from_end(ends), lost, most)
 
         def nothing_known() -> list[Value]:
             mean = graph.where(made.is_known, 0.0, graph.constant([NOTHING_YET], F64))
-            return [mean, filled, of_hops, *rows]
+            return [mean, filled, *kept]
 
         def those_known() -> list[Value]:
             parts = (None if part is None else gaps.valid_of(part) for part in made)
             own = _Measured(*parts)  # type: ignore[arg-type]  # flags are there
-            place = _count_up(own.is_known.length(0))
+            place = _from_end(own.is_known)
+            before = place.slice(0, 1, 0) - filled
             begins = _latest(gaps.valid_of(gaps.begins_anew), before, place)
-            mean, *after = scores_of(own, begins)
+            mean, *after = _scores_of_known(own, begins, kept, onset)
             mean = gaps.spread(mean, graph.constant([NOTHING_YET], F64))
             return [graph.where(made.is_known, mean, NOTHING_YET), *after]
 
-        mean, *after = graph.if_(gaps.has_valid, those_known, nothing_known)
-        return [mean, gaps.lost_after, *after]
+        return [*graph.if_(gaps.has_valid, those_known, nothing_known), gaps.lost_after]
 
-    score, *after = graph.if_(_is_whole(made.is_known, lost), all_known, some_lost)
-    return score, after
+    is_whole = _is_whole(made.is_known, lost)
+    score, *after, now_lost = graph.if_(is_whole, all_known, some_lost)
+    return score, [now_lost, *after]
 
 
 def _scores_of_known(
-    measured: _Measured,
-    begins: Value,
-    number: Value,
-    kept: Sequence[Value],
-    floors: Value,
-    onset: OnsetClassifier,
-) -> tuple[Value, list[Value]]:
-    """``OnsetClassifier.scores``, NaN without evidence, and the rows and floors that are kept.
+    measured: _Measured, begins: Value, kept: Sequence[Value], onset: OnsetClassifier
+) -> list[Value]:
+    """Means of ``OnsetClassifier.scores``, how many blocks are known, and what is kept.
 
     Args:
         measured: of known blocks, ``k`` of them.
-        begins: place of the first block of each one's stream; below 0: before these.
-        number: of each block in its stream, from 1.
-        kept: rows of the blocks before; of no stream yet NaN.
-        floors: of the blocks before.
+        begins: the first block of each one's stream, ``[k]`` or ``[1]``; it and all places of
+            blocks are counted from the end of these.
+        kept: ``memory_sizes`` from scores on, but for empty parts.
         onset: that scores.
     """
     evidence, graph = onset.evidence, begins.graph
     fast, slow, num_filters = evidence.hand.fast, evidence.hand.slow, evidence.num_filters
-    num, places, delay = begins.length(0), _count_up(begins.length(0)).unsqueeze(1), evidence.delay
-    given, rows, after = list(kept), list[Value](), list[Value]()
+    delay, windows, reach = evidence.delay, evidence.windows, len(evidence.step_matrix)
+    place = _from_end(measured.is_known)
+    number = place - begins + 1.0  # of each block in its stream
+    of_scores, *given, floors = kept
+    shapes = [shape for shape in memory_shapes(onset) if all(shape)]
+    after = list[Value]()
 
-    def joined(latest: Value) -> tuple[Value, int, Value]:
-        """Rows with those that are kept, how many these are, and the first place that counts."""
-        before = given.pop(0)
-        size = [s for s in memory_shapes(onset) if all(s)][len(rows)][0]
-        rows.append(graph.concat(before, latest, axis=0))
-        lowest = (begins + size).maximum(0).unsqueeze(1)
-        end = _count_up(graph.axes(size)) + num
-        after.append(graph.op("Gather", rows[-1], end.maximum(_last(lowest).squeeze(1)), axis=0))
-        return rows[-1], size, lowest
+    # rows of before a stream's first block are equal to it
+    backs = [range(MEAN_HOPS - 1, -1, -1), range(delay - 1, -1, -1), [delay]]
+    backs += [range(reach - 1, -1, -1), [0, *onset.lags]]
+    earliest = graph.constant(-np.concatenate(backs), F64)
+    at_back = (place.unsqueeze(1) + earliest).maximum(begins.unsqueeze(1)).cast(I64)
+    of_mean, latest, delayed, of_steps, of_lags = at_back.split(list(map(len, backs)), 1)
 
-    def latest(of: tuple[Value, int, Value], back: range) -> Value:
-        """Rows so many blocks back of each block, none before its stream: ``[k, back, width]``."""
-        all_rows, size, lowest = of
-        index = (places + graph.axes(*(size - i for i in back))).maximum(lowest)
-        return graph.op("Gather", all_rows, index, axis=0)
+    def joined(rows: Value) -> Value:
+        """Rows with those of the blocks before."""
+        num_rows, width = shapes[len(after)]
+        all_rows = graph.concat(given[len(after)].reshape(num_rows, width), rows, axis=0)
+        after.append(all_rows.slice(-num_rows, END, 0).reshape(-1))
+        return all_rows
 
-    longest = range(delay - 1, -1, -1)
-    to_means = [
-        graph.constant(np.r_[np.zeros(delay - n), np.full(n, 1 / n)][None], F64)
-        for n in evidence.windows
-    ]
-    power, products, delayed = list[Value](), list[Value](), list[Value]()
-    if measured.logs is not None:
-        logs = joined(measured.logs)
-        powers = (latest(logs, longest) * 2.0).exp()
-        power = [(each @ powers).reshape(0, num_filters, len(fast)) for each in to_means]
-        delayed = [latest(logs, range(delay, delay + 1)).squeeze(1)] * len(FLOORS_S)
-    if measured.products is not None:
-        pairs = latest(joined(measured.products), longest)
-        shape = (num_filters, evidence.pairs.shape[1])
-        products = [(each @ pairs).reshape(0, *shape) for each in to_means]
-    steps: Any = None
+    def at(rows: Value, places: Value) -> Value:
+        return graph.op("Gather", rows, places, axis=0)
+
+    num_levels, width = len(windows) * num_filters, len(fast) + evidence.pairs.shape[1]
+    power, products, of_floors, steps = list[Any]([None] * 4)
+    to_follow = list[Value]()
+    if measured.power is not None:
+        rows = joined(measured.power)
+        to_means = [np.r_[np.zeros(delay - n), np.full(n, 1 / n)] for n in windows]
+        means = graph.constant(to_means, F64) @ at(rows, latest)
+        means = means.reshape(0, num_levels, width)
+        power, products = means.split([len(fast), width - len(fast)], 2)
+        quiet = at(rows, delayed).reshape(0, num_filters, width)[..., : len(fast)].log() * 0.5
+        to_follow = [quiet.reshape(0, num_filters * len(fast))] * len(FLOORS_S)
+    step_floor: Any = None
     if measured.means is not None:
-        reach, num_steps = len(evidence.step_matrix), evidence.step_matrix.shape[1]
-        means = latest(joined(measured.means), range(reach - 1, -1, -1))
-        steps = graph.constant(evidence.step_matrix.T, F64) @ (means - means.slice(0, 1, 1))
+        levels = at(joined(measured.means), of_steps)
+        steps = graph.constant(evidence.step_matrix.T, F64) @ (levels - levels.slice(0, 1, 1))
+        num_steps = evidence.step_matrix.shape[1]
         sizes = joined(steps.abs().reshape(0, num_steps * len(slow)))
-        delayed.append(latest(sizes, range(delay, delay + 1)).squeeze(1))
-    usual, now = _followed(graph.concat(*delayed, axis=1), number, floors, evidence)
-    num_logs = num_filters * len(fast)
-    of_logs = [
-        usual.slice(i * num_logs, (i + 1) * num_logs, 1).reshape(0, num_filters, len(fast))
-        for i in range(len(FLOORS_S) if fast else 0)
-    ]
-    of_steps: Any = None
+        to_follow.append(at(sizes, delayed.squeeze(1)))
+    usual, now = _followed(graph.concat(*to_follow, axis=1), number, floors, evidence)
+    num_logs = len(FLOORS_S) * num_filters * len(fast)
+    if fast:
+        of_floors = usual.slice(0, num_logs, 1).reshape(0, len(FLOORS_S) * num_filters, len(fast))
     if slow:
-        of_steps = usual.slice(len(of_logs) * num_logs, END, 1).reshape(0, num_steps, len(slow))
-    in_use: list[Any] = [graph.constant(np.ones(len(each)), BOOL) for each in (fast, slow)]
-    pooled: Any = evidence.pooled(
-        *(power, products, of_logs),  # type: ignore[arg-type]  # values in place of tensors
-        *(steps, of_steps, *in_use),
-    )
+        step_floor = usual.slice(num_logs, END, 1).reshape(0, num_steps, len(slow))
+    pooled: Any = evidence.pooled(power, products, of_floors, steps, step_floor)
     columns, is_usable = pooled
     inputs = scaled(columns, onset.scaler)
-    if lags := onset.lags:
-        of_before = joined(inputs)
-        back = [latest(of_before, range(lag, lag + 1)).squeeze(1) for lag in lags]
-        inputs = graph.concat(inputs, *back, axis=1)
+    if onset.lags:
+        inputs = at(joined(inputs), of_lags).reshape(0, len(backs[-1]) * evidence.num_columns)
     head: Any = onset.head
     score = machine(inputs, head, F64) if isinstance(head, QuadraticForm) else head(inputs)
-    is_usable = is_usable & (number > float(evidence.blind))
-    flat = [each.reshape(-1) for each in after]
-    return graph.where(is_usable, score, math.nan), [*flat, now]
+    score = graph.where(is_usable & (number > float(evidence.blind)), score, math.nan)
+    scores = graph.concat(of_scores, score, axis=0)
+    mean = at(scores, of_mean).mean(1)
+    mean = graph.where(mean.isfinite(), mean, NOTHING_YET)
+    return [mean, _last(number), scores.slice(1 - MEAN_HOPS, END, 0), *after, now]
 
 
 def _followed(
@@ -661,17 +603,18 @@ def _followed(
     num_sizes = evidence.step_matrix.shape[1] * len(evidence.hand.slow)
     rates = np.r_[rates, np.full(num_sizes, evidence.floor_rates[0])]
     since = (number - float(evidence.delay)).clamp(min=1.0).unsqueeze(1)
-    rate = (1.0 / since).maximum(rates)  # [k, V]
-    is_first = number.eq(1.0).unsqueeze(1).cast(F64) + rate * 0.0
+    rate = (1.0 / since).maximum(rates)  # [k, V]; 1 of a first block
+    nothing = values - values
+    is_known = nothing.eq(0.0) | number.eq(1.0).unsqueeze(1)  # a first block leaves nothing before
 
     def follow(state: list[Value], row: list[Value]) -> tuple[list[Value], list[Value]]:
-        x, share, anew = row
-        before = graph.where(anew > 0.0, math.nan, state[0])
-        known = graph.where(before.isfinite(), before, x)
-        after = graph.where(x.isfinite(), known + share * (x - known), before)
+        (before,), (x, share, is_known) = state, row
+        start = graph.where(before.eq(before), before, x)
+        after = graph.where(is_known, start + share * (x - start), before)
         return [after], [after]
 
-    (after,), (made,) = graph.scan(follow, [floors], [values, rate, is_first], (len(rates),))
+    rows = [values + nothing, rate, is_known]
+    (after,), (made,) = graph.scan(follow, [floors], rows, (len(rates),))
     return made, after
 
 
@@ -864,7 +807,7 @@ def _latched(
 
     One is raised where the statistic is high, and the last alarm is no later than the last
     re-arming and than ``refractory`` decisions back. So only the number of the last alarm is
-    walked, and nothing where the statistic is low and no alarm stands.
+    walked.
 
     Args:
         statistic: finite.
@@ -888,38 +831,41 @@ def _latched(
         last = graph.where(state[0] <= row[0], row[1], state[0])
         return [last], [last]
 
-    def awake() -> list[Value]:
-        on, below, since = graph.ops("Split", memory, dtypes=[F64] * 3, axis=0, num_outputs=3)
-        last = (number.slice(0, 1, 0) if first is None else first) - 1.0 - since
-        place = _count_up(number.length(0)).cast(F64)
-        high = _latest(is_high, -1.0 - below, place)  # the last one that was not low
-        if anew is not None:  # before such a one, none was low
-            is_edge = is_high | anew
-            high = _latest(is_edge, -1.0 - below, graph.where(is_high, place, place - 1.0))
-        rearms, since_when = place - high >= float(max(rearm, 1)), number
-        if anew is not None:  # armed before it, so that it may raise an alarm itself
-            rearms, since_when = rearms | anew, graph.where(anew & is_high, number - 1.0, number)
-        rearmed = _latest(rearms, last - on, since_when)
-        allowed = rearmed.minimum(number - float(refractory))
-        allowed = graph.where(is_high, allowed, -math.inf)
-        (end,), (alarms,) = graph.scan(raise_, [last.squeeze(0)], [allowed, number])
-        is_on = alarms > rearmed
-        now = _last(number)
-        after = _last(is_on).cast(F64), _last(place) - _last(high), now - end
-        return [alarms.eq(number), is_on, graph.concat(*after, axis=0)]
-
-    def asleep() -> list[Value]:  # nothing is high
-        num = _last(number) + 1.0 - (number.slice(0, 1, 0) if first is None else first)
-        return [is_high, is_high, memory + graph.constant([0, 0, 1], F64) * num]
-
-    is_awake = (statistic.amax(0, keepdim=True) >= level) | (memory.slice(0, 1, 0) > 0.0)
-    return _Latched(*graph.if_(is_awake, awake, asleep))
+    on, below, since = memory.split([1, 1, 1], 0)
+    last = (number.slice(0, 1, 0) if first is None else first) - 1.0 - since
+    place = _count_up(number.length(0)).cast(F64)
+    high = _latest(is_high, -1.0 - below, place)  # the last one that was not low
+    if anew is not None:  # before such a one, none was low
+        is_edge = is_high | anew
+        high = _latest(is_edge, -1.0 - below, graph.where(is_high, place, place - 1.0))
+    rearms, since_when = place - high >= float(max(rearm, 1)), number
+    if anew is not None:  # armed before it, so that it may raise an alarm itself
+        rearms, since_when = rearms | anew, graph.where(anew & is_high, number - 1.0, number)
+    rearmed = _latest(rearms, last - on, since_when)
+    allowed = rearmed.minimum(number - float(refractory))
+    allowed = graph.where(is_high, allowed, -math.inf)
+    (end,), (alarms,) = graph.scan(raise_, [last.squeeze(0)], [allowed, number])
+    is_on = alarms > rearmed
+    now = _last(number)
+    after = _last(is_on).cast(F64), _last(place) - _last(high), now - end
+    return _Latched(alarms.eq(number), is_on, graph.concat(*after, axis=0))
 
 
 def _count_up(num: Value) -> Value:
     """The whole numbers from 0 to before ``num`` ``[1]``, int64."""
     graph = num.graph
     return graph.op("Range", graph.constant(0, I64), num.squeeze(0), graph.constant(1, I64))
+
+
+def _from_to(start: Value, stop: Value) -> Value:
+    """The numbers ``start``, ``start + 1`` and so on to before ``stop``, ``[1]`` both, float64."""
+    graph = start.graph
+    return graph.op("Range", start.squeeze(0), stop.squeeze(0), graph.constant(1.0, F64))
+
+
+def _from_end(rows: Value) -> Value:
+    """Places of rows, counted from behind the last, float64."""
+    return _from_to(-rows.length(0).cast(F64), rows.graph.constant([0.0], F64))
 
 
 def _latest(mask: Value, start: Value, values: Value) -> Value:
@@ -930,8 +876,8 @@ def _latest(mask: Value, start: Value, values: Value) -> Value:
 
 
 def _is_whole(valid: Value, lost: Value) -> Value:
-    """Whether all decisions ``[k]`` are valid, and so was the one before, a scalar."""
-    return valid.cast(I64).amin(0).cast(BOOL) & (lost <= 0.0).squeeze(0)
+    """Whether all decisions ``[k]`` are valid, and so was the one before, ``[1]``."""
+    return valid.cast(F64).amin(0, keepdim=True) - lost > 0.0
 
 
 def _last(value: Value) -> Value:

@@ -331,11 +331,13 @@ class Value:
 
     contiguous = detach
 
-    def __getitem__(self, place: tuple[Any, slice | int | None]) -> Value:
-        """Of the last axis (``x[..., place]``) a slice or an entry; or one more, of length 1."""
+    def __getitem__(self, place: tuple[Any, slice | int | list[int] | None]) -> Value:
+        """Of the last axis (``x[..., place]``) entries or one; or one more axis, of length 1."""
         _, key = place
         if key is None:
             return self.unsqueeze(-1)
+        if isinstance(key, list):
+            return self.take(key, -1)
         if isinstance(key, int):  # a scalar index takes its axis away
             return self.graph.op("Gather", self, self.graph.constant(key, I64), axis=-1)
         return self.slice(key.start or 0, END if key.stop is None else key.stop, -1)
@@ -411,6 +413,11 @@ class Value:
         ends = (self.graph.axes(x) if isinstance(x, int) else x for x in (start, stop))
         return self.graph.op("Slice", self, *ends, self.graph.axes(axis))
 
+    def split(self, sizes: Sequence[int], axis: int) -> list[Value]:
+        """Parts of so many entries along an axis."""
+        kinds = [self.dtype] * len(sizes)
+        return self.graph.ops("Split", self, self.graph.axes(*sizes), dtypes=kinds, axis=axis)
+
     def unsqueeze(self, axis: int) -> Value:
         """With another axis of length 1."""
         return self.graph.op("Unsqueeze", self, self.graph.axes(axis))
@@ -448,9 +455,11 @@ class Value:
         return other
 
 
-_FUNCTIONS: dict[Callable[..., Any], Callable[..., Value]] = {
+_FUNCTIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     torch.where: lambda mask, yes, no: mask.graph.where(mask, yes, no),
     torch.cat: lambda values, dim: values[0].graph.concat(*values, axis=dim),
+    torch.split: lambda value, sizes, dim: value.split(sizes, dim),
+    torch.matmul: lambda matrix, value: value.graph.constant(matrix, value.dtype) @ value,
     torch.minimum: Value.minimum,
     torch.maximum: Value.maximum,
 }

@@ -430,15 +430,13 @@ class OnsetEvidence:
             torch.cat([memory.floor.flatten(), memory.step_floor.flatten()]),
             blocks.logs[0].numel(),
         )
-        floor = (
-            usual.unflatten(1, (num_floors, self.num_filters, -1)) if len(self.hand.fast) else None
-        )
+        floors = usual.unflatten(1, (num_floors * self.num_filters, logs.shape[2]))
         power = (2.0 * logs).exp()
         used = torch.ones(len(self.hand), dtype=torch.bool) if in_use is None else in_use
         columns, is_usable = self.pooled(
-            [_last_means(power, n, num) for n in self.windows],
-            [_last_means(products, n, num) for n in self.windows],
-            [] if floor is None else list(floor.unbind(1)),
+            torch.cat([_last_means(power, n, num) for n in self.windows], 1),
+            torch.cat([_last_means(products, n, num) for n in self.windows], 1),
+            floors,
             steps,
             step_floor.unflatten(1, steps.shape[1:]),
             used[list(self.hand.fast)],
@@ -450,7 +448,7 @@ class OnsetEvidence:
             products[-delay:],
             means[len(means) - len(memory.means) :],
             sizes[-delay:],
-            memory.floor if floor is None else floor[-1],
+            floors[-1].unflatten(0, (num_floors, self.num_filters)),
             step_floor[-1].unflatten(0, steps.shape[1:]),
             memory.scaled,
         )
@@ -481,59 +479,85 @@ class OnsetEvidence:
 
     def pooled(
         self,
-        power: Sequence[Tensor],
-        products: Sequence[Tensor],
-        floors: Sequence[Tensor],
+        power: Tensor,
+        products: Tensor,
+        floors: Tensor,
         steps: Tensor,
         step_floor: Tensor,
-        fast: Tensor,
-        slow: Tensor,
+        fast: Tensor | None = None,
+        slow: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Columns of what was measured; in operations that tensors and values of a graph share.
 
         Args:
-            power: mean over each window.
+            power: mean over each window, of each filter.
             products: the same of pairs.
-            floors: of each length.
+            floors: of each length and filter.
             steps: of the slow channels.
             step_floor: their usual size.
-            fast: fast channels that are not left out.
+            fast: fast channels that are not left out; default all.
             slow: slow ones.
 
         Shape:
-            - power: ``[k, B, F]`` each; products: ``[k, B, P]``; floors: ``[k, B, F]``
+            - power: ``[k, W * B, F]``; products: ``[k, W * B, P]``; floors: ``[k, 3 * B, F]``
             - steps, step_floor: ``[k, D, S]``; fast: ``[F]``; slow: ``[S]``, bool
             - output: ``[k, K]`` and ``[k]``, bool
         """
         columns, num_fast, num_slow = list[Tensor](), len(self.hand.fast), len(self.hand.slow)
         alive = None
         if num_fast:
-            levels = [each.log() * 0.5 for each in power]
-            every = torch.cat(levels, 1)  # [k, W * B, F]
-            known = (every.sum(1) + floors[0].sum(1)).isfinite()
-            loud = (floors[-1] - self.silence).amax(1) > 0.0
-            alive = known & loud & fast  # [k, F]
-            rises = every - torch.cat([floors[0]] * len(levels), 1)
+            contrasts, quickest = self._contrasts
+            levels = power.log() * 0.5
+            rises = torch.matmul(contrasts, torch.cat([levels, floors], 1))  # [k, R, F]
+            alive = rises.sum(1).isfinite() & ((floors - quickest).amax(1) > 0.0)  # [k, F]
+            alive = alive if fast is None else alive & fast
             columns += _over_channels(rises, alive, num_fast, with_spread=True)
-            quick = [level - floor for level in levels[:2] for floor in floors[1:]]
-            columns += _over_channels(torch.cat(quick, 1), alive, num_fast)[:2]
             if num_fast > 1:
-                columns += self._correlations(
-                    torch.cat([*power], 1), torch.cat([*products], 1), rises, alive
-                )
+                columns += self._correlations(power, products, rises, alive)
         if num_slow:
-            known = (steps + step_floor).sum(1).isfinite() & slow
+            known = (steps + step_floor).sum(1).isfinite()
+            known = known if slow is None else known & slow
             alive = known if alive is None else alive
             relative = steps / (step_floor + self.least_step)
             size = (relative.abs() + 1.0).log()
-            columns += _over_channels(size, known, num_slow)
-            columns += _over_channels(relative.sign() * size, known, num_slow)
+            columns += _over_channels(torch.cat([size, relative.sign() * size], 1), known, num_slow)
             if num_slow > 1:
                 of_known = torch.where(known.unsqueeze(1), relative, 0.0)
                 columns.append(of_known.sum(-1) / (of_known.abs().sum(-1) + _LEAST_STEPS))
         assert alive is not None  # a hand has a channel
-        num_alive = alive.type_as(steps if num_slow else power[0]).sum(-1)
-        return torch.cat(columns, -1), num_alive >= float(self.min_alive)
+        num_alive = alive.type_as(steps if num_slow else power).sum(-1)
+        return torch.cat(columns, -1)[..., self._order], num_alive >= float(self.min_alive)
+
+    @cached_property
+    def _contrasts(self) -> tuple[Tensor, Tensor]:
+        """Levels and floors to rises, and what a channel that is not silent is above somewhere.
+
+        Rises are those over the longest floor, of each window and filter; then those over the
+        shorter ones, of the two shorter windows.
+
+        Shape:
+            - output: ``[R, W * B + 3 * B]`` and ``[3 * B, F]``, of which the quickest floors count
+        """
+        pairs = [(window, 0) for window in range(len(WINDOWS_S))]
+        pairs += [(window, floor) for window in (0, 1) for floor in (1, 2)]
+        levels, floors = (np.eye(3)[list(each)] for each in zip(*pairs, strict=True))
+        signs = np.kron(np.hstack([levels, -floors]), np.eye(self.num_filters))
+        slower = torch.full_like(self.silence, math.inf).repeat(len(FLOORS_S) - 1, 1)
+        return torch.from_numpy(signs), torch.cat([slower, self.silence])
+
+    @cached_property
+    def _order(self) -> list[int]:
+        """Where each column is among those that are pooled together."""
+        num_levels, num_steps = len(WINDOWS_S) * self.num_filters, self.step_matrix.shape[1]
+        num_rises = len(self._contrasts[0])
+        fast, slow = (min(len(each), 2) for each in (self.hand.fast, self.hand.slow))
+        sizes = [[0, 1, 4][fast] * num_rises, [0, 0, 3][fast] * num_levels]
+        sizes += [[0, 1, 3][slow] * 2 * num_steps, [0, 0, 1][slow] * num_steps]
+        parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+        rises, steps = parts[0].reshape(-1, num_rises), parts[2].reshape(-1, 2, num_steps)
+        parts[0] = np.r_[rises[:, :num_levels].ravel(), rises[:2, num_levels:].ravel()]
+        parts[2] = steps.swapaxes(0, 1).ravel()
+        return [int(place) for place in np.concatenate(parts)]
 
     def _correlations(
         self, power: Tensor, products: Tensor, rises: Tensor, alive: Tensor
@@ -541,23 +565,25 @@ class OnsetEvidence:
         """Squared correlation over pairs in use, 0 of none: mean, largest, mean by rises.
 
         Shape:
-            - power, rises: ``[k, W * B, F]``; products: ``[k, W * B, P]``; alive: ``[k, F]``
+            - power: ``[k, W * B, F]``; products: ``[k, W * B, P]``; rises: ``[k, R, F]``, those of
+              power first; alive: ``[k, F]``
             - output: ``[k, W * B]`` each
         """
         num_fast, num_pairs = len(self.hand.fast), self.pairs.shape[1]
+        num_levels = len(WINDOWS_S) * self.num_filters
         first, second = torch.zeros(2, num_fast, num_pairs, dtype=torch.float64)
         first[self.pairs[0], torch.arange(num_pairs)] = 1.0
         second[self.pairs[1], torch.arange(num_pairs)] = 1.0
-        found = alive.type_as(power)
-        both = (found @ first) * (found @ second)  # [k, P]
-        num = both.sum(-1)[..., None].clamp(min=1.0)
-        known = torch.where(alive.unsqueeze(1), power, 1.0)
-        square = products * products / ((known @ first) * (known @ second))
-        square = torch.where(both.unsqueeze(1) > 0.0, square, 0.0)
-        risen = torch.where(alive.unsqueeze(1), rises, 0.0).clamp(min=0.0)
-        weight = (risen @ first) * (risen @ second)
+        rows = alive.unsqueeze(1)
+        known = torch.where(rows, power, 1.0)
+        own = torch.split(rises, [num_levels, len(self._contrasts[0]) - num_levels], 1)[0]
+        risen = torch.where(rows, own, 0.0).clamp(min=0.0)
+        of_channels = torch.cat([known, risen, rows.type_as(power)], 1)
+        of_pairs = (of_channels @ first) * (of_channels @ second)
+        known, weight, both = torch.split(of_pairs, [num_levels, num_levels, 1], 1)
+        square = torch.where(both > 0.0, products * products / known, 0.0)
         by_rises = (square * weight).sum(-1) / (weight.sum(-1) + _LEAST_RISE)
-        return [square.sum(-1) / num, square.amax(-1), by_rises]
+        return [square.sum(-1) / both.sum(-1).clamp(min=1.0), square.amax(-1), by_rises]
 
     def to_dict(self) -> dict[str, Any]:
         """All but the hand and the sample rate, which are the detector's."""
