@@ -42,6 +42,7 @@ from tactslip_torch.onset.evidence import (
     MEAN_HOPS,
     OnsetClassifier,
     OnsetEvidence,
+    Perceptron,
 )
 from tactslip_torch.onset.rules import NOTHING_YET, Cusum, Rule, most_lost
 from tactslip_torch.signals.filtering import past_matrix
@@ -91,7 +92,7 @@ def stream_graph(
     before = 0.0 if onset is None else math.nan  # what no stream has is no evidence
     nothing = graph.constant(np.full((timing.tail, num_channels), before), dtype)
     no_sample = [math.nan] * num_channels + [0.0] * num_channels
-    starts = [[0.0], [0.0, 0.0, 0.0, *rule_start(settings.rule)], _LATCH_START, no_sample]
+    starts = [[0.0], [0.0], [0.0, 0.0, *rule_start(settings.rule)], _LATCH_START, no_sample]
     sizes = list(map(len, starts))
     if onset is not None:
         no_bin = [*([math.nan] * 3), 0.0, 0.0, math.inf, *([0.0] * num_channels)]
@@ -109,13 +110,13 @@ def stream_graph(
             memory[:2] = [graph.constant([0.0], F64)] * 2
         return known + memory
 
-    before, of_bins, of_latch, of_samples, *of_onset = graph.if_(
+    before, made, of_bins, of_latch, of_samples, *of_onset = graph.if_(
         state.length(0) > 0, lambda: state.split(sizes, 0), begun
     )
     num = samples.length(0).cast(F64)
     marked, stuck = _without_stuck(samples, num, of_samples, detector.sensing.stuck_samples)
     held = graph.concat(nothing, tail, marked, axis=0)
-    seen, made = before + num, of_bins.slice(0, 1, 0)
+    seen = before + num
     decided = ((seen + float(timing.hop - timing.first)) / float(timing.hop)).floor().clamp(min=0.0)
     if timing.frame > timing.first:
         decided = graph.where(seen >= float(timing.frame), decided, 0.0)
@@ -148,7 +149,7 @@ def stream_graph(
 
     def gathered(number: Value, scored: Scored, llr: Value) -> tuple[Value, Value, Value]:
         """Statistics, where runs of positive ratios began, and what is kept of bins then."""
-        _, run, lost, of_rule = of_bins.split([1, 1, 1, len(rule_start(settings.rule))], 0)
+        run, lost, of_rule = of_bins.split([1, 1, len(rule_start(settings.rule))], 0)
 
         def simply() -> list[Value]:
             statistic, after = _statistic_of(settings.rule, llr, of_rule)
@@ -162,7 +163,7 @@ def stream_graph(
 
         is_whole = _is_whole(scored.is_valid, lost)
         statistic, runs, after, now_lost = graph.if_(is_whole, simply, with_gaps)
-        return statistic, runs, graph.concat(decided, _last(runs), now_lost, after, axis=0)
+        return statistic, runs, graph.concat(_last(runs), now_lost, after, axis=0)
 
     def raised(
         statistic: Value, high: Value, number: Value, valid: Value, lost: Value
@@ -200,7 +201,7 @@ def stream_graph(
 
     def decide() -> list[Value]:
         number, scored, llr = bins()
-        high, lost = level(settings.threshold, dtype), of_bins.slice(2, 3, 0)
+        high, lost = level(settings.threshold, dtype), of_bins.slice(1, 2, 0)
         statistic, runs, after = gathered(number, scored, llr)
         alarm, on, memory, _ = raised(statistic, high, number, scored.is_valid, lost)
         return [
@@ -213,7 +214,7 @@ def stream_graph(
             on,
             *_times_s(number, runs, settings, timing, rate_hz),
             scored.channels_lost,
-            graph.concat(seen, after, memory, stuck, axis=0),
+            graph.concat(seen, decided, after, memory, stuck, axis=0),
         ]
 
     def nothing_made() -> list[Value]:
@@ -223,7 +224,7 @@ def stream_graph(
         return empty
 
     def wait() -> list[Value]:
-        return [*nothing_made(), graph.concat(seen, of_bins, of_latch, stuck, axis=0)]
+        return [*nothing_made(), graph.concat(seen, made, of_bins, of_latch, stuck, axis=0)]
 
     def join(onset: OnsetClassifier) -> list[Value]:
         """Decisions a hop of the classifier apart, from its scores and the last bin by then."""
@@ -252,14 +253,17 @@ def stream_graph(
         hops, first = (seen / hop).floor(), (before / hop).floor()
 
         def next_state(of_latch: Value, alarm_lost: Value, memory: Sequence[Value]) -> Value:
-            kept = (seen, now_of_bins, of_latch, stuck, alarm_lost, _last(rows).reshape(-1))
+            kept = (seen, decided, now_of_bins, of_latch, stuck, alarm_lost)
+            kept = (*kept, _last(rows).reshape(-1))
             return graph.concat(*kept, *memory, axis=0)
 
         def decide_hops() -> list[Value]:
             number = _from_to(first, hops)
             samples = (number + 1.0) * hop
             most_blocks = most_lost(onset.evidence.context + int(hop), hold, int(hop))
-            onset_score, after = _onset_scores(held, samples - seen, memory, onset, most_blocks)
+            onset_score, after = _onset_scores(
+                held, samples - seen, number - hops, memory, onset, most_blocks
+            )
             by_onset = onset_score >= level(onset.threshold, F64)
             num_bins = ((samples + (of_bin - float(timing.first))) / of_bin).floor()
             if timing.frame > timing.first:
@@ -412,11 +416,11 @@ def _without_stuck(samples: Value, num: Value, known: Value, most: int) -> tuple
 
 
 class _Measured(NamedTuple):
-    """Rows of blocks, ``[k, width]`` each; of no channels None.
+    """What is measured of blocks; of no channels None.
 
     Attributes:
-        power: of each filter that of fast channels, and mean products of pairs behind it.
-        means: of slow channels.
+        power: that of fast channels, and mean products of pairs behind it, ``[k, B, F + P]``.
+        means: of slow channels, ``[k, S]``.
         is_known: which blocks are not lost, ``[k]``, bool.
     """
 
@@ -444,8 +448,8 @@ def _measured(held: Value, ends: Value, evidence: OnsetEvidence) -> _Measured:
         to_mean = np.kron(np.eye(num_filters), np.full((hop, 1), 1 / hop))
         rounding = np.zeros((num_filters, len(fast) + evidence.pairs.shape[1]))
         rounding[:, : len(fast)] = evidence.rounding
-        both = (one * other @ to_mean).transpose(0, 2, 1) + rounding  # [k, B, F + P]
-        of_fast = both[..., : len(fast)]
+        power = (one * other @ to_mean).transpose(0, 2, 1) + rounding  # [k, B, F + P]
+        of_fast = power[..., : len(fast)]
         moves = (of_fast - (2.0 * evidence.silence).exp()).amax(1) > 0.0
         if hop >= FEWEST_BLOCK_SAMPLES:
             of_own = own.take(fast, 2)
@@ -453,7 +457,6 @@ def _measured(held: Value, ends: Value, evidence: OnsetEvidence) -> _Measured:
         if any(evidence.is_still):
             moves = moves | graph.constant(evidence.is_still, BOOL)
         known = moves & (of_fast.sum(1) < math.inf)
-        power = both.reshape(0, -1)
     if slow:
         means = own.take(slow, 2).mean(1)
         if not fast:
@@ -465,6 +468,7 @@ def _measured(held: Value, ends: Value, evidence: OnsetEvidence) -> _Measured:
 def _onset_scores(
     held: Value,
     ends: Value,
+    place: Value,
     memory: Sequence[Value],
     onset: OnsetClassifier,
     most: int,
@@ -474,23 +478,24 @@ def _onset_scores(
     Args:
         held: samples, NaN before a stream.
         ends: where the blocks of these hops end, counted from the end of the samples.
+        place: of these hops, counted from behind the last.
         memory: ``memory_sizes``, but for empty parts.
         onset: that scores.
         most: lost blocks in a row, beyond which the memory begins anew.
 
     Shape:
-        - held: ``[m, C]``; ends: ``[k]``, float64, k at least 1
+        - held: ``[m, C]``; ends, place: ``[k]``, float64, k at least 1
         - output: ``[k]``, float64, and as memory
     """
     graph, made = held.graph, _measured(held, ends, onset.evidence)
     lost, filled, *kept = memory
 
     def all_known() -> list[Value]:
-        begins = -filled - ends.length(0).cast(F64)
-        return [*_scores_of_known(made, begins, kept, onset), lost * 0.0]
+        begins = place.slice(0, 1, 0) - filled
+        return [*_scores_of_known(made, place, begins, kept, onset), lost * 0.0]
 
     def some_lost() -> list[Value]:
-        gaps = _Gaps.of(made.is_known, _from_end(ends), lost, most)
+        gaps = _Gaps.of(made.is_known, place, lost, most)
 
         def nothing_known() -> list[Value]:
             mean = graph.where(made.is_known, 0.0, graph.constant([NOTHING_YET], F64))
@@ -499,10 +504,10 @@ def _onset_scores(
         def those_known() -> list[Value]:
             parts = (None if part is None else gaps.valid_of(part) for part in made)
             own = _Measured(*parts)  # type: ignore[arg-type]  # flags are there
-            place = _from_end(own.is_known)
-            before = place.slice(0, 1, 0) - filled
-            begins = _latest(gaps.valid_of(gaps.begins_anew), before, place)
-            mean, *after = _scores_of_known(own, begins, kept, onset)
+            num = own.is_known.length(0).cast(F64)
+            own_place = _from_to(-num, graph.constant([0.0], F64))
+            begins = _latest(gaps.valid_of(gaps.begins_anew), -num - filled, own_place)
+            mean, *after = _scores_of_known(own, own_place, begins, kept, onset)
             mean = gaps.spread(mean, graph.constant([NOTHING_YET], F64))
             return [graph.where(made.is_known, mean, NOTHING_YET), *after]
 
@@ -514,21 +519,24 @@ def _onset_scores(
 
 
 def _scores_of_known(
-    measured: _Measured, begins: Value, kept: Sequence[Value], onset: OnsetClassifier
+    measured: _Measured,
+    place: Value,
+    begins: Value,
+    kept: Sequence[Value],
+    onset: OnsetClassifier,
 ) -> list[Value]:
     """Means of ``OnsetClassifier.scores``, how many blocks are known, and what is kept.
 
     Args:
         measured: of known blocks, ``k`` of them.
-        begins: the first block of each one's stream, ``[k]`` or ``[1]``; it and all places of
-            blocks are counted from the end of these.
+        place: of each, counted from behind the last, ``[k]``, float64.
+        begins: place of the first block of each one's stream, ``[k]`` or ``[1]``.
         kept: ``memory_sizes`` from scores on, but for empty parts.
         onset: that scores.
     """
     evidence, graph = onset.evidence, begins.graph
     fast, slow, num_filters = evidence.hand.fast, evidence.hand.slow, evidence.num_filters
     delay, windows, reach = evidence.delay, evidence.windows, len(evidence.step_matrix)
-    place = _from_end(measured.is_known)
     number = place - begins + 1.0  # of each block in its stream
     of_scores, *given, floors = kept
     shapes = [shape for shape in memory_shapes(onset) if all(shape)]
@@ -544,9 +552,9 @@ def _scores_of_known(
     def joined(rows: Value) -> Value:
         """Rows with those of the blocks before."""
         num_rows, width = shapes[len(after)]
-        all_rows = graph.concat(given[len(after)].reshape(num_rows, width), rows, axis=0)
-        after.append(all_rows.slice(-num_rows, END, 0).reshape(-1))
-        return all_rows
+        flat = graph.concat(given[len(after)], rows.reshape(-1), axis=0)
+        after.append(flat.slice(-num_rows * width, END, 0))
+        return flat.reshape(-1, width)
 
     def at(rows: Value, places: Value) -> Value:
         return graph.op("Gather", rows, places, axis=0)
@@ -567,7 +575,7 @@ def _scores_of_known(
         levels = at(joined(measured.means), of_steps)
         steps = graph.constant(evidence.step_matrix.T, F64) @ (levels - levels.slice(0, 1, 1))
         num_steps = evidence.step_matrix.shape[1]
-        sizes = joined(steps.abs().reshape(0, num_steps * len(slow)))
+        sizes = joined(steps.abs())
         to_follow.append(at(sizes, delayed.squeeze(1)))
     usual, now = _followed(graph.concat(*to_follow, axis=1), number, floors, evidence)
     num_logs = len(FLOORS_S) * num_filters * len(fast)
@@ -580,13 +588,24 @@ def _scores_of_known(
     inputs = scaled(columns, onset.scaler)
     if onset.lags:
         inputs = at(joined(inputs), of_lags).reshape(0, len(backs[-1]) * evidence.num_columns)
-    head: Any = onset.head
-    score = machine(inputs, head, F64) if isinstance(head, QuadraticForm) else head(inputs)
+    head = onset.head
+    is_form = isinstance(head, QuadraticForm)
+    score = machine(inputs, head, F64) if is_form else _network(inputs, head)
     score = graph.where(is_usable & (number > float(evidence.blind)), score, math.nan)
     scores = graph.concat(of_scores, score, axis=0)
     mean = at(scores, of_mean).mean(1)
     mean = graph.where(mean.isfinite(), mean, NOTHING_YET)
     return [mean, _last(number), scores.slice(1 - MEAN_HOPS, END, 0), *after, now]
+
+
+def _network(inputs: Value, head: Perceptron) -> Value:
+    """Its score of inputs, ``[k, K] -> [k]``; hops are columns, which is quicker for few."""
+    graph, z, last = inputs.graph, inputs, len(head.weights) - 1
+    for number, (weight, bias) in enumerate(zip(head.weights, head.biases, strict=True)):
+        layer = graph.constant(weight, F64), z, graph.constant(bias[:, None], F64)
+        z = graph.op("Gemm", *layer, transB=int(number == 0))
+        z = z * z.sigmoid() if number < last else z
+    return z.squeeze(0)
 
 
 def _followed(
@@ -861,11 +880,6 @@ def _from_to(start: Value, stop: Value) -> Value:
     """The numbers ``start``, ``start + 1`` and so on to before ``stop``, ``[1]`` both, float64."""
     graph = start.graph
     return graph.op("Range", start.squeeze(0), stop.squeeze(0), graph.constant(1.0, F64))
-
-
-def _from_end(rows: Value) -> Value:
-    """Places of rows, counted from behind the last, float64."""
-    return _from_to(-rows.length(0).cast(F64), rows.graph.constant([0.0], F64))
 
 
 def _latest(mask: Value, start: Value, values: Value) -> Value:

@@ -511,6 +511,7 @@ class OnsetEvidence:
             rises = torch.matmul(contrasts, torch.cat([levels, floors], 1))  # [k, R, F]
             alive = rises.sum(1).isfinite() & ((floors - quickest).amax(1) > 0.0)  # [k, F]
             alive = alive if fast is None else alive & fast
+            rises = torch.where(alive.unsqueeze(1), rises, 0.0)
             columns += _over_channels(rises, alive, num_fast, with_spread=True)
             if num_fast > 1:
                 columns += self._correlations(power, products, rises, alive)
@@ -519,11 +520,11 @@ class OnsetEvidence:
             known = known if slow is None else known & slow
             alive = known if alive is None else alive
             relative = steps / (step_floor + self.least_step)
+            relative = torch.where(known.unsqueeze(1), relative, 0.0)
             size = (relative.abs() + 1.0).log()
             columns += _over_channels(torch.cat([size, relative.sign() * size], 1), known, num_slow)
             if num_slow > 1:
-                of_known = torch.where(known.unsqueeze(1), relative, 0.0)
-                columns.append(of_known.sum(-1) / (of_known.abs().sum(-1) + _LEAST_STEPS))
+                columns.append(relative.sum(-1) / (relative.abs().sum(-1) + _LEAST_STEPS))
         assert alive is not None  # a hand has a channel
         num_alive = alive.type_as(steps if num_slow else power).sum(-1)
         return torch.cat(columns, -1)[..., self._order], num_alive >= float(self.min_alive)
@@ -566,7 +567,7 @@ class OnsetEvidence:
 
         Shape:
             - power: ``[k, W * B, F]``; products: ``[k, W * B, P]``; rises: ``[k, R, F]``, those of
-              power first; alive: ``[k, F]``
+              power first, 0 where not alive; alive: ``[k, F]``
             - output: ``[k, W * B]`` each
         """
         num_fast, num_pairs = len(self.hand.fast), self.pairs.shape[1]
@@ -577,8 +578,7 @@ class OnsetEvidence:
         rows = alive.unsqueeze(1)
         known = torch.where(rows, power, 1.0)
         own = torch.split(rises, [num_levels, len(self._contrasts[0]) - num_levels], 1)[0]
-        risen = torch.where(rows, own, 0.0).clamp(min=0.0)
-        of_channels = torch.cat([known, risen, rows.type_as(power)], 1)
+        of_channels = torch.cat([known, own.clamp(min=0.0), rows.type_as(power)], 1)
         of_pairs = (of_channels @ first) * (of_channels @ second)
         known, weight, both = torch.split(of_pairs, [num_levels, num_levels, 1], 1)
         square = torch.where(both > 0.0, products * products / known, 0.0)
@@ -934,12 +934,14 @@ def _over_channels(
 ) -> list[Tensor]:
     """Mean, largest, smallest, spread over channels in use, 0 of none; of one channel itself.
 
+    Values of others are 0.
+
     Shape:
         - values: ``[k, R, C]``; in_use: ``[k, C]``; output: ``[k, R]`` each
     """
     rows = in_use.unsqueeze(1)
     num = rows.type_as(values).sum(-1).clamp(min=1.0)
-    mean = torch.where(rows, values, 0.0).sum(-1) / num
+    mean = values.sum(-1) / num
     if num_channels == 1:
         return [mean]
     known = torch.where(rows, values, mean.unsqueeze(-1))
