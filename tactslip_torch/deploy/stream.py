@@ -89,8 +89,8 @@ def stream_graph(
     threshold = graph.input("threshold", F64, ("t",))
 
     onset = settings.onset
-    before = 0.0 if onset is None else math.nan  # what no stream has is no evidence
-    nothing = graph.constant(np.full((timing.tail, num_channels), before), dtype)
+    unknown = 0.0 if onset is None else math.nan  # what no stream has is no evidence
+    nothing = graph.constant(np.full((timing.tail, num_channels), unknown), dtype)
     no_sample = [math.nan] * num_channels + [0.0] * num_channels
     starts = [[0.0], [0.0], [0.0, 0.0, *rule_start(settings.rule)], _LATCH_START, no_sample]
     sizes = list(map(len, starts))
@@ -172,7 +172,7 @@ def stream_graph(
 
         Next to nothing is to be done while all is valid and low, and no alarm stands.
         """
-        is_whole, is_on = _is_whole(valid, lost), of_latch.slice(0, 1, 0) > 0.0
+        is_whole, is_off = _is_whole(valid, lost), of_latch.slice(0, 1, 0) <= 0.0
 
         def quietly() -> list[Value]:
             none, since = statistic >= high, graph.constant([0, 0, 1], F64)
@@ -186,7 +186,7 @@ def stream_graph(
             return [*gaps.latched(statistic, high, number, of_latch, *latch_times), gaps.lost_after]
 
         return graph.if_(
-            is_whole & (statistic.amax(0, keepdim=True) < high) & ~is_on,
+            is_whole & (statistic.amax(0, keepdim=True) < high) & is_off,
             quietly,
             lambda: graph.if_(is_whole, simply, with_gaps),
         )
@@ -253,8 +253,8 @@ def stream_graph(
         hops, first = (seen / hop).floor(), (before / hop).floor()
 
         def next_state(of_latch: Value, alarm_lost: Value, memory: Sequence[Value]) -> Value:
-            kept = (seen, decided, now_of_bins, of_latch, stuck, alarm_lost)
-            kept = (*kept, _last(rows).reshape(-1))
+            bin_now = _last(rows).reshape(-1)
+            kept = (seen, decided, now_of_bins, of_latch, stuck, alarm_lost, bin_now)
             return graph.concat(*kept, *memory, axis=0)
 
         def decide_hops() -> list[Value]:
@@ -264,7 +264,8 @@ def stream_graph(
             onset_score, after = _onset_scores(
                 held, samples - seen, number - hops, memory, onset, most_blocks
             )
-            by_onset = onset_score >= level(onset.threshold, F64)
+            high = level(onset.threshold, F64)
+            by_onset = onset_score >= high
             num_bins = ((samples + (of_bin - float(timing.first))) / of_bin).floor()
             if timing.frame > timing.first:
                 num_bins = graph.where(samples >= float(timing.frame), num_bins, 0.0)
@@ -275,7 +276,6 @@ def stream_graph(
             hinted = onset_score >= onset.hint
             if math.isfinite(onset.hint):
                 hinted |= by_onset  # as a threshold that is given may be below it
-            high = level(onset.threshold, F64)
             alarm, on, of_alarm, now_lost = raised(onset_score, high, number, is_known, alarm_lost)
             return [
                 given[..., 0],
@@ -300,10 +300,10 @@ def stream_graph(
         return graph.if_(hops > first, decide_hops, wait_for_hop)
 
     if onset is None:
-        *made, next_state = graph.if_(decided > made, decide, wait)
+        *columns, next_state = graph.if_(decided > made, decide, wait)
     else:
-        *made, next_state = join(onset)
-    for name, value in zip(outputs, made, strict=True):
+        *columns, next_state = join(onset)
+    for name, value in zip(outputs, columns, strict=True):
         graph.output(name, value, ("k", num_channels) if name == "channels_lost" else ("k",))
     graph.output("next_tail", held.slice(-timing.tail, END, 0), (timing.tail, num_channels))
     graph.output("next_state", next_state, (timing.state_size,))
@@ -589,8 +589,10 @@ def _scores_of_known(
     if onset.lags:
         inputs = at(joined(inputs), of_lags).reshape(0, len(backs[-1]) * evidence.num_columns)
     head = onset.head
-    is_form = isinstance(head, QuadraticForm)
-    score = machine(inputs, head, F64) if is_form else _network(inputs, head)
+    if isinstance(head, QuadraticForm):
+        score = machine(inputs, head, F64)
+    else:
+        score = _network(inputs, head)
     score = graph.where(is_usable & (number > float(evidence.blind)), score, math.nan)
     scores = graph.concat(of_scores, score, axis=0)
     mean = at(scores, of_mean).mean(1)

@@ -507,8 +507,7 @@ class OnsetEvidence:
         alive = None
         if num_fast:
             contrasts, quickest = self._contrasts
-            levels = power.log() * 0.5
-            rises = torch.matmul(contrasts, torch.cat([levels, floors], 1))  # [k, R, F]
+            rises = torch.matmul(contrasts, torch.cat([power.log(), floors], 1))  # [k, R, F]
             alive = rises.sum(1).isfinite() & ((floors - quickest).amax(1) > 0.0)  # [k, F]
             alive = alive if fast is None else alive & fast
             rises = torch.where(alive.unsqueeze(1), rises, 0.0)
@@ -531,7 +530,7 @@ class OnsetEvidence:
 
     @cached_property
     def _contrasts(self) -> tuple[Tensor, Tensor]:
-        """Levels and floors to rises, and what a channel that is not silent is above somewhere.
+        """Log powers and floors to rises, and what a channel that is not silent is above somewhere.
 
         Rises are those over the longest floor, of each window and filter; then those over the
         shorter ones, of the two shorter windows.
@@ -542,7 +541,7 @@ class OnsetEvidence:
         pairs = [(window, 0) for window in range(len(WINDOWS_S))]
         pairs += [(window, floor) for window in (0, 1) for floor in (1, 2)]
         levels, floors = (np.eye(3)[list(each)] for each in zip(*pairs, strict=True))
-        signs = np.kron(np.hstack([levels, -floors]), np.eye(self.num_filters))
+        signs = np.kron(np.hstack([levels / 2, -floors]), np.eye(self.num_filters))
         slower = torch.full_like(self.silence, math.inf).repeat(len(FLOORS_S) - 1, 1)
         return torch.from_numpy(signs), torch.cat([slower, self.silence])
 
