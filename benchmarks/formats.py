@@ -1,6 +1,6 @@
 """Reading and writing times beside the libraries: ``python -m benchmarks.formats``.
 
-One simulated recording in every format: written, loaded whole, read by stretches, and read by the
+One simulated recording in every format: written, loaded whole, read in parts, and read by the
 format's own library alone with the lines that anybody would write first. All are checked to read
 what was written.
 """
@@ -25,9 +25,9 @@ from benchmarks.timing import interleaved, on_threads, paired_ratio
 from tactslip_torch.data.formats import FORMATS, Archived, pieces
 from tactslip_torch.simulation.simulate import SimulatedRecordings
 
-LOAD, STRETCHES, SAVE, LIBRARY = "loaded whole", "read by stretches", "written", "by its library"
+LOAD, IN_PARTS, SAVE, LIBRARY = "loaded whole", "read in parts", "written", "by its library"
 SOURCES = ("tactslip_torch/data/formats/*.py",)
-WAYS = (LOAD, STRETCHES, SAVE, LIBRARY)
+WAYS = (LOAD, IN_PARTS, SAVE, LIBRARY)
 LIMITED = ("npz", "hdf5", "mcap")
 
 
@@ -37,24 +37,24 @@ class Formats(Benchmark):
 
     Args:
         duration_s: of the recording.
-        stretch_ms: read at a time where it is not read whole.
+        part_ms: read at a time where it is not read whole.
         rounds: of every call.
     """
 
     title = "Files"
     about = "a simulated recording of 24 channels at 2 kHz in float32, in every format on 1 thread"
-    charts: ClassVar = {"": (("Reading", ("whole, ms", "by stretches, ms", "by its library, ms")),)}
+    charts: ClassVar = {"": (("Reading", ("whole, ms", "in parts, ms", "by its library, ms")),)}
     quick = "duration_s=1.0 rounds=2"
     libraries = ("h5py", "mcap", "rosbags", "pyarrow")
     duration_s: float = 14.0
-    stretch_ms: float = 100.0
+    part_ms: float = 100.0
     rounds: int = 15
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Seconds of every way, each of which is checked first."""
         written = _recording(self.duration_s)
         samples = written.recording.samples
-        stretch = round(self.stretch_ms * 1e-3 * written.recording.sample_rate_hz)
+        part = round(self.part_ms * 1e-3 * written.recording.sample_rate_hz)
         with TemporaryDirectory() as folder, on_threads(1):
             calls: dict[str, Callable[[], Any]] = {}
             files = {name: Path(folder, f"a.{of.endings[0]}") for name, of in FORMATS.items()}
@@ -63,7 +63,7 @@ class Formats(Benchmark):
                 of.save(path, *written)
                 ways: dict[str, Callable[[], Any]] = {
                     LOAD: partial(of.load, path),
-                    STRETCHES: partial(_by_stretches, name, path, stretch),
+                    IN_PARTS: partial(_in_parts, name, path, part),
                     LIBRARY: partial(_LIBRARIES[name][1], path),
                 }
                 for read in ways.values():
@@ -85,17 +85,17 @@ class Formats(Benchmark):
                 {
                     "file": f".{file}",
                     "whole, ms": ms[LOAD],
-                    "by stretches, ms": ms[STRETCHES],
+                    "in parts, ms": ms[IN_PARTS],
                     "library": _LIBRARIES[name][0],
                     "by its library, ms": ms[LIBRARY],
                     "library / whole": paired_ratio(seconds[LIBRARY], seconds[LOAD]).median,
                 }
             )
             row = {"file": f".{file}", "ms": ms[SAVE], "kB": f"{size / 1e3:,.0f}"}
-            part = size / (samples.numel() * samples.element_size())
-            writing.append(row | {"bytes / samples": number(part)})
+            over = size / (samples.numel() * samples.element_size())
+            writing.append(row | {"bytes / samples": number(over)})
             if name in LIMITED:
-                for way in (LOAD, STRETCHES):
+                for way in (LOAD, IN_PARTS):
                     goals.append((f".{file} {way}, median", median(ms[way]), 100, "ms"))
         tables = {"Limits": limits(goals), "Reading": Table(reading), "Writing": Table(writing)}
         return {"tables": tables}
@@ -109,9 +109,9 @@ def _recording(duration_s: float) -> Archived:
     return Archived(whole, source.hand, dict(source.key(source.ids[0])))
 
 
-def _by_stretches(name: str, path: Path, stretch: int) -> torch.Tensor:
+def _in_parts(name: str, path: Path, part: int) -> torch.Tensor:
     with FORMATS[name].open(path) as opened:
-        return torch.cat(list(pieces(opened.samples, stretch)), 1)
+        return torch.cat(list(pieces(opened.samples, part)), 1)
 
 
 def _bytes(path: Path) -> int:
