@@ -543,8 +543,7 @@ def test_matrices_and_their_rate(tmp_path, name):
         assert (names, since, rate, samples.dtype) == (None, None, 250.0, torch.float32)
     assert read(path, Reading(time_first=False))[0].shape == (3, 60)
     assert "volts'" in refused(path, Reading(samples="clock"))
-    assert read(path, Reading(time="clock"))[2:] == (None, 250.0)  # it has its own rate
-    assert "'clock'" in refused(stored(path, volts=volts), Reading(time="clock"))
+    assert "'clock'" in refused(path, Reading(time="clock"))
     square = stored(tmp_path / name, volts=np.zeros((3, 3)))
     assert "reading.time_first" in refused(square)
 
@@ -559,8 +558,6 @@ def test_columns_and_their_times(tmp_path, name):
     assert (names, rate, samples.tolist()) == (("x", "y"), 500.0, [list(range(9))] * 2)
     assert since.tolist() == [2000 * i * 1e-6 for i in range(9)]
     path = tmp_path / name
-    named = read(path, Reading(time="clock", time_unit="ms"))  # a column of other files
-    np.testing.assert_allclose(named[2], since)  # by its size it counts from 1970 in microseconds
     samples, names, since, _ = read(path, Reading(channels=("y",), time=None))
     assert (names, since, samples.dtype) == (("y",), None, torch.float32)
     assert "say reading.channels" in refused(stored(path, x=np.zeros(9), y=np.zeros(8)))
@@ -723,8 +720,6 @@ def test_log_times_and_stamps_of_zero(tmp_path):
     since = read(path, Reading(time="log_time"))[2]
     assert since.tolist() == [n * 5 * STEP_NS / 1e9 for n in range(20)]
     assert read(path, Reading(time=None))[2] is None
-    of_table = read(path, Reading(time="clock", time_unit="ms"))[2]  # a column of other files
-    np.testing.assert_array_equal(of_table, read(path)[2])
 
 
 def blocks_of(values, lengths):

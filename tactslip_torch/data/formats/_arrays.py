@@ -156,14 +156,7 @@ def _choose(
     elif how.time == "auto":
         times = [array for array in columns if is_time(array.leaf)]
     else:
-        try:
-            times = apart(how.time, setting("reading.time"))
-        except Refused:  # the name may be that of other files of the folder
-            times = [array for array in columns if is_time(array.leaf)]
-            has_rate = any(array.sample_rate_hz for array in arrays) or _single_rate(arrays, "")
-            if not (times or has_rate):
-                raise
-            how = replace(how, time="auto", time_unit=None)
+        times = apart(how.time, setting("reading.time"))
     label = how.label
     words = _label_words(found, how, separator)
     labels = [] if words else apart(None if label is None else label.name, "labels.column")

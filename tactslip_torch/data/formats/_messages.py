@@ -272,9 +272,6 @@ class TopicColumns:
             raise Refused(f"{what} numbers an instant, 1 to {_MOST_NUMBERS} are read")
         if names is not None and len(set(names)) < num_columns:
             raise Refused("two numbers of one name")
-        if isinstance(how.time, str) and how.time not in ("auto", _LOG_TIME, *(names or ())):
-            how = replace(how, time="auto", time_unit=None)  # of other files: messages have times
-        self._how = how
         if how.time == _LOG_TIME or (how.time == "auto" and (is_stamped or names is None)):
             how = replace(how, time=None)
         self._chosen = chosen_columns(names, num_columns, replace(how, label=None))
@@ -339,7 +336,7 @@ class _TopicSamples(TopicColumns):
 
     def __init__(self, first: Message, types: Types | None, how: Reading, stack: ExitStack) -> None:
         super().__init__(first, types, how)
-        self._stack = stack
+        self._how, self._stack = how, stack
         self.spool = Spool(self.num_channels, "f4" if self.is_small else "f8", stack)
         self._marks: list[tuple[int, int, int]] = []  # when recorded, stamp or 0, samples
         self._named: list[Any] = []  # the times that ``how`` names

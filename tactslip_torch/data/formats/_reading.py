@@ -130,7 +130,6 @@ class Reading:
     Args:
         sample_rate_hz: of files without times: samples a second of each channel.
         time: the column, dataset, variable or field of times, by name or by number from 0.
-            Arrays and messages without it go by their own times or rate.
             ``"auto"``: what is called ``time``, ``t``, ``timestamp`` or the like; of a table
             without names the first column, unless the rate is given. ``None``: there is none.
         time_unit: of those times; ``None``: as their name or a line of units says, else by the
