@@ -32,8 +32,9 @@ def batch_of(onsets=(2.0, 6.0), ends=(4.0, 8.0), stretches=(), roles=None, slip_
     return RecordingFeatures(RecordingId("M1", 0), *columns, *sensed, times, hop_s, roles)
 
 
-def events_of(batch, says_slip):
-    part = evaluation.evaluated_bins(batch, says_slip, {})["test"]
+def events_of(batch, says_slip, is_valid=None):
+    is_valid = torch.ones_like(says_slip) if is_valid is None else is_valid
+    part = evaluation.evaluated_bins(batch, says_slip, is_valid, {})["test"]
     return {name: own[0] for name, own in evaluation.events_by_rule([part], LATENCY).items()}
 
 
@@ -44,10 +45,13 @@ def seen(events):
 # -------------------------------------------------------------------------------- what rules see
 
 
-def plain_alarms(decisions, name):
+def plain_alarms(decisions, is_valid, name):
     """Whether each decision raises an alarm: the paper's rule, and two of three, by hand."""
     last, was_on, raised = deque(maxlen=3), False, []
-    for decision in decisions:
+    for decision, counts in zip(decisions, is_valid, strict=True):
+        if not counts:
+            raised.append(False)
+            continue
         last.append(bool(decision))
         is_on = last[-1] if name == "first_transition" else sum(last) >= 2
         raised.append(is_on and not was_on)
@@ -63,11 +67,13 @@ def test_random_decisions_raise_the_alarms_that_rules_by_hand_do(layout, hop_ms)
     is_apart = batch.stroke == -1
     groups = [batch.stroke == 0, batch.stroke == 1]
     groups += [is_apart & (batch.ends_s < 10.1), is_apart & (batch.ends_s > 10.4)]
-    for share, name in itertools.product((0.2, 0.5, 0.8), evaluation.RULES):
-        decisions = torch.rand(len(batch.is_slip), generator=generator) < share
-        events, alarms = events_of(batch, decisions)[name], []
+    for share, name, lost in itertools.product((0.2, 0.5, 0.8), evaluation.RULES, (0.0, 0.4)):
+        random = torch.rand(2, len(batch.is_slip), generator=generator)
+        is_valid = random[1] >= lost
+        decisions = (random[0] < share) & is_valid
+        events, alarms = events_of(batch, decisions, is_valid)[name], []
         for rows in groups:
-            raised = torch.tensor(plain_alarms(decisions[rows], name))
+            raised = torch.tensor(plain_alarms(decisions[rows], is_valid[rows], name))
             alarms += (batch.ends_s[rows][raised] + 0.0125).tolist()
         own = [onset.num_alarms for onset in events.onsets]
         windows = ((2.0 - 0.2, 4.0 + 0.1125), (6.0 - 0.2, 8.0 + 0.1125))
@@ -94,7 +100,7 @@ def test_a_split_by_bin_has_no_events_and_says_why():
     num = len(whole.is_slip)
     some = torch.arange(num) % 5 > 0
     apart = batch_of(roles={"train": some, "test": ~some, "unseen": torch.zeros_like(some)})
-    parts = evaluation.evaluated_bins(apart, apart.is_slip, {})
+    parts = evaluation.evaluated_bins(apart, apart.is_slip, torch.ones_like(apart.is_slip), {})
     assert {role: part.is_whole for role, part in parts.items()} == {"train": False, "test": False}
     assert sum(len(part.says_slip) for part in parts.values()) == num
     events = {role: evaluation.events_by_rule([part], LATENCY) for role, part in parts.items()}
@@ -103,7 +109,9 @@ def test_a_split_by_bin_has_no_events_and_says_why():
         for numbers in by_rule.values():
             assert numbers["reason"] == evaluation.BINS_APART
             assert numbers["found"] is numbers["false_alarms_per_minute"] is None
-    of_whole = evaluation.evaluated_bins(whole, whole.is_slip, {})["test"]
+    of_whole = evaluation.evaluated_bins(whole, whole.is_slip, torch.ones_like(whole.is_slip), {})[
+        "test"
+    ]
     assert evaluation.events_by_rule([of_whole, parts["test"]], LATENCY) == {
         name: [] for name in evaluation.RULES
     }

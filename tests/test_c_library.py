@@ -394,7 +394,10 @@ def test_where_float32_is_off_the_default_is_float64_and_says_why(typed, tmp_pat
     ("words", "said"),
     [
         (["graph=native", "native.scale=0"], "native.scale must not be 0, got 0"),
-        (["graph=native", "native.scale=[1.0,0]"], "native.scale must be .* of 24 channels, got"),
+        (
+            ["graph=native", "native.scale=[" + "1.0," * 23 + "0]"],
+            "native.scale must not be 0, got",
+        ),
         (["graph=native", "native.scale=true"], "native.scale must be a finite number.* got True"),
         (
             ["graph=native", "native.offset=abc"],

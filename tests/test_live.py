@@ -251,6 +251,15 @@ LINES = {
         [[1, 2, 3, 4], NAN, [1, 2, 3, 4]],
         "anew, with the columns PVDF2",
     ),
+    **{
+        f"a boot message of {len(line)} letters": (f"{line}\n1,2,3,4\n", [[1, 2, 3, 4]], "line")
+        for line in (
+            "rst:0x1 (POWERON_RESET),boot:0x13 (SPI_FAST_FLASH_BOOT)",
+            "E (123) adc, timeout",
+            "mode:DIO, clock div:1, b, c",
+            "Ready, all of it",
+        )
+    },
     "no names": ("Booting from flash now\n1,2,3,4\n", [[1, 2, 3, 4]], "no number: 'Booting"),
     "names twice": ("SG1,SG1,SG2,PVDF1,PVDF2\n1,2,3,4\n", [[1, 2, 3, 4]], "has 5 values"),
 }

@@ -311,7 +311,7 @@ def test_a_time_that_counts_the_rows_asks_for_the_rate(tmp_path):
     found = slips(tmp_path, time=np.arange(400), slip=[0] * 200 + [1] * 200)
     question, *_ = propose(found).questions
     assert (question.name, question.flag, question.default) == ("rate_hz", "--rate HZ", "")
-    assert "column time counts rows: 0, 1, 2; if in seconds, add --time-unit s" in question.text
+    assert "column time counts rows, by 1; if in seconds, add --time-unit s" in question.text
     data = propose(found, Answers(rate_hz=100.0)).settings["data"]
     assert (data["reading"]["time"], data["reading"]["sample_rate_hz"]) == (None, 100.0)
     assert [row["name"] for row in data["channels"]] == ["a", "b"]

@@ -72,13 +72,8 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     if not isinstance(config.seed, int):
         raise ValueError(f"seed must be a whole number, got {config.seed!r}")
     L.seed_everything(config.seed, verbose=False)
-    experiment = _experiment(config)
-
-    def after_save(detector: SlipDetector) -> dict[str, Any]:
-        save_config(config, folder)  # not before: the results of an earlier run may be there
-        return experiment.alarm(detector) if experiment.alarm else {}
-
-    found = run_experiment(replace(experiment, alarm=after_save), folder)
+    experiment = replace(_experiment(config), after_save=partial(save_config, config, folder))
+    found = run_experiment(experiment, folder)
     metrics = common_metadata(experiment.maker, config) | found
     metrics["timing_s"]["total"] = time.perf_counter() - started
     features = metrics.pop("features")

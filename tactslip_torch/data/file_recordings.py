@@ -203,7 +203,7 @@ def _head_of(opened: Opened, path: Path, given: _Given, stated_hz: float | None 
     rate = stated or clock.sample_rate_hz
     if not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
         raise ValueError(
-            f"{path} is of {rate:g} Hz, and tactile sensors of 1 Hz to 1 MHz; "
+            f"{path} is of {rate:g} Hz; tactile sensors have 1 Hz to 1 MHz: "
             f"if its times are in another unit, say {setting('reading.time_unit')}=s, ms, us or ns"
         )
     return _Head(
@@ -261,7 +261,7 @@ def _hand_of(opened: Opened, given: _Given) -> tuple[HandLayout, Sequence[int]]:
     has = _some(own) if own else f"{num} without names"
     if rows and not is_ordered:
         lacking = [name for name, place in places.items() if place is None]
-        what = f"no channel {_some(lacking)}" if lacking else "two channels in one column"
+        what = f"no channel {_some(lacking)}" if lacking else "one column for two channels"
         raise ValueError(f"has {what} of data.channels; it has {has}")
     how = (
         "; name its columns so, or list them in the order of the hand as "

@@ -511,7 +511,7 @@ def _propose_rate(found: Look, given: Answers, draft: Proposal) -> float:
     if not has_times:
         no_times = "the files have no times"
         if table.row_number:
-            no_times = f"{table.row_number} counts rows: 0, 1, 2; if in seconds, add --time-unit s"
+            no_times = f"{table.row_number} counts rows, by 1; if in seconds, add --time-unit s"
         if wrong or table.row_number or not table.rate_hz:
             why = "the times are uneven; samples are taken as even"
             draft.set(f"{reading}.time", None, why if wrong else no_times)

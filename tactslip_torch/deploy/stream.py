@@ -478,7 +478,7 @@ def _onset_scores(
     Args:
         held: samples, NaN before a stream.
         ends: where the blocks of these hops end, counted from the end of the samples.
-        place: of these hops, counted from behind the last.
+        place: of these hops: -1 is the last of them.
         memory: ``memory_sizes``, but for empty parts.
         onset: that scores.
         most: lost blocks in a row, beyond which the memory begins anew.
@@ -529,7 +529,7 @@ def _scores_of_known(
 
     Args:
         measured: of known blocks, ``k`` of them.
-        place: of each, counted from behind the last, ``[k]``, float64.
+        place: of each: -1 is the last, ``[k]``, float64.
         begins: place of the first block of each one's stream, ``[k]`` or ``[1]``.
         kept: ``memory_sizes`` from scores on, but for empty parts.
         onset: that scores.

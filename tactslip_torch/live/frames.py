@@ -39,6 +39,7 @@ _MOST_MISSING_S = 10.0  # by a counter; what lacks more is another stream
 _BETWEEN = re.compile(r"[ \t]{0,99}[,;][ \t]{0,99}| *\t *| +")
 """Between the values of a line; what is empty between two of them is missing."""
 _NUMBERED = re.compile(r"(ch|C)\d+")  # names of channels of recordings that have none
+_NAME = re.compile(r"[^\W\d][\w ./-]*([\[(][^])]*[\])])?")  # of a column, with its unit
 _MARKS = re.compile(r"[,;\t]")
 """Between names, which may have blanks within where there are such marks."""
 
@@ -335,7 +336,9 @@ class _LineReader(FrameReader):
             return
         cells = [part.strip("\"'") for part in self._parts(line, _MARKS)]
         lacking = [name for name in self._channels if place_of(name, cells) is None]
-        if len(set(cells)) == len(cells) and lacking:
+        if not len(set(cells)) == len(self._names) > 1 or not all(map(_NAME.fullmatch, cells)):
+            return
+        if lacking:
             raise ValueError(
                 f"the sender names its columns {', '.join(cells[:8])}, but has no "
                 f"{', '.join(lacking[:5])} of the detector; name them so, or say by frame.columns "

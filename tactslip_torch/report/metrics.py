@@ -194,7 +194,8 @@ def merged_metrics(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             }
         else:
             groups[kind] = {label: summed_metrics(of) for label, of in by_label.items()}
-    return {**summed_metrics(scores), **groups}
+    not_valid = {"num_not_valid": sum(own.get("num_not_valid", 0) for own in scores)}
+    return {**summed_metrics(scores), **not_valid, **groups}
 
 
 def weights_at_share(is_slip: Tensor, slip_share: float) -> Tensor:

@@ -88,7 +88,8 @@ def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[st
 
 def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> None:
     """Print the tables of a run."""
-    texts = [_splits_table(metrics), *_comparison_lines(metrics), *_trained_on_lines(metrics)]
+    texts = [_splits_table(metrics), *_not_valid_lines(metrics), *_comparison_lines(metrics)]
+    texts += _trained_on_lines(metrics)
     texts.append(_materials_table(metrics))
     for key, tables in (
         ("events", (_events_table,)),
@@ -116,6 +117,16 @@ def _percents(scores: Mapping[str, Any], titles: Mapping[str, str]) -> _Row:
 
 def _score_cells(scores: Mapping[str, Any]) -> _Row:
     return _percents(scores, _SCORES) | {"bins": scores.get("num_bins")}
+
+
+def _not_valid_lines(metrics: _Metrics) -> list[str]:
+    """One for each split that has bins without a valid decision."""
+    return [
+        f"{name}: {num} of {scores['num_bins']} bins have too few channels alive, so that their "
+        "decision is not valid; they count as non-slip"
+        for name, scores in metrics["splits"].items()
+        if (num := scores.get("num_not_valid"))
+    ]
 
 
 def _splits_table(metrics: _Metrics) -> str:

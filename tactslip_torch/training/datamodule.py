@@ -215,7 +215,7 @@ class FeatureMaker:
     ) -> KeptFeatures:
         key = self._key(recording, bins)
         cached = None if self.cache is None else self.cache.load(key, self.pool.selected)
-        if cached is not None and len(cached.features) == len(bins.starts):
+        if cached is not None and {len(each) for each in cached[:3]} == {len(bins.starts)}:
             return cached
         loaded = self._load(recording, times, bins)
         with torch.no_grad():
@@ -232,7 +232,7 @@ class FeatureMaker:
         """What ``KeptFeatures`` says of samples ``[C, T]`` and filtered bins ``[N, C, n]``."""
         runs = run_lengths(samples)
         frames = bins.starts, bins.bin_samples, self.channel_filter.reaches
-        loudest = largest_in_frames(samples.abs().double(), *frames)
+        loudest = largest_in_frames(samples.abs(), *frames).double()
         span = (cut.amax(-1) - cut.amin(-1)).double()
         is_more = span * self.pool.inverse_span(samples.dtype, is_raw=True) > loudest
         return span.where(is_more, 0.0), largest_in_frames(runs, *frames), longest_run_of(runs)

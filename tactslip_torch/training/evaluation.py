@@ -58,13 +58,15 @@ class EvaluatedBins(NamedTuple):
 
     Attributes:
         bins: which they are; without features.
-        says_slip: of the detector, ``[N]``, bool.
+        says_slip: of the detector, ``[N]``, bool; not where the decision is not valid.
+        is_valid: whether the decision is, ``[N]``, bool.
         baselines: decisions of baselines by name, ``[N]`` each.
         is_whole: whether these are all bins of the recording.
     """
 
     bins: RecordingFeatures
     says_slip: Tensor
+    is_valid: Tensor
     baselines: Mapping[str, Tensor]
     is_whole: bool
 
@@ -102,14 +104,17 @@ class Outcomes(NamedTuple):
 def evaluated_bins(
     batch: RecordingFeatures,
     says_slip: Tensor,
+    is_valid: Tensor,
     baselines: Mapping[str, Tensor],
 ) -> dict[str, EvaluatedBins]:
     """Decisions ``[N]`` on the bins of a recording, for each role that some of them have."""
-    light = batch._replace(features=batch.features[:, :0])
+    heavy = ("features", "span", "run")
+    light = batch._replace(**{name: getattr(batch, name)[:, :0] for name in heavy})
     return {
         role: EvaluatedBins(
             light.of(mask),
             says_slip[mask],
+            is_valid[mask],
             {name: decisions[mask] for name, decisions in baselines.items()},
             bool(mask.all()),
         )
@@ -119,7 +124,10 @@ def evaluated_bins(
 
 
 def bin_scores(parts: Sequence[EvaluatedBins]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """``bin_metrics`` of the detector, and ``split_metrics`` of each baseline, on all bins."""
+    """``bin_metrics`` of the detector, and ``split_metrics`` of each baseline, on all bins.
+
+    Those of the detector have ``num_not_valid`` too: bins on which its decision is not valid.
+    """
     truth = torch.cat([part.bins.is_slip for part in parts])
     places = torch.cat([part.bins.position for part in parts]).tolist()
     scores = bin_metrics(
@@ -130,6 +138,7 @@ def bin_scores(parts: Sequence[EvaluatedBins]) -> tuple[dict[str, Any], dict[str
         [part.bins.recording.scene for part in parts for _ in part.says_slip],
         [None if place == NO_POSITION else place for place in places],
     )
+    scores["num_not_valid"] = sum(int((~part.is_valid).sum()) for part in parts)
     return scores, {
         name: split_metrics(
             confusion_matrix(truth, torch.cat([part.baselines[name] for part in parts]))
@@ -229,18 +238,23 @@ def _watched(part: EvaluatedBins, rule: KOfN, latency: LatencyParts) -> EventRec
 
     It starts anew with every stroke and every unbroken stretch of bins of no stroke, whatever order
     their labels put them in. Watched is from one hop before the first decision of such a stretch to
-    the last one.
+    the last one. The rule passes over decisions that are not valid.
     """
     bins, times = part.bins, part.bins.times
     order = np.lexsort((bins.ends_s.numpy(), bins.stroke.numpy() < 0))
     available_s = (bins.ends_s + latency.look_ahead_s).numpy()[order]
     says_slip, stroke = part.says_slip.numpy()[order], bins.stroke.numpy()[order]
+    is_valid = part.is_valid.numpy()[order]
     is_apart = np.diff(available_s) > bins.hop_s + 1e-6
     is_new = (np.diff(stroke) != 0) | ((stroke[1:] < 0) & is_apart)
     stretches = np.split(np.arange(len(stroke)), np.flatnonzero(is_new) + 1)
     alarms: list[tuple[float, float]] = []
     seen: list[tuple[float, float]] = []
     for rows in sorted(stretches, key=lambda rows: float(available_s[rows[0]])):
+        before = seen[-1][1] if seen else -math.inf  # a hop may be longer than a bin
+        begin_s, end_s = float(available_s[rows[0]]), float(available_s[rows[-1]])
+        seen.append((max(begin_s - bins.hop_s, before), end_s))
+        rows = rows[is_valid[rows]]
         hops_s = available_s[rows]
         statistic, _ = rule.scan_row(says_slip[rows].astype(float).tolist(), rule.start(), float)
         alarm, is_on, _ = latch(statistic, 1.0, rearm=1, refractory=0)
@@ -248,8 +262,6 @@ def _watched(part: EvaluatedBins, rule: KOfN, latency: LatencyParts) -> EventRec
         off = np.append(np.flatnonzero(np.logical_not(is_on)), len(rows))
         ends = np.append(hops_s, math.inf)[off[np.searchsorted(off, raised)]]
         alarms += zip(hops_s[raised].tolist(), ends.tolist(), strict=True)
-        before = seen[-1][1] if seen else -math.inf  # a hop may be longer than a bin
-        seen.append((max(float(hops_s[0]) - bins.hop_s, before), float(hops_s[-1])))
     first = []
     for number, release_s in enumerate(first_releases(times.onsets_s, times.released_s)):
         is_later = says_slip & (stroke == number) & (available_s >= release_s)

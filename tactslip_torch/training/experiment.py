@@ -65,6 +65,8 @@ class Experiment:
             folds; those of folds then show what to expect of it, in place of a nested validation.
         keep_bins: writes the sample of the training bins of a detector into a folder; of several
             folds only of the last detector, where there is one. ``None``: nothing does.
+        after_save: called when a detector was written. Before, nothing of an earlier run in the
+            folder has changed.
     """
 
     maker: FeatureMaker
@@ -79,6 +81,7 @@ class Experiment:
     export: Callable[[SlipDetector, Path], dict[str, Any]] | None = None
     train_on_all: bool = False
     keep_bins: Callable[[SlipDetector, SampledBins, Path], None] | None = None
+    after_save: Callable[[], None] | None = None
 
 
 def run_experiment(experiment: Experiment, folder: Path) -> dict[str, Any]:
@@ -151,6 +154,8 @@ def _run_fold(experiment: Experiment, data: SlipDataModule, folder: Path) -> dic
     onnx: dict[str, Any] = {}
     if trainer.is_global_zero:
         detector.save(folder / "detector.pt")  # stays, whatever comes
+        if experiment.after_save:
+            experiment.after_save()
         if experiment.keep_bins and learner.sample is not None:
             experiment.keep_bins(detector, learner.sample, folder)
         alarm = experiment.alarm(detector) if experiment.alarm else {}

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 import time
-from collections import Counter
 from typing import Any
 
 import lightning as L
@@ -30,8 +28,6 @@ from tactslip_torch.training.evaluation import (
     events_by_rule,
 )
 from tactslip_torch.training.recipe import General, Recipe
-
-log = logging.getLogger(__name__)
 
 
 class SlipLearner(L.LightningModule):
@@ -85,7 +81,6 @@ class SlipLearner(L.LightningModule):
         self.outcomes: dict[str, Outcomes] = {}
         self.seconds: dict[str, float] = {}
         self._evaluated: dict[str, list[EvaluatedBins]] = {}
-        self._not_valid: Counter[str] = Counter()
         # nothing is trained by it: torch's DistributedDataParallel refuses a module without one
         self._anchor = nn.Parameter(torch.zeros(()))
 
@@ -122,7 +117,6 @@ class SlipLearner(L.LightningModule):
         if self.detector is None:
             raise ValueError("nothing to test: fit first, or give the learner a detector")
         self._evaluated = {role: [] for role in ROLES}
-        self._not_valid = Counter()
 
     @one_thread()  # a recording is small: threads would mostly wait
     def test_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
@@ -136,10 +130,9 @@ class SlipLearner(L.LightningModule):
         scaled = detector.scaled(chosen.to(device), is_lost if is_lost.any() else None)
         says_slip = (detector.head(scaled) >= 0) & is_valid
         baselines = self.baselines(batch.features, scaled.cpu()) if self.baselines else {}
-        for role, part in evaluated_bins(batch, says_slip.cpu(), baselines).items():
+        parts = evaluated_bins(batch, says_slip.cpu(), is_valid.cpu(), baselines)
+        for role, part in parts.items():
             self._evaluated[role].append(part)
-        for role, mask in batch.roles.items():
-            self._not_valid[role] += int((~is_valid.cpu() & mask).sum())
 
     @one_thread()
     def on_test_epoch_end(self) -> None:
@@ -153,16 +146,12 @@ class SlipLearner(L.LightningModule):
             self.detector.look_ahead / pool.sample_rate_hz, pool.bin_samples / pool.sample_rate_hz
         )
         of_processes = gathered(self._evaluated)
-        not_valid = sum(gathered(self._not_valid), Counter[str]())
         for role in ROLES:
             parts = [part for own in of_processes for part in own[role]]
             parts.sort(key=lambda part: part.bins.recording)
             if not parts:
                 continue
             scores, of_baselines = bin_scores(parts)
-            if num := not_valid[role]:
-                text = "%s: %d of %d bins have too few channels that move; they count as non-slip"
-                log.warning(text, role, num, scores["num_bins"])
             for name, found in of_baselines.items():
                 baselines[name]["splits"][role] = found
             self.metrics["splits"][role] = scores
