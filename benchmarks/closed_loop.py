@@ -49,7 +49,7 @@ SOURCES = (
 _CYCLE = ("gradual", "sudden", "heavy", "gradual", "sudden", "steady") * 2
 _KINDS = (*_CYCLE[:-1], "sudden, 1.4")
 """Of lifts, in turn; the last is shown apart, as few grips can save it."""
-_ALARM, _SET_HERE, _NEVER = "alarm", "alarm set on lifts", "no reflex"
+_ALARM, _NEVER = "alarm", "no reflex"
 _CUSUM_CEILING = 1.5  # over its threshold: it comes down when a slip has ended
 
 
@@ -61,8 +61,7 @@ class ClosedLoop(Benchmark):
         lifts: how many; a twelfth of them are loaded with 1.4 times the limit, shown apart.
         delays_ms: of the actuator.
         calibration: lifts of lighter objects of seen materials, which do not slip, with a grip
-            raised by nobody's alarm, in which neither energy nor CUSUM may reach its threshold, nor
-            an alarm that is set anew on them, as ``tactslip calibrate`` does it for a user.
+            raised by nobody's alarm, in which neither energy nor CUSUM may reach its threshold.
         detector: shipped one or file, trained on ``SEEN_MATERIALS``; empty: the one whose alarm
             ``python -m benchmarks.alarms`` has set with its first seed.
     """
@@ -143,9 +142,8 @@ class ClosedLoop(Benchmark):
             "*peak grip*: median and, in brackets, 95 % quantile. Grips are multiples of the "
             "lowest grip that holds the largest load. *Late*: from the begin of a slide to the "
             "first tightening in it, median. *False*: the grip was tightened although no pad had "
-            "slid in the quarter second before. The thresholds of energy, of CUSUM and of the "
-            f"*alarm set on lifts* are the highest values in {numbers['calibration']} lifts of "
-            "seen materials without slip; its hint is the highest value in all of them but one."
+            "slid in the quarter second before. The thresholds of energy and CUSUM are the highest "
+            f"values in {numbers['calibration']} lifts of seen materials without slip."
         )
         kinds = [
             {"dropped %, by load": kind}
@@ -200,21 +198,18 @@ def _percents(shares: list[float] | None) -> str:
 
 
 def _thresholds(detector: SlipDetector, num: int) -> dict[str, float]:
-    """What energy, CUSUM and the alarm reach at most, in lifts without slip; and all but one."""
-    energy, cusum, scores = -np.inf, -np.inf, []
+    """What energy and CUSUM reach at most, in lifts without slip."""
+    energy, cusum = -np.inf, -np.inf
     for number in range(num):
         lift = Lift(
             10_000 + number, "steady", mass=(0.4, 0.6), materials=SEEN_MATERIALS, tightens=True
         )
         of_energy = Energy(list(detector.pool.hand.fast))
         of_cusum = Listening(detector, _by_cusum(detector, np.inf))
-        of_alarm = Listening(detector, AlarmSettings.of(detector).at_threshold(np.inf))
-        for trigger in (of_energy, of_cusum, of_alarm):
+        for trigger in (of_energy, of_cusum):
             run_lift(lift, trigger, 0.01)
         energy, cusum = max(energy, of_energy.highest), max(cusum, of_cusum.highest)
-        scores.append(of_alarm.highest)
-    hint = sorted(scores)[-2:][0]
-    return {"energy": energy, "cusum": cusum, "alarm": max(scores), "hint": hint}
+    return {"energy": float(energy), "cusum": float(cusum)}
 
 
 def _by_cusum(detector: SlipDetector, threshold: float) -> AlarmSettings:
@@ -222,15 +217,6 @@ def _by_cusum(detector: SlipDetector, threshold: float) -> AlarmSettings:
     settings, hop = AlarmSettings.of(detector), 2 * HOP
     rule = Cusum(evidence=hop / detector.pool.bin_samples, ceiling=_CUSUM_CEILING * threshold)
     return replace(settings, onset=None, hop_samples=hop, rule=rule, threshold=threshold)
-
-
-def _set_here(detector: SlipDetector, set_by: Mapping[str, float]) -> AlarmSettings:
-    """The alarm behind what lifts without slip reach, its hint behind what all but one reach."""
-    alarm, hint = (float(np.nextafter(set_by[name], np.inf)) for name in ("alarm", "hint"))
-    settings = AlarmSettings.of(detector).at_threshold(alarm)
-    if settings.onset is None:
-        return settings
-    return replace(settings, onset=replace(settings.onset, hint=hint))
 
 
 def _triggers(
@@ -242,7 +228,7 @@ def _triggers(
     fast = list(detector.pool.hand.fast)
     return {
         _ALARM: partial(Listening, detector),
-        _SET_HERE: partial(Listening, detector, _set_here(detector, set_by)),
+        "alarm and hint": partial(Listening, detector, with_hint=True),
         "energy": partial(Energy, fast, above * set_by["energy"]),
         "CUSUM": partial(Listening, detector, cusum),
         "oracle": Oracle,

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -202,31 +201,34 @@ class Energy:
 
 
 class Listening:
-    """A ``StreamingDetector``, its alarm and, where its decisions have one, its hint.
+    """A ``StreamingDetector``, its alarm and, if wanted, its hint.
 
     Attributes:
-        highest: what has a threshold so far, once the grip has closed: the score of slipping now,
-            or the statistic of the rule on bins.
+        highest: statistic of the rule so far, once the grip has closed.
     """
 
-    def __init__(self, detector: SlipDetector, settings: AlarmSettings | None = None) -> None:
-        self._stream = StreamingDetector(detector, settings)
-        self._is_on, self.highest = False, -math.inf
+    def __init__(
+        self,
+        detector: SlipDetector,
+        settings: AlarmSettings | None = None,
+        *,
+        with_hint: bool = False,
+    ) -> None:
+        self._stream, self._with_hint = StreamingDetector(detector, settings), with_hint
+        self._is_high, self.highest = False, -math.inf
 
     def hear(self, volts: Array, pads: Pads) -> int:
-        """Slip while an alarm stands."""
-        decisions = self._stream.push(volts)
+        """Slip while the threshold is reached: an alarm stands longer, and the slip may be over."""
+        decisions, settings = self._stream.push(volts), self._stream.settings
         if not len(decisions.number):
-            return 2 * int(self._is_on)
-        self._is_on = bool(decisions.is_on[-1])
-        has_onset = self._stream.settings.onset is not None
-        values = decisions.onset_score if has_onset else decisions.statistic
-        late = values[decisions.available_s > WATCHED_S].nan_to_num(-math.inf)
+            return 2 * int(self._is_high)
+        reached = decisions.statistic >= settings.threshold
+        self._is_high = bool((decisions.by_onset if settings.onset else reached)[-1])
+        late = decisions.statistic[decisions.available_s > WATCHED_S].nan_to_num(-math.inf)
         self.highest = max([self.highest, *late.tolist()])
-        if self._is_on or bool(decisions.is_alarm.any()):
+        if self._is_high or bool(decisions.is_alarm.any()):
             return 2
-        hint = getattr(decisions, "is_hint", torch.zeros(1))
-        return int(bool(hint.any()))
+        return int(self._with_hint and bool(decisions.is_hint.any()))
 
 
 @dataclass
