@@ -542,7 +542,7 @@ def test_a_rate_that_no_sensor_has_is_asked_for(tmp_path, rate, is_read):
     if is_read:
         assert FileRecordings(tmp_path).sample_rate_hz == rate
     else:
-        said = re.escape(f"a.csv is of {rate:g} Hz; tactile sensors have 1 Hz to 1 MHz:")
+        said = re.escape(f"a.csv: is of {rate:g} Hz; tactile sensors have 1 Hz to 1 MHz:")
         refused(f"{said} .* say data.reading.time_unit=", tmp_path)
 
 

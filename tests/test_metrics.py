@@ -78,7 +78,9 @@ def test_folds_merged_count_the_scenes_that_all_bins_together_would(scenes):
     together = bin_metrics(
         torch.tensor(truth), torch.tensor(predicted), materials, [20.0] * 120, own
     )
-    assert merged_metrics(of_fold) == together
+    for number, scores in enumerate(of_fold):
+        scores["num_not_valid"] = 3 + number
+    assert merged_metrics(of_fold) == together | {"num_not_valid": 7}
 
 
 @pytest.mark.parametrize("slip", [True, False])
