@@ -256,7 +256,7 @@ LINES = {
         for line in (
             "rst:0x1 (POWERON_RESET),boot:0x13 (SPI_FAST_FLASH_BOOT)",
             "E (123) adc, timeout",
-            "mode:DIO, clock div:1, b, c",
+            "rst:0x1,boot:0x13,mode:DIO,load:0x3f",
             "Ready, all of it",
         )
     },
