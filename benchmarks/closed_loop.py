@@ -49,7 +49,7 @@ SOURCES = (
 _CYCLE = ("gradual", "sudden", "heavy", "gradual", "sudden", "steady") * 2
 _KINDS = (*_CYCLE[:-1], "sudden, 1.4")
 """Of lifts, in turn; the last is shown apart, as few grips can save it."""
-_ALARM, _NEVER = "alarm", "no reflex"
+_OURS, _NEVER = "alarm and hint", "no reflex"
 _CUSUM_CEILING = 1.5  # over its threshold: it comes down when a slip has ended
 
 
@@ -126,7 +126,7 @@ class ClosedLoop(Benchmark):
             {
                 "tightened by": _words(name),
                 "dropped %": _percents(row["dropped"]),
-                "more than with the alarm, %": _percents(row["beside"]),
+                "more than with alarm and hint, %": _percents(row["beside"]),
                 "slid mm": f"{row['slid'][1]:.2f} [{row['slid'][2]:.1f}]",
                 "peak grip": f"{row['peak'][1]:.2f} [{row['peak'][2]:.2f}]",
                 "mean grip": f"{row['mean'][1]:.2f}",
@@ -138,8 +138,8 @@ class ClosedLoop(Benchmark):
         ]
         note = (
             f"{numbers['lifts']} lifts. *Dropped*: with 95 % intervals of a bootstrap over lifts. "
-            "*More than with the alarm*: the difference to the alarm at the same delay. *Slid* and "
-            "*peak grip*: median and, in brackets, 95 % quantile. Grips are multiples of the "
+            "*More than with alarm and hint*: the difference at the same delay. *Slid* and *peak "
+            "grip*: median and, in brackets, 95 % quantile. Grips are multiples of the "
             "lowest grip that holds the largest load. *Late*: from the begin of a slide to the "
             "first tightening in it, median. *False*: the grip was tightened although no pad had "
             "slid in the quarter second before. The thresholds of energy and CUSUM are the highest "
@@ -227,8 +227,8 @@ def _triggers(
     cusum = _by_cusum(detector, above * set_by["cusum"])
     fast = list(detector.pool.hand.fast)
     return {
-        _ALARM: partial(Listening, detector),
-        "alarm and hint": partial(Listening, detector, with_hint=True),
+        _OURS: partial(Listening, detector, with_hint=True),
+        "alarm": partial(Listening, detector),
         "energy": partial(Energy, fast, above * set_by["energy"]),
         "CUSUM": partial(Listening, detector, cusum),
         "oracle": Oracle,
@@ -258,12 +258,12 @@ def _row(lifts: list[dict[str, Any]], name: str) -> dict[str, Any]:
     """Of one method in all lifts: values with intervals, quantiles and means."""
     own = {key: [lift[name][key] for lift in lifts] for key in lifts[0][name]}
     dropped = np.array(own["dropped"], float)
-    alarm = f"{_ALARM}, {name.partition(', ')[2] or _first_delay(lifts[0])}"
-    beside = dropped - np.array([lift[alarm]["dropped"] for lift in lifts], float)
+    ours = f"{_OURS}, {name.partition(', ')[2] or _first_delay(lifts[0])}"
+    beside = dropped - np.array([lift[ours]["dropped"] for lift in lifts], float)
     late = [ms for ms in own["late_ms"] if ms is not None]
     return {
         "dropped": _interval(dropped),
-        "beside": None if name == alarm else _interval(beside),
+        "beside": None if name == ours else _interval(beside),
         "late": float(np.median(late)) if late else None,
         **{key: float(np.mean(own[key])) for key in ("false_alarms", "false_hints")},
         **{
