@@ -118,7 +118,7 @@ def _closed_loop(numbers: Mapping[str, Any]) -> Iterator[Row]:
         name.partition(",")[0]: 100 * (1 - of["dropped"][0])
         for name, of in reversed(numbers["methods"].items())  # the first delay last, which stays
     }
-    ours = next(of for name, of in numbers["methods"].items() if name.startswith("alarm"))
+    ours = next(of for name, of in numbers["methods"].items() if name.startswith("alarm and hint"))
     row = _row("lifts in a closed loop", "MuJoCo", "kept", kept["alarm and hint"])
     row["delay, ms"] = "-" if ours["late"] is None else f"{ours['late']:.0f}"
     row["false alarms"] = f"{ours['false_alarms']:.2f} a lift"
