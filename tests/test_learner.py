@@ -135,7 +135,8 @@ class Dying(SmallSet):
 )
 def test_a_test_decides_as_the_detector_does_where_channels_die(align, bin_ms, cache):
     source, length = Dying(), round(bin_ms * 1e-3 * RATE_HZ)
-    layer, pool = ChannelFilter([51, 11], align=align), FeaturePool(SMALL_HAND, bin_samples=length, level=None)
+    layer = ChannelFilter([51, 11], align=align)
+    pool = FeaturePool(SMALL_HAND, bin_samples=length, level=None)
     maker = FeatureMaker(source, pool, layer, LabelRule(bin_ms=bin_ms, hop_ms=10), cache)
     split = unseen_c(source)
     learner = learn(source, split, maker, General(sample_bins=50))

@@ -304,7 +304,17 @@ def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
     file, kept = path.relative_to(folder).as_posix(), (*samples, *words)
     is_native = own is not None
     return _Table(
-        *(file, kept, samples, words, times, time, unit, rate_hz, delimiter, is_native, row_number)
+        file,
+        kept,
+        samples,
+        words,
+        times,
+        time,
+        unit,
+        rate_hz,
+        delimiter,
+        is_native,
+        row_number,
     )
 
 

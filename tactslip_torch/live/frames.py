@@ -336,9 +336,8 @@ class _LineReader(FrameReader):
             return
         cells = [part.strip("\"'") for part in self._parts(line, _MARKS)]
         lacking = [name for name in self._channels if place_of(name, cells) is None]
-        if not len(set(cells)) == len(self._names) > 1 or not all(map(_NAME.fullmatch, cells)):
-            return
-        if lacking:
+        is_whole = 1 < len(self._names) == len(cells) == len(set(cells))
+        if is_whole and lacking and all(map(_NAME.fullmatch, cells)):
             raise ValueError(
                 f"the sender names its columns {', '.join(cells[:8])}, but has no "
                 f"{', '.join(lacking[:5])} of the detector; name them so, or say by frame.columns "
