@@ -77,10 +77,11 @@ def sources(name: str) -> list[Path]:
 def _configuration(found: Iterable[Path]) -> list[Path]:
     """What commands of these files are configured by: their own files and the options chosen.
 
-    An option is chosen by the defaults of a file that counts, or by the strings of a benchmark,
+    A command's own file counts with its module, and ``scenes.yaml`` with every command. An option is chosen by the defaults of a file that counts, or by the strings of a benchmark,
     such as ``+exp=unseen4``; one that ends in ``recipe=`` chooses all options of the group.
     """
-    if ROOT / "tactslip_torch" / "commands" / "configuration.py" not in found:
+    commands = ROOT / "tactslip_torch" / "commands"
+    if commands / "configuration.py" not in found:
         return []
     words = [
         node.value
@@ -97,9 +98,10 @@ def _configuration(found: Iterable[Path]) -> list[Path]:
                 (of or group, option)
                 for of, option in _DEFAULT.findall(path.read_text(encoding="utf-8"))
             }
+    own = {"scenes", *(path.stem for path in found if path.parent == commands)}
     options = sorted(ROOT.glob("conf/*/*.yaml"))
     return [
-        *sorted(ROOT.glob("conf/*.yaml")),
+        *(of for of in sorted(ROOT.glob("conf/*.yaml")) if of.stem in own),
         *(of for of in options if {(of.parent.name, of.stem), (of.parent.name, "")} & chosen),
     ]
 

@@ -74,7 +74,10 @@ def test_comments_docstrings_version_and_other_modules_do_not_change_a_digest(di
 
 COMMANDS = {
     "tactslip_torch/commands/configuration.py": "",
-    "benchmarks/a.py": "from tactslip_torch.commands import configuration\nGIVEN = ['+exp=one']\n",
+    "tactslip_torch/commands/train.py": "from tactslip_torch.commands import configuration\n",
+    "benchmarks/a.py": "from tactslip_torch.commands import train\nGIVEN = ['+exp=one']\n",
+    "conf/scenes.yaml": "scene: {}\n",
+    "conf/detect.yaml": "seed: 1\n",
     "conf/train.yaml": "defaults:\n  - onset: none   # no alarm\n",
     "conf/onset/none.yaml": "{}\n",
     "conf/onset/alarms.yaml": "hop_ms: 5\n",
@@ -88,6 +91,8 @@ COMMANDS = {
     ("name", "counts"),
     [
         ("conf/train.yaml", True),
+        ("conf/scenes.yaml", True),
+        ("conf/detect.yaml", False),
         ("conf/onset/none.yaml", True),
         ("conf/exp/one.yaml", True),
         ("conf/onset/alarms.yaml", True),
@@ -95,7 +100,7 @@ COMMANDS = {
         ("conf/exp/two.yaml", False),
     ],
 )
-def test_options_that_a_benchmark_chooses_change_its_digest_and_others_do_not(
+def test_commands_and_options_of_a_benchmark_change_its_digest_and_others_do_not(
     digest_of, name: str, counts: bool
 ) -> None:
     changed = COMMANDS | {name: COMMANDS[name] + "more: 1\n"}
