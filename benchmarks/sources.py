@@ -77,7 +77,8 @@ def sources(name: str) -> list[Path]:
 def _configuration(found: Iterable[Path]) -> list[Path]:
     """What commands of these files are configured by: their own files and the options chosen.
 
-    A command's own file counts with its module, and ``scenes.yaml`` with every command. An option is chosen by the defaults of a file that counts, or by the strings of a benchmark,
+    A command's own file counts with its module, and ``scenes.yaml`` with every command.
+    An option is chosen by the defaults of a file that counts, or by the strings of a benchmark,
     such as ``+exp=unseen4``; one that ends in ``recipe=`` chooses all options of the group.
     """
     commands = ROOT / "tactslip_torch" / "commands"

@@ -1,8 +1,8 @@
 """Which sensors matter: balanced accuracy without each channel, finger and kind of channel.
 
-The detector stays as it is; what is masked counts as missing. It is evaluated on bins of its test
-and held-out recordings, as many of each recording and class; a decision that is not valid is wrong.
-Where a mask leaves no decision valid, nothing is said of it.
+The detector stays as it is; what is masked counts as missing. It is evaluated on all bins of its
+test and held-out recordings, as by ``tactslip evaluate``: a bin whose decision is not valid counts
+as non-slip. Where a mask leaves no decision valid, nothing is said of it.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.report import style
 from tactslip_torch.report.metrics import confusion_matrix, split_metrics
-from tactslip_torch.runtime import check_number, in_processes, write_json
-from tactslip_torch.training.experiment import features_of
+from tactslip_torch.runtime import in_processes, write_json
+from tactslip_torch.training.datamodule import RecordingFeatures
+from tactslip_torch.training.experiment import feature_cache, features_of
 
 _ROLES = ("test", "unseen")
 
@@ -44,7 +45,6 @@ def importance(config: DictConfig, folder: Path) -> dict[str, Any]:
         ValueError: for bad input, in one line.
         FileNotFoundError: if there is no such detector, or no configuration beside it.
     """
-    check_number("bins", config.bins, whole=True)
     model = Path(config.model)
     detector = SlipDetector.load(model)
     places = [place / "config.yaml" for place in (model.parent, model.parent.parent)]
@@ -62,30 +62,29 @@ def importance(config: DictConfig, folder: Path) -> dict[str, Any]:
             if detector.info.get("split") == "all"
             else f"{found} has no fold {detector.info.get('split')!r} of {model.name}"
         )
-    maker = features_of(detector, source, instantiate(training.labels), None)
     masks = _masks(source.hand)
-
-    def evaluated(recording: RecordingId) -> Tensor:
-        """Confusions by role, mask and whether decisions were valid, ``[R, M, 2, 2, 2]``."""
-        bins, laid = maker.filtered_bins(recording)
-        counts = torch.zeros(len(_ROLES), len(masks), 2, 2, 2, dtype=torch.long)
-        roles = fold.bin_roles(recording, len(bins))
-        for place, role in enumerate(_ROLES):
-            of_class = [(roles[role] & (laid.is_slip == value)).nonzero()[:, 0] for value in (0, 1)]
-            some = torch.cat([index[:: max(1, len(index) // config.bins)] for index in of_class])
-            for number, channels in enumerate(masks.values() if len(some) else ()):
-                decided = detector.predict(bins[some], masked_channels=channels or None)
-                is_slip = laid.is_slip[some]
-                says_slip = torch.where(decided.is_valid, decided.score >= 0, ~is_slip)
-                for valid, mine in enumerate((~decided.is_valid, decided.is_valid)):
-                    table = confusion_matrix(is_slip[mine], says_slip[mine])
-                    counts[place, number, valid] = torch.tensor(table)
-        return counts
-
     save_config(config, folder)
-    recordings = fold.having(*_ROLES)
-    parts = in_processes(evaluated, recordings, "recordings", "recording", config.num_workers)
-    total = torch.stack(list(parts)).sum(0)
+    with feature_cache(training.cache) as cache:
+        maker = features_of(detector, source, instantiate(training.labels), cache)
+        order = [maker.pool.selected.index(feature) for feature in detector.selected]
+
+        def evaluated(recording: RecordingId) -> Tensor:
+            """Confusions by role, mask and whether decisions are valid, ``[R, M, 2, 2, 2]``."""
+            counts = torch.zeros(len(_ROLES), len(masks), 2, 2, 2, dtype=torch.long)
+            bins = maker(recording).in_split(fold)
+            bins = bins._replace(features=bins.features[:, order].double())
+            for number, is_masked in enumerate(masks.values()):
+                says_slip, is_valid = _decided(detector, bins, is_masked)
+                for place, role in enumerate(_ROLES):
+                    for valid, kind in enumerate((~is_valid, is_valid)):
+                        mine = bins.roles[role] & kind
+                        table = confusion_matrix(bins.is_slip[mine], says_slip[mine])
+                        counts[place, number, valid] = torch.tensor(table)
+            return counts
+
+        recordings = fold.having(*_ROLES)
+        parts = in_processes(evaluated, recordings, "recordings", "recording", config.num_workers)
+        total = torch.stack(list(parts)).sum(0)
     rows: list[dict[str, Any]] = [
         {"unit": unit, "name": name}
         | {
@@ -107,14 +106,26 @@ def importance(config: DictConfig, folder: Path) -> dict[str, Any]:
     return content
 
 
-def _masks(hand: HandLayout) -> dict[tuple[str, str], tuple[str, ...]]:
+@torch.no_grad()
+def _decided(
+    detector: SlipDetector, bins: RecordingFeatures, is_masked: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Whether bins are called slip and are valid, ``[N]`` each, without masked channels ``[C]``."""
+    always_stuck = torch.iinfo(bins.run.dtype).max
+    is_lost, is_valid = detector.sensed(bins.span, bins.run.masked_fill(is_masked, always_stuck))
+    scaled = detector.scaled(bins.features, is_lost)
+    return (detector.head(scaled) >= 0) & is_valid, is_valid
+
+
+def _masks(hand: HandLayout) -> dict[tuple[str, str], Tensor]:
     """What is masked: nothing, each channel, and of several fingers or kinds each of these."""
-    masks: dict[tuple[str, str], tuple[str, ...]] = {("nothing", ""): ()}
+    masks = {("nothing", ""): torch.zeros(len(hand), dtype=torch.bool)}
     several = [u for u in ("finger", "kind") if len({getattr(c, u) for c in hand.channels}) > 1]
     for unit in ("name", *several):
-        for channel in hand.channels:
-            key = ("channel" if unit == "name" else unit, str(getattr(channel, unit)))
-            masks[key] = (*masks.get(key, ()), channel.name)
+        of = [str(getattr(channel, unit)) for channel in hand.channels]
+        for name in dict.fromkeys(of):
+            key = ("channel" if unit == "name" else unit, name)
+            masks[key] = torch.tensor([each == name for each in of])
     return masks
 
 
