@@ -666,6 +666,23 @@ def test_a_stream_without_one_sample_is_an_error(tmp_path):
     assert "ended before a sample came; check that it sends" in ended.stderr.splitlines()[-1]
 
 
+def test_standard_output_has_json_alone_where_a_run_has_left_its_configuration(detector, tmp_path):
+    detector.save(tmp_path / "detector.pt")
+    (tmp_path / "config.yaml").write_text("seed: 0\n")
+    np.save(tmp_path / "a.npy", slip_samples(HAND)[:, :2000])
+    words = [sys.executable, "-m", "tactslip_torch", "stream", "model=detector.pt", "source=a.npy"]
+    ended = subprocess.run(
+        [*words, f"sample_rate_hz={detector.pool.sample_rate_hz}", "speed=null"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    lines = [json.loads(line) for line in ended.stdout.splitlines()]
+    assert lines[0]["event"] == "connected"
+    assert "earlier run" not in ended.stderr
+
+
 # The page ----------------------------------------------------------------------------------------
 
 

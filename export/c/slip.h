@@ -9,6 +9,10 @@
 
 enum { SLIP_ERROR = 1024 }; /* room for any message */
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 struct slip;
 
 struct slip_facts {
@@ -47,7 +51,7 @@ const struct slip_facts *slip_facts(const struct slip *slip);
 /* The name of a channel, UTF-8; NULL behind the last. */
 const char *slip_channel(const struct slip *slip, size_t index);
 
-/* Takes the next n instants of volts [n, num_channels], NaN where a sample is missing.
+/* Takes the next n instants [n, num_channels], in the unit of the training, NaN where a sample is missing.
  * Returns how many decisions they made possible, which stand in out[max_decisions]; or -1 if n is
  * above max_samples or the graph fails: then nothing was taken, and slip_error says why. */
 int slip_push(struct slip *slip, const float *samples, size_t n, struct slip_decision *out);
@@ -62,5 +66,9 @@ void slip_set_threshold(struct slip *slip, double threshold);
 void slip_reset(struct slip *slip);
 
 void slip_close(struct slip *slip); /* NULL is nothing to close */
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

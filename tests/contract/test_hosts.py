@@ -329,6 +329,16 @@ int main(int count, char **words) {
     assert found == pytest.approx(onsets_s, abs=1e-3)
 
 
+def test_a_program_in_cpp_links_with_the_host(places, build, tmp_path):
+    build(library := f"{places['build']}/libslip.so")
+    code = '#include "slip.h"\nint main() { slip_close(nullptr); return slip_push != nullptr; }\n'
+    (tmp_path / "loop.cpp").write_text(code)
+    command = ["g++", "-std=c++11", "-Wall", "-Werror", "-Wno-address", f"-I{EXPORT / 'c'}"]
+    command += [tmp_path / "loop.cpp", library, f"-Wl,-rpath,{places['build']}"]
+    subprocess.run([*command, "-o", tmp_path / "loop"], check=True)
+    assert subprocess.run([tmp_path / "loop"], check=False).returncode == 1
+
+
 # Python ----------------------------------------------------------------------------------------
 
 
