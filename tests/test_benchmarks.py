@@ -10,13 +10,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from test_real_sets import write_osu
 
 from benchmarks import train
 from benchmarks.harness import Benchmark, between_markers
 from benchmarks.native_c import BOARD_TOOLS, TOOLS, missing_tools
-from benchmarks.paper_tables import RIDGE, forward_order
 from benchmarks.real_sets import RealSet
 from benchmarks.tables import Table
 from benchmarks.timing import interleaved, paired_ratio
@@ -100,32 +98,6 @@ def test_names_in_a_chart_leave_out_results_and_what_all_rows_have() -> None:
     assert Table(rows).columns("found") == (["a", "b"], {"found %": [40.0, 60.0]})
     rows[1]["slips"] = "99"
     assert Table(rows).columns("found")[0] == ["a, slips 116", "b, slips 99"]
-
-
-def test_forward_selection_takes_what_lessens_the_error_most() -> None:
-    """Against a solve of every candidate at every step, with features that repeat each other."""
-    generator = torch.Generator().manual_seed(3)
-    scales = torch.tensor([1.0, 0.2, 5.0, 0.1, 3.0, 1.0, 8.0]).double()
-    z = torch.randn(60, 7, generator=generator, dtype=torch.float64)
-    z[:, 5] = z[:, 0] + 0.01 * z[:, 1]
-    is_slip, weights = z[:, 0] + 0.5 * z[:, 2] - 0.4 * z[:, 4] > 0.2, torch.rand(60).double() + 0.5
-    z = z * scales
-    targets, part = torch.where(is_slip, 1.0, -1.0).double(), weights / weights.sum()
-
-    def error(taken: list[int]) -> float:
-        columns = torch.cat([torch.ones(60, 1), z[:, taken]], 1) * part.sqrt()[:, None]
-        ridge = RIDGE**0.5 * torch.eye(1 + len(taken)).double()[1:]
-        left, right = (
-            torch.cat([columns, ridge]),
-            torch.cat([targets * part.sqrt(), 0 * ridge[:, 0]]),
-        )
-        return float((left @ torch.linalg.lstsq(left, right).solution - right).square().sum())
-
-    expected = list[int]()
-    for _ in range(5):
-        rest = [place for place in range(7) if place not in expected]
-        expected.append(min(rest, key=lambda place: error([*expected, place])))
-    assert forward_order(z, is_slip, weights, 5).tolist() == expected
 
 
 def test_only_what_stands_between_the_markers_is_replaced() -> None:

@@ -60,10 +60,8 @@ class Element:
         d = d0 / (1.0 + d0 * abs(v) / (w * self.mu_k * load))
         return z_rate, float((s * z + d * z_rate).sum() + self.sigma2 * v)
 
-    def radau(
-        self, arm: Course, load: Course, times_s: np.ndarray, force_n: float = 0.0
-    ) -> dict[str, np.ndarray]:
-        """SciPy's solution at some times, from rest under a shear force."""
+    def radau(self, arm: Course, load: Course, times_s: np.ndarray) -> dict[str, np.ndarray]:
+        """SciPy's solution at some times, from rest."""
 
         def right(t: float, y: np.ndarray) -> np.ndarray:
             (u, v, q), w = y[:3], arm(t)
@@ -71,8 +69,7 @@ class Element:
             v_rate = (self.k * u + q + self.c * (w - v) - pull) / self.m
             return np.r_[w - v, v_rate, self.k1 * (w - v) - q / self.tau, z_rate]
 
-        bent = force_n / self.sigma * len(self.pressure) * np.array(self.pressure)
-        start = np.r_[force_n / self.k, 0.0, 0.0, bent]
+        start = np.zeros(3 + len(self.pressure))
         options = {"method": "Radau", "rtol": 1e-8, "atol": 1e-12, "max_step": 1e-3}
         found = solve_ivp(right, (0.0, times_s[-1]), start, t_eval=times_s, **options)
         assert found.success

@@ -165,8 +165,7 @@ def native(detector):
     return stream_of(detector)
 
 
-def test_there_are_sixty_kinds_of_inputs_and_they_raise_alarms_and_lose_channels(detector):
-    assert len(KINDS) >= 60
+def test_the_inputs_raise_alarms_and_lose_channels(detector):
     found = by_package(detector, kind_of("as it is"))
     assert found["alarm"].any()
     assert not by_package(detector, kind_of("600 NaN"))["valid"].all()

@@ -61,8 +61,9 @@ def bunched_scores(rng, hours, bunches_per_hour=30.0, mean_size=2.5, spacing_s=8
 # The rate ----------------------------------------------------------------------------------------
 
 
-def broken_rates(*, sees_bunches, per_hour=10.0, num_sets=40):
+def broken_rates(*, sees_bunches):
     """How often the rate stated on 5 h is exceeded in the other 25 h of the same use."""
+    per_hour, num_sets = 10.0, 40
     rng, made = np.random.default_rng(3), calibrator(per_hour=per_hour)
     pieces = in_stretches(stream_of(bunched_scores(rng, 30.0)), TIMING, 300)
     scored = [made.scored(piece) for piece in pieces]

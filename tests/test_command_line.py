@@ -223,6 +223,13 @@ def test_the_page_has_every_mistake():
     assert [line for line in MISTAKES if f"`tactslip {line}`" not in text] == []
 
 
+def test_help_for_who_reads_no_further_ends_without_a_word():
+    for command in ("--help", "stream --help"):
+        line = f"{sys.executable} -m tactslip_torch {command} | true"
+        ended = subprocess.run(["bash", "-o", "pipefail", "-c", line], capture_output=True)
+        assert (ended.returncode, ended.stderr) == (0, b"")
+
+
 def write_page() -> None:
     """Run every mistake, and write the table between the markers of the page."""
     rows = ["", "| typed | answer |", "|---|---|"]

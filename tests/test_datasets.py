@@ -184,7 +184,7 @@ def test_a_column_that_may_be_the_label_is_no_channel_unless_said(tmp_path, name
     assert FileRecordings(tmp_path, channels=rows_named("b", "a")).hand.names == ("b", "a")
 
 
-def test_many_files_are_looked_at_in_processes(tmp_path):
+def test_many_files_keep_their_order(tmp_path):
     for place in range(18):
         table(tmp_path / f"{place}.csv", samples(place, 20))
     manifest(tmp_path, *(f"{place}.csv,wood,{place},,,slip" for place in range(18)))

@@ -97,8 +97,9 @@ def as_watched(made):
     )
 
 
-def by_loops(made, found=500, early=200, settle=100):
+def by_loops(made):
     """The definitions, word by word, in whole milliseconds."""
+    found, early, settle = 500, 200, 100
 
     def is_seen(t):
         return made.stretches is None or any(a <= t <= b for a, b in made.stretches)
@@ -187,8 +188,6 @@ def test_numbers_of_many_are_sums_of_what_the_loops_count(many):
 
 
 def test_rounding_moves_no_alarm_over_an_edge():
-    assert 0.9 < 1.1 - 0.2  # as floats see it
-    assert 0.18 + 0.5 < 0.68
     for alarm, onset, outcome in ((0.9, 1.1, "early"), (0.68, 0.18, "found")):
         (found,) = events_of(watched([alarm], [onset])).onsets
         assert found.outcome == outcome

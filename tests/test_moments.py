@@ -39,7 +39,7 @@ def assert_same(one, other):
     assert one.seen_batches == other.seen_batches
 
 
-# Machines -------------------------------------------------------------------------------------
+# Sums in any order ----------------------------------------------------------------------------
 
 
 @settings(max_examples=20)

@@ -44,23 +44,21 @@ def cut(detector, samples):
     return samples[..., start : start + raw.length].contiguous()
 
 
-def run_on(detector, precision, samples, mask=None):
+def run_on(detector, precision, samples):
     """Outputs of onnxruntime for bins with full context."""
     feeds = {"samples": cut(detector, samples).to(getattr(torch, precision)).numpy()}
-    if mask is not None:
-        feeds["samples"][..., mask.numpy(), :] = np.nan
     return runner(session_of(bin_graph(detector, precision).model()))(feeds)
 
 
-def assert_scores(detector, precision, samples, mask=None, spread=None):
+def assert_scores(detector, precision, samples):
     """Scores are those of torch in float64, flags those of torch in the graph's precision."""
     given = samples.to(getattr(torch, precision))
-    expected = detector.predict_raw(given.double(), given=given.dtype, masked_channels=mask)
-    got = run_on(detector, precision, given, mask)
+    expected = detector.predict_raw(given.double(), given=given.dtype)
+    got = run_on(detector, precision, given)
     assert got["score"].dtype == precision
-    spread = np.nanstd(expected.score) if spread is None else spread
+    spread = np.nanstd(expected.score)
     np.testing.assert_allclose(got["score"], expected.score, rtol=0, atol=CLOSE[precision] * spread)
-    for found in (expected, detector.predict_raw(given, masked_channels=mask)):
+    for found in (expected, detector.predict_raw(given)):
         np.testing.assert_array_equal(got["valid"], found.is_valid)
         np.testing.assert_array_equal(got["in_range"], found.in_range)
         np.testing.assert_array_equal(got["channels_lost"], found.channels_lost)

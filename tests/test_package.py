@@ -95,6 +95,3 @@ def test_a_detector_gives_probabilities_of_raw_and_of_filtered_bins(paper: Train
     detector.info = {}
     with pytest.raises(ValueError, match=r"no calibration, .*several recipe.penalties"):
         detector.probability(raw)
-    for take in (detector, detector.predict_raw, detector.pool):
-        with pytest.raises(TypeError, match=r"got numpy.ndarray; use torch.as_tensor"):
-            take(raw.numpy())

@@ -384,13 +384,13 @@ TRUTH = {"onsets": [{"onset_s": 0.42}], "sliding_s": [(0.42, 1.1)]}
 ALARMS = [{"alarm_s": 0.5, "onset_s": 0.43}, {"alarm_s": 1.25, "onset_s": 1.23}]
 
 
-def traces_of(films, view=(0.0, 1.4), num_decisions=130):
+def traces_of(films):
     """Slip is decided from 0.5 to 1.2 s, 0.2 s of it not valid."""
-    times = np.round(0.07 + HOP_S * np.arange(num_decisions), 6)
+    times = np.round(0.07 + HOP_S * np.arange(130), 6)
     slip = (times >= 0.5) & (times < 1.2)
     valid = (times < 0.6) | (times >= 0.8)
     names = [f"PVDF{i}" for i in range(1, 1 + len(films))]
-    traces = Traces(names, RATE_HZ, HOP_S, view)
+    traces = Traces(names, RATE_HZ, HOP_S, (0.0, 1.4))
     traces.add_samples(films)
     score = np.where(times < 0.2, math.nan, 2.0 * slip)  # not before there is a floor
     of = {"available_s": times - 1e-9, "probability": 0.9 * slip + 0.05, "is_on": slip}

@@ -302,11 +302,6 @@ def test_times_that_go_back_are_asked_for_with_their_step(last_is_first, tmp_pat
     assert (question.name, question.default) == ("rate_hz", "500")
 
 
-def test_numbers_of_rows_are_no_milliseconds(tmp_path):
-    found = slips(tmp_path, time=np.arange(400), slip=[0] * 200 + [1] * 200)
-    assert propose(found).settings["data"]["reading"].get("time_unit") != "ms"
-
-
 def test_a_time_that_counts_the_rows_asks_for_the_rate(tmp_path):
     found = slips(tmp_path, time=np.arange(400), slip=[0] * 200 + [1] * 200)
     question, *_ = propose(found).questions

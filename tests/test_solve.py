@@ -254,7 +254,7 @@ def test_scores_are_those_of_refits(
     assert_refits(bins, grouped(rng, num_bins, kind), 1e3, kernel)
 
 
-# Refusals -------------------------------------------------------------------------------------
+# Gradients ------------------------------------------------------------------------------------
 
 
 def inputs_of(rng, num_bins, num_features, kind):

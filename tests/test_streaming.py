@@ -56,7 +56,7 @@ def in_pieces(stream, samples, cuts=()):
     return joined_decisions([*parts, stream.flush()])
 
 
-def offline(detector, settings, samples, masked=None):
+def offline(detector, settings, samples):
     """Decisions on a whole recording, all at once."""
     found, names = score_stream(detector, samples, settings.hop_samples), detector.pool.hand.names
     before = max(detector.channel_filter.reaches[c][0] for c in detector.needed_index)
@@ -69,8 +69,7 @@ def offline(detector, settings, samples, masked=None):
     evidence = settings.onset.evidence
     alone = torch.full((samples.shape[-1] // 10 + 2,), torch.nan, dtype=torch.float64)
     samples = without_stuck(samples, detector.sensing.stuck_samples)
-    in_use = None if masked is None else ~masked
-    known, _ = settings.onset.scores(evidence.blocks_of_recording(samples), None, in_use)
+    known, _ = settings.onset.scores(evidence.blocks_of_recording(samples), None, None)
     alone[-len(known) :] = known
     return decider.join(bins, alone.unfold(0, 3, 1).mean(-1).nan_to_num(-1e30))
 
@@ -336,7 +335,7 @@ def test_a_copy_of_a_running_stream_goes_on_by_itself(copied, rule):
     assert torch.equal(joined_decisions([*before, rest[0]]).is_alarm, whole.is_alarm)
 
 
-# Gradients -------------------------------------------------------------------------------------
+# Memory ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

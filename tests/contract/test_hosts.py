@@ -342,7 +342,7 @@ def test_a_program_in_cpp_links_with_the_host(places, build, tmp_path):
 # Python ----------------------------------------------------------------------------------------
 
 
-def test_it_needs_no_torch(stream, recording):
+def test_the_python_host_needs_no_torch(stream, recording):
     code = (
         "import runpy, sys; sys.modules |= dict.fromkeys(['torch', 'tactslip_torch']); "
         "sys.argv = sys.argv[1:]; sys.path.insert(0, sys.argv.pop(0)); "
