@@ -404,6 +404,7 @@ def test_where_float32_is_off_the_default_is_float64_and_says_why(typed, tmp_pat
         ),
         (["native.scale=3e-5"], "native.scale=3e-05 .* are of graph=native"),
         (["native.source=true"], "native.source=True, .* are of graph=native"),
+        (["graph=native", "native.source=no"], "native.source must be true or false, got 'no'"),
     ],
 )
 def test_a_converter_that_makes_no_volts_is_refused(words, said, typed, tmp_path):

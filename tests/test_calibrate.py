@@ -282,6 +282,8 @@ REFUSED = {
     "few hours": ({}, ["per_hour=100"], "0.03 h 0.008 h 374"),
     "nothing to set": ({}, [], "per_hour=RATE slip"),
     "no label": ({"label": ""}, ["per_hour=2000"], "label slip_free=true"),
+    "no hours, all slip": ({"label": "slip"}, [], "all labelled bins are slip; per_hour=RATE"),
+    "no flag": ({}, ["per_hour=2000", "slip_free=no"], "slip_free must be true or false, got 'no'"),
     "no rate": ({}, ["per_hour=-1"], "per_hour positive -1"),
     "no confidence": ({}, ["per_hour=2000", "confidence=2"], "error: confidence 2"),
 }

@@ -157,6 +157,21 @@ def test_bins_that_cannot_be_are_told_by_check(tmp_path, capsys):
     assert "bins: labels.bin_ms=51 is 10.2 samples at 200 Hz; choose" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("output={root}/c.csv", r"output of action=check must be a picture, FILE\.png, got"),
+        ("features.frames=null", "features.frames must be of kinds, such as"),
+        ("samples=no", "samples must be true or false, got 'no'"),
+    ],
+)
+def test_what_check_cannot_do_is_refused_and_replaces_nothing(root, override, said):
+    before = (root / "c.csv").read_bytes()
+    with pytest.raises(ValueError, match=said):
+        run("check", root, ROWS, override.format(root=root))
+    assert (root / "c.csv").read_bytes() == before
+
+
 def test_a_file_that_is_damaged_in_its_samples_is_a_problem(root, capsys, monkeypatch):
     assert run("check", root, ROWS) == 0
     assert "4 recordings of 2 materials, 12.0 s, 3 channels at 200" in capsys.readouterr().out
@@ -227,6 +242,10 @@ NO_CONVERSIONS = [
     (["to=npz"], "no value for output; give to=FORMAT and output=FOLDER"),
     (["to=doc", "output=out"], "format must be one of .* got 'doc'"),
     (["to=npz", "output={root}/../set"], "output must be another folder than root"),
+    (["to=npz", "output={root}/out"], "output must not lie in root"),
+    (["to=npz", "output={there}/a.npz"], "output must be a folder, and .* is a file"),
+    (["to=npz", "output={labelled}"], r"manifest\.csv is of recordings of your own"),
+    (["to=npz", "output=out", "skip_failed=no"], "skip_failed must be true or false, got 'no'"),
     (["to=npz", "output={there}"], r"a\.npz .*; move it away, or give another output"),
     (
         ["data=simulated", "to=npz", "output=out"],
@@ -237,10 +256,12 @@ NO_CONVERSIONS = [
 
 @pytest.mark.parametrize(("overrides", "line"), NO_CONVERSIONS)
 def test_a_conversion_that_cannot_be_is_refused_before_any_work(root, tmp_path, overrides, line):
-    there = tmp_path / "there"
+    there, labelled = tmp_path / "there", tmp_path / "labelled"
     there.mkdir()
+    labelled.mkdir()
     (there / "a.npz").write_text("a letter")
-    given = [override.format(root=root, there=there) for override in overrides]
+    (labelled / "manifest.csv").write_text("file,material,onsets_s\n")
+    given = [one.format(root=root, there=there, labelled=labelled) for one in overrides]
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(ValueError, match=line):
         run("convert", root, ROWS, *given)

@@ -150,9 +150,19 @@ def test_a_file_that_is_not_ours_is_never_replaced(tmp_path, content):
     assert (tmp_path / "manifest.csv").read_bytes() == listed
 
 
+def test_a_manifest_of_ones_own_is_never_replaced(tmp_path):
+    (tmp_path / "manifest.csv").write_text("file,material,onsets_s\na.csv,cup,1.5\n")
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match=r"manifest\.csv is of recordings of your own"):
+        run(tmp_path)
+    assert contents(tmp_path) == before
+
+
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
+        (["figure=no"], "figure must be true or false, got 'no'"),
+        (["seed=abc", "scene=paper"], "seed must be a whole number, got 'abc'"),
         (["materials=M1", "scene=paper"], r"materials must be a list such as \[M1,M6\], got 'M1'"),
         (["materials=[]", "scene=paper"], "no recording to write; give at least one"),
         (["cycles=0", "scene=paper"], "data: cycles must be a whole number of at least 1, got 0"),

@@ -61,6 +61,27 @@ def test_a_detector_needs_the_configuration_of_its_training(paper, tmp_path):
         sensors_of(tmp_path / "alone.pt", tmp_path)
 
 
+def test_a_run_keeps_its_configuration_and_needs_that_of_a_training(paper, tmp_path):
+    run = paper.file.parent
+    before = (run / "config.yaml").read_bytes()
+    with pytest.raises(ValueError, match=r"config\.yaml would be lost; give another folder"):
+        sensors_of(paper.file, run)
+    assert (run / "config.yaml").read_bytes() == before
+    shutil.copy(paper.file, tmp_path)
+    (tmp_path / "config.yaml").write_text("per_hour: 5\n")  # as calibrate leaves it
+    with pytest.raises(ValueError, match=r"config\.yaml is of no training; give model=RUN"):
+        sensors_of(tmp_path / paper.file.name, tmp_path / "out")
+
+
+def test_a_detector_is_not_evaluated_on_what_it_was_trained_on(paper, tmp_path):
+    shutil.copy(paper.file, tmp_path / "detector.pt")
+    training = OmegaConf.load(paper.file.with_name("config.yaml"))
+    training.split.seen, training.split.unseen = training.split.unseen, training.split.seen
+    OmegaConf.save(training, tmp_path / "config.yaml")
+    with pytest.raises(ValueError, match="holds out now: the recordings have changed since"):
+        sensors_of(tmp_path / "detector.pt", tmp_path / "out")
+
+
 def test_nothing_is_said_of_a_sensor_without_which_no_decision_is_valid(paper, tmp_path, capsys):
     detector = SlipDetector.load(paper.file)
     needs_all = replace(detector.sensing, min_alive=int(detector.counted.sum()))

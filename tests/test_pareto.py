@@ -89,10 +89,26 @@ def test_the_detector_that_is_left_keeps_its_deadline(recordings, cache, tmp_pat
     assert "deadline_us=0.001" in capsys.readouterr().err
 
 
-BAD = {"deadline_us=0": "deadline_us", "hops_ms=[-1]": "hops_ms", "sizes=[]": "sizes"}
+@pytest.mark.slow
+def test_recordings_of_ones_own_and_hops_that_are_no_samples(recordings, cache, tmp_path, capsys):
+    given = ["deadline_us=1e6", "split=groups", "sizes=[4]", "hops_ms=[25,0.3]"]
+    found = pareto(of(recordings, cache, *given), tmp_path)
+    assert [row["hop_ms"] for row in found["candidates"]] == [25]
+    assert SlipDetector.load(tmp_path / "detector.pt").info["split"] == "all"
+    assert "left out: hops_ms 0.3: no whole number of samples at 2000 Hz" in capsys.readouterr().out
+
+
+BAD = {
+    "deadline_us=0": "deadline_us",
+    "hops_ms=[-1]": "hops_ms",
+    "hops_ms=[0.3]": r"no whole number of samples .*; give hops_ms=\[1\]",
+    "sizes=[]": "sizes",
+}
 
 
 @pytest.mark.parametrize("override", BAD)
 def test_limits_that_are_none_are_refused_before_any_training(override, tmp_path):
+    (tmp_path / "detector.pt").touch()  # of an earlier run
     with pytest.raises(ValueError, match=BAD[override]):
         pareto(compose_config("pareto", [override]), tmp_path)
+    assert (tmp_path / "detector.pt").exists()

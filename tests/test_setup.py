@@ -249,6 +249,15 @@ def test_labels_of_minus_one_and_one_are_not_all_slip(tmp_path):
     assert column.states(np.array([-1.0, 1.0])).tolist() == [0, 1]
 
 
+@pytest.mark.parametrize("name", ["no_slip", "stable"])
+@pytest.mark.parametrize(("least", "most"), [(0, 1), (-1, 1)])
+def test_a_column_of_non_slip_is_read_the_other_way_round(name, least, most, tmp_path):
+    found = slips(tmp_path, **{name: [least] * 200 + [most] * 200})
+    labels = propose(found, Answers(column=name)).settings["labels"]
+    column = LabelColumn(name, slip=labels["slip"])
+    assert column.states(np.array([least, most], dtype=float)).tolist() == [1, 0]
+
+
 @pytest.mark.parametrize(
     ("labels", "answers", "said"),
     [
@@ -372,7 +381,10 @@ def test_a_table_of_intervals_becomes_a_manifest(tmp_path):
     assert rows["cup_2.csv"]["slip_s"] == rows["cup_2.csv"]["non_slip_s"] == ""  # nobody says
     assert (rows["box_2.csv"]["material"], rows["box_2.csv"]["trial"]) == ("box", "2")
     (tmp_path / "manifest.csv").write_text("file,material,slip_s\ncup_1.csv,cup,0-1\n")
-    assert not propose(look(tmp_path)).manifest  # one that is there is kept
+    again = propose(look(tmp_path))
+    assert not again.manifest  # one that is there is kept
+    told = {finding.value for finding in again.findings}
+    assert "slips.csv is not read, as manifest.csv is there" in told
 
 
 def test_a_table_that_is_not_understood_is_named(tmp_path):
@@ -438,6 +450,59 @@ def test_files_that_are_no_recordings_are_told_and_do_not_change_how_names_are_r
     assert proposal.settings["data"]["pattern"] == "{material}_{trial}"
     told = [finding.value for finding in proposal.findings if finding.what == "look"]
     assert [text.split()[0] for text in told] == ["notes.csv", "temperature_of_the_day.csv"]
+
+
+def four_trials(folder):
+    """Of two objects, with a column of labels."""
+    for name in ("cup_1", "cup_2", "box_1", "box_2"):
+        write(folder / f"{name}.csv", ["a", "b"], slip=[0] * 200 + [1] * 200)
+
+
+def test_a_word_among_numbers_is_told_and_changes_nothing_else(tmp_path):
+    four_trials(tmp_path)
+    whole = propose(look(tmp_path)).settings
+    path = tmp_path / "box_1.csv"
+    rows = path.read_text().splitlines()
+    cells = rows[7].split(",")
+    path.write_text("\n".join([*rows[:7], ",".join([cells[0], "ERR", *cells[2:]]), *rows[8:], ""]))
+    found = look(tmp_path)
+    assert found.problems == {"box_1.csv": "has 'ERR' in column a; mend it"}
+    settings = propose(found).settings
+    assert (settings["data"]["pattern"], settings["split"]) == (
+        whole["data"]["pattern"],
+        whole["split"],
+    )
+
+
+def test_a_file_of_one_row_leaves_the_times_of_the_others(tmp_path):
+    four_trials(tmp_path)
+    head, first, *_ = (tmp_path / "cup_1.csv").read_text().splitlines()
+    (tmp_path / "cup_3.csv").write_text(f"{head}\n{first}\n")
+    found = look(tmp_path)
+    assert found.problems == {"cup_3.csv": "has fewer than 3 rows"}
+    assert propose(found).settings["data"]["reading"]["time"] == "time"
+
+
+def test_a_manifest_may_list_some_of_the_files_with_labels_of_their_own(tmp_path):
+    four_trials(tmp_path)
+    (tmp_path / "manifest.csv").write_text("file,material\ncup_1.csv,cup\nbox_1.csv,box\n")
+    proposal = propose(look(tmp_path))
+    assert proposal.example in ("cup_1.csv", "box_1.csv")
+    (tmp_path / "manifest.csv").write_text("file,material\n")
+    with pytest.raises(ValueError, match=r"manifest\.csv lists no recording"):
+        propose(look(tmp_path))
+
+
+def test_a_setup_that_fails_can_be_started_again(tmp_path):
+    for name in ("cup_1", "cup_2", "box_1", "box_2"):
+        write(tmp_path / f"{name}.csv", ["a", "b"])
+    table = tmp_path / "slips.csv"
+    table.write_text("file,start,end\ncup_1.csv,1,99\nbox_1.csv,1,2\n")
+    with pytest.raises(ValueError, match="leaves the recording"):
+        setup.setup(tmp_path, Answers(), setup._ask(True))
+    table.write_text("file,start,end\ncup_1.csv,1,3\nbox_1.csv,1,2\n")
+    setup.setup(tmp_path, Answers(), setup._ask(True))
+    assert "1-3" in (tmp_path / "manifest.csv").read_text()
 
 
 def test_columns_that_are_no_channels_are_told_with_the_reason(tmp_path):

@@ -62,6 +62,9 @@ def calibrate(config: DictConfig, folder: Path) -> dict[str, Any]:
     """
     detector = SlipDetector.load(config.model)
     settings, pool = AlarmSettings.of(detector), detector.pool
+    for name in ("slip_free", "use_trained", "refit"):
+        if type(config[name]) is not bool:
+            raise ValueError(f"{name} must be true or false, got {config[name]!r}")
     if config.per_hour is not None:
         check_number("per_hour", config.per_hour)
     check_share("confidence", config.confidence)
@@ -391,6 +394,12 @@ def _calibrated(
     budget = _bunched_budget(calibrator, recordings)
     num_slip = sum(int(one.is_slip.sum()) for one in recordings)
     moves_bins = 0 < num_slip < sum(len(one.is_slip) for one in recordings)
+    if budget is None and not moves_bins:
+        side, other = ("slip", "non-slip") if num_slip else ("non-slip", "slip")
+        raise ValueError(
+            f"nothing to set: all labelled bins are {side}; label {other} as well, or give "
+            "per_hour=RATE for the alarm"
+        )
     change = calibrator.fit(recordings, budget, moves_bins=moves_bins)
     changes, words = calibrator.left_out(recordings, change, budget)
     rows = _rows(calibrator, recordings, changes)

@@ -27,7 +27,7 @@ from tactslip_torch.commands.stopping import fail, one_line
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest, write_template
 from tactslip_torch.data.labels import LabelledBins, LabelRule, bins_of, whole_samples
-from tactslip_torch.data.manifest import Problem
+from tactslip_torch.data.manifest import MANIFEST, Problem
 from tactslip_torch.data.recording import RecordingId, Timeline
 from tactslip_torch.features.sensing import level_message, level_ratio
 from tactslip_torch.model.detector import SlipDetector
@@ -55,6 +55,9 @@ def check(config: DictConfig) -> int:
         ValueError: if the set cannot be looked at at all.
         FileNotFoundError: if there is no folder or manifest.
     """
+    _check_flags(config)
+    if config.output is not None and Path(str(config.output)).suffix.lower() != ".png":
+        raise ValueError(f"output of action=check must be a picture, FILE.png, got {config.output}")
     source = _source(config, strict=False)
     problems, warnings = list(source.problems), list(source.warnings)
     if config.samples and source.ids:
@@ -83,6 +86,23 @@ def check(config: DictConfig) -> int:
     return len(problems)
 
 
+def check_manifest(folder: Path) -> None:
+    """Refuse to replace a manifest that this package did not write.
+
+    Raises:
+        ValueError: if there is one in the folder.
+    """
+    path = folder / MANIFEST
+    if path.exists() and "fidelity" not in path.read_text(encoding="utf-8").partition("\n")[0]:
+        raise ValueError(f"{path} is of recordings of your own; give another folder")
+
+
+def _check_flags(config: DictConfig) -> None:
+    for name in ("samples", "skip_failed"):
+        if type(config[name]) is not bool:
+            raise ValueError(f"{name} must be true or false, got {config[name]!r}")
+
+
 def convert(config: DictConfig) -> list[Written]:
     """Write a set in another format; what was written or found finished.
 
@@ -92,6 +112,7 @@ def convert(config: DictConfig) -> list[Written]:
         FileNotFoundError: if there is no folder or manifest.
     """
     started = time.perf_counter()
+    _check_flags(config)
     for name in ("to", "output"):
         if config[name] is None:
             raise ValueError(f"no value for {name}; give to=FORMAT and output=FOLDER")
@@ -99,6 +120,11 @@ def convert(config: DictConfig) -> list[Written]:
     output = Path(str(config.output))
     if output.resolve() == source.root.resolve():
         raise ValueError("output must be another folder than root, which stays as it is")
+    if output.resolve().is_relative_to(source.root.resolve()):
+        raise ValueError("output must not lie in root, whose recordings would be there twice")
+    if output.exists() and not output.is_dir():
+        raise ValueError(f"output must be a folder, and {output} is a file")
+    check_manifest(output)
     made_by = {"made_by": __version__, "units": source.units}
     files = {recording: source.entry(recording).file for recording in source.ids}
     job = RecordingFolder(source, output, str(config.to), made_by, "output", files)
@@ -204,7 +230,11 @@ def _show_use(config: DictConfig, source: FileRecordings) -> None:
             f"bins: {rule.bin_ms:g} ms are {num:g} samples at {rate_hz:g} Hz, fewer than "
             f"{_FEWEST}; train with labels.bin_ms={least_ms} or more"
         )
-    frames = {kind: config.features.frames.get(kind) for kind in source.hand.kinds}
+    given = config.features.frames
+    if not isinstance(given, DictConfig):
+        kinds = ", ".join(f"{kind}: null" for kind in source.hand.kinds)
+        raise ValueError(f"features.frames must be of kinds, such as {{{kinds}}}, got {given!r}")
+    frames = {kind: given.get(kind) for kind in source.hand.kinds}
     smooth = ChannelFilter(
         frame_lengths(source.hand, frames), config.features.polyorder, config.features.align
     )

@@ -52,6 +52,12 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     detector = SlipDetector.load(config.model)
     source: RecordingSource = instantiate(config.data, _convert_="all")
     rule: LabelRule = instantiate(config.labels)
+    units, own = getattr(source, "units", "V"), detector.info.get("units", "V")
+    if units != own:
+        raise ValueError(
+            f"the recordings are in {units}, the detector was trained on {own}; give recordings in "
+            f"{own}, or data.units={own} if they are"
+        )
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
     overlaps = {fold.name: overlap(detector, source, fold) for fold in folds}
     if is_first_process():

@@ -33,6 +33,8 @@ def export(config: DictConfig, results: Path) -> None:
     check_choice("precision", config.precision, ("auto", "float32", "float64"))
     given: Any = OmegaConf.to_container(config.native)
     with_source = given.pop("source")
+    if type(with_source) is not bool:
+        raise ValueError(f"native.source must be true or false, got {with_source!r}")
     if config.graph == "native":
         made = NativeFile.checked(detector, config.precision, **given)
         reason = f", as in float32 {made.why_double}" if made.why_double else ""

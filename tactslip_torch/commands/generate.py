@@ -20,6 +20,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig
 
+from tactslip_torch.commands.data import check_manifest
 from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest
 from tactslip_torch.data.manifest import MANIFEST
@@ -49,6 +50,10 @@ def generate(config: DictConfig, folder: Path) -> list[Written]:
     if not isinstance(config.materials, ListConfig):
         raise ValueError(f"materials must be a list such as [M1,M6], got {config.materials!r}")
     num_processes(config.num_workers)  # refused before anything is made
+    if type(config.figure) is not bool:
+        raise ValueError(f"figure must be true or false, got {config.figure!r}")
+    if type(config.seed) is not int:
+        raise ValueError(f"seed must be a whole number, got {config.seed!r}")
     source: RecordingSource = instantiate(config.data, _convert_="all")
     made_by = {
         "code": source_digest(),
@@ -57,6 +62,7 @@ def generate(config: DictConfig, folder: Path) -> list[Written]:
     files = RecordingFolder(source, folder, config.format, made_by)
     smooth = _filter(config, source)
     files.check()
+    check_manifest(folder)
     save_config(config, folder)
     (folder / MANIFEST).unlink(missing_ok=True)  # it must not speak of files that are replaced
     written = list(

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from tactslip_torch.commands.entry import entry_point, save_config
+from tactslip_torch.commands.evaluate import overlap
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split
 from tactslip_torch.hand import HandLayout
@@ -52,6 +53,10 @@ def importance(config: DictConfig, folder: Path) -> dict[str, Any]:
     if found is None:
         raise FileNotFoundError(f"no config.yaml beside {model}; give model=RUN/detector.pt")
     training: Any = OmegaConf.load(found)
+    if not {"data", "split", "labels"} <= {*training}:
+        raise ValueError(f"{found} is of no training; give model=RUN/without_OBJECT/detector.pt")
+    if folder.resolve() in {place.parent.resolve() for place in places}:
+        raise ValueError(f"{found} would be lost; give another folder, hydra.run.dir=FOLDER")
     source: RecordingSource = instantiate(training.data, _convert_="all")
     folds: list[Split] = instantiate(training.split, _convert_="all")(source.ids)
     fold = next((fold for fold in folds if fold.name == detector.info.get("split")), None)
@@ -61,6 +66,11 @@ def importance(config: DictConfig, folder: Path) -> dict[str, Any]:
             f"{model} was trained on all recordings, so that none is left to evaluate it on{kept}"
             if detector.info.get("split") == "all"
             else f"{found} has no fold {detector.info.get('split')!r} of {model.name}"
+        )
+    if fold.test_fraction is None and (known := overlap(detector, source, fold)["recordings"]):
+        raise ValueError(
+            f"{model} was trained on {known[0]}, which {fold.name} holds out now: the recordings "
+            "have changed since; train again"
         )
     masks = _masks(source.hand)
     save_config(config, folder)

@@ -11,7 +11,9 @@ from __future__ import annotations
 import io
 import itertools
 import json
+import math
 import sys
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.commands.train import train
+from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.pareto import (
     Candidate,
@@ -56,8 +59,11 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
             raise ValueError(f"{name} is empty, expected at least one value")
     for hop_ms in config.hops_ms:
         check_number("hops_ms", hop_ms)
-    for name in ("pareto.json", "pareto.png", "detector.pt"):
-        (folder / name).unlink(missing_ok=True)  # of an earlier run
+    source: RecordingSource = instantiate(config.data, _convert_="all")
+    config.hops_ms = _whole_hops(config.hops_ms, source.sample_rate_hz)
+    if len(instantiate(config.split, _convert_="all")(source.ids)) > 1:  # validation is enough
+        config.split = {"_target_": "tactslip_torch.data.splits.everything", "_partial_": True}
+        config.split.role = "train"
     save_config(config, folder)
     candidates: list[Candidate] = []
     made = list(itertools.product(config.recipes, config.sizes, config.precisions))
@@ -65,6 +71,8 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
         place = folder / "candidates" / f"{recipe}-{size or 'own'}-{precision}"
         place.mkdir(parents=True, exist_ok=True)
         candidates += _trained(config, recipe, size, precision, place)
+    for name in ("pareto.json", "pareto.png", "detector.pt"):
+        (folder / name).unlink(missing_ok=True)  # of an earlier run
     limits = {"deadline_us": config.deadline_us, "latency_ms": config.latency_ms}
     chosen = choose(candidates, **limits)
     points = [(c.worst_ms, c.timing.p99_us, -c.accuracy) for c in candidates]
@@ -90,6 +98,24 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
     why = " and ".join(closest.misses(**limits))
     print(f"no detector keeps the limits: the fastest has {why}", file=sys.stderr)
     return content
+
+
+def _whole_hops(hops_ms: Sequence[float], rate_hz: float) -> list[float]:
+    """The hops that are whole numbers of samples; says which are not.
+
+    Raises:
+        ValueError: if none is.
+    """
+    numbers = {hop: hop * rate_hz / 1000 for hop in hops_ms}
+    whole = [
+        hop for hop, num in numbers.items() if round(num) >= 1 and math.isclose(num, round(num))
+    ]
+    if left := [f"{hop:g}" for hop in hops_ms if hop not in whole]:
+        what = f"hops_ms {', '.join(left)}: no whole number of samples at {rate_hz:g} Hz"
+        if not whole:
+            raise ValueError(f"{what}; give hops_ms=[{2000 / rate_hz:g}] or the like")
+        print(f"left out: {what}")
+    return whole
 
 
 def _trained(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -63,12 +64,19 @@ def setup(
     width = max(len(finding.what) for finding in proposal.findings)
     for what, value, reason in proposal.findings:
         print(f"{what:{width}}  {value}  ({reason})")
+    before = {name: (folder / name).exists() for name in (HAND_FILE, MANIFEST)}
     if proposal.manifest:
         write_table(folder / MANIFEST, list(proposal.manifest[0]), proposal.manifest)
         print(f"\n{folder / MANIFEST} lists the recordings with their intervals")
     (folder / HAND_FILE).write_text(_hand_yaml(proposal), encoding="utf-8")
     print(f"\n{folder / HAND_FILE} says how the recordings are read; change what is wrong there")
-    _draw(folder, proposal)
+    try:
+        _draw(folder, proposal)
+    except (ValueError, OSError):
+        for name, was_there in before.items():
+            if not was_there:  # so that setup can be started again, with what is corrected
+                (folder / name).unlink(missing_ok=True)
+        raise
     return proposal
 
 
@@ -240,7 +248,7 @@ def main() -> None:
 
     with errors_in_one_line():
         setup(given.folder, _answers(given), _ask(given.yes), force=given.force)
-        print(f"next: tactslip train {given.folder}")
+        print(f"next: {shlex.join(['tactslip', 'train', str(given.folder)])}")
 
 
 def _answers(given: argparse.Namespace) -> Answers:

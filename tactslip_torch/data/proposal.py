@@ -245,12 +245,27 @@ def look(folder: Path, answers: Answers | None = None) -> Look:
             problems[file] = str(error).removeprefix(str(path)).lstrip(": ")
     if not tables:
         raise ValueError(f"{paths[0]} {next(iter(problems.values()))}")
+    short = [t for t in tables if t.times_s is not None and len(t.times_s) < 3]
+    if len(short) < len(tables):  # they tell nothing of the clock
+        problems |= {t.file: "has fewer than 3 rows" for t in short}
+        tables = [t for t in tables if t.file not in problems]
     common = Counter(table.names for table in tables).most_common(1)[0][0]
     alike = tuple(table for table in tables if table.names == common)
-    problems |= {t.file: "has other columns" for t in tables if t.names != common}
+    unlike = {t.file: _wrong_cell(t, alike[0]) for t in tables if t.names != common}
+    apart = problems.keys() | {file for file, cell in unlike.items() if not cell}
+    problems |= {file: cell or "has other columns" for file, cell in unlike.items()}
     files = [path.relative_to(folder).as_posix() for path in paths]
-    files = [file for file in files if file not in problems]
+    files = [file for file in files if file not in apart]
     return Look(folder, tuple(files), alike, problems, name, intervals)
+
+
+def _wrong_cell(table: _Table, other: _Table) -> str:
+    """What to say of a word in a column that holds numbers elsewhere; else ``""``."""
+    column = next((name for name in table.words if name in other.samples), None)
+    if column is None or {*table.names} != {*other.names}:
+        return ""
+    cells = (cell for cell in table.words[column] if not NUMBER.fullmatch(cell.replace(",", ".")))
+    return f"has {next(filter(None, cells))!r} in column {column}; mend it"
 
 
 def _table_of(folder: Path, path: Path, answers: Answers) -> _Table:
@@ -834,7 +849,15 @@ def _propose_labels_and_groups(
             entry.file: {"material": entry.recording.material, "session": entry.recording.session}
             for entry in listing.entries
         }
+        classes = {file: states for file, states in classes.items() if file in fields}
         classes |= {entry.file: _states_of(entry) for entry in listing.entries if entry.truth}
+        classes = classes or {entry.file: set() for entry in listing.entries}
+        if not classes:
+            manifest = found.folder / MANIFEST
+            raise ValueError(f"{manifest} lists no recording; list one, or remove it")
+        if found.table_of_intervals and label is None:
+            unread = f"{found.table_of_intervals} is not read, as {MANIFEST} is there"
+            draft.tell("look", unread, f"remove {MANIFEST} to read it")
         draft.tell("labels and objects", MANIFEST, "it lists the recordings")
     else:
         fields = _propose_pattern(found, by_name, given, draft)
@@ -903,12 +926,13 @@ def _propose_label_column(
         )
     sizes = sorted({abs(number) for number in numbers})
     if over is None and len(numbers) == 2:
-        if -numbers[0] == numbers[1]:  # slip goes by the magnitude otherwise
-            draft.set("labels.slip", [numbers[1]], "numbers of that column that are slip")
-            draft.tell(
-                "labels", f"column {label.name}, slip where it is {numbers[1]:g}", label.reason
-            )
-            return _states_by_file(found, label.name, lambda values: values == numbers[1])
+        is_inverted = label_of(str(label.name)) == "non-slip"  # such as no_slip
+        if is_inverted or -numbers[0] == numbers[1]:  # slip goes by the magnitude otherwise
+            slip = min(numbers, key=abs) if is_inverted else numbers[1]
+            reason = "by its name" if is_inverted else label.reason
+            draft.set("labels.slip", [slip], "numbers of that column that are slip")
+            draft.tell("labels", f"column {label.name}, slip where it is {slip:g}", reason)
+            return _states_by_file(found, label.name, lambda values: values == slip)
         over = sum(sizes) / 2
     if over is None:
         values, default = f"numbers from {numbers[0]:g} to {numbers[-1]:g}", ""

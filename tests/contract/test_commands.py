@@ -73,6 +73,13 @@ def test_evaluate_gives_what_training_gave(command, trained_or_slow, recordings,
         assert splits[name][names.CONFUSION] == scores[names.CONFUSION], name
 
 
+def test_evaluate_refuses_recordings_of_another_unit(command, paper, recordings, tmp_path):
+    told = [*of_set(recordings), *settings(model=paper.file, workers=0), "data.units=N"]
+    ran = command(tmp_path, "evaluate", *told)
+    assert (ran.status, ran.err.count("\n")) == (2, 1)
+    assert "the recordings are in N, the detector was trained on V" in ran.err
+
+
 def test_detect_decides_as_a_stream(command, trained_or_slow, recordings, tmp_path):
     """And finds the slip of every recording."""
     trained = trained_or_slow
