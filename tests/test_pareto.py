@@ -91,8 +91,10 @@ def test_the_detector_that_is_left_keeps_its_deadline(recordings, cache, tmp_pat
 
 @pytest.mark.slow
 def test_recordings_of_ones_own_and_hops_that_are_no_samples(recordings, cache, tmp_path, capsys):
-    given = ["deadline_us=1e6", "split=groups", "sizes=[4]", "hops_ms=[25,0.3]"]
-    found = pareto(of(recordings, cache, *given), tmp_path)
+    config = of(recordings, cache, "deadline_us=1e6", "sizes=[4]", "hops_ms=[25,0.3]")
+    groups = "tactslip_torch.data.splits.leave_groups_out"  # as with a folder
+    config.split = {"_target_": groups, "_partial_": True, "by": None, "folds": 10}
+    found = pareto(config, tmp_path)
     assert [row["hop_ms"] for row in found["candidates"]] == [25]
     assert SlipDetector.load(tmp_path / "detector.pt").info["split"] == "all"
     assert "left out: hops_ms 0.3: no whole number of samples at 2000 Hz" in capsys.readouterr().out
