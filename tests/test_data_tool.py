@@ -362,6 +362,15 @@ def test_a_set_that_names_no_scenes_is_counted_by_its_objects(tmp_path, capsys):
     assert "paper" not in printed
 
 
+def test_a_manifest_that_is_not_read_is_told(tmp_path, capsys):
+    table(tmp_path / "wood_1.csv", samples(0))
+    manifest(tmp_path, "wood_1.csv,wood,0,,,slip")
+    words = ["data=named", "data.pattern='{material}_{trial}'"]
+    for more, is_told in (([], True), (["data.manifest=manifest.csv"], False)):
+        run("check", tmp_path, *words, *more)
+        assert ("warning: manifest.csv is not read" in capsys.readouterr().out) == is_told
+
+
 def test_warnings_that_many_recordings_have_are_shown_a_few_times_and_counted(tmp_path, capsys):
     own = tmp_path / "own"
     for number in range(9):

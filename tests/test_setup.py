@@ -480,6 +480,8 @@ def test_a_file_of_one_row_leaves_the_times_of_the_others(tmp_path):
     (tmp_path / "cup_3.csv").write_text(f"{head}\n{first}\n")
     found = look(tmp_path)
     assert found.problems == {"cup_3.csv": "has fewer than 3 rows"}
+    with pytest.raises(ValueError, match=r"cup_3\.csv is a file; give the folder"):
+        look(tmp_path / "cup_3.csv")
     assert propose(found).settings["data"]["reading"]["time"] == "time"
 
 

@@ -71,6 +71,9 @@ def check(config: DictConfig) -> int:
         warnings += _levels(config, source)
     for problem in problems:
         print(f"problem: {problem}")
+    is_named = "named_recordings" in config.data._target_
+    if is_named and config.data.manifest is None and (source.root / MANIFEST).exists():
+        print(f"warning: {MANIFEST} is not read; to read it, write manifest: {MANIFEST} under data:")
     alike: dict[str, list[Problem]] = {}
     for warning in warnings:
         alike.setdefault(_WITH_DIGITS.sub("#", warning.what), []).append(warning)

@@ -225,6 +225,8 @@ def look(folder: Path, answers: Answers | None = None) -> Look:
         FileNotFoundError: if there is no such folder.
         ValueError: if it holds no recording, or none that can be read.
     """
+    if folder.is_file():
+        raise ValueError(f"{folder} is a file; give the folder that holds it")
     if not folder.is_dir():
         raise FileNotFoundError(f"no folder at {folder}")
     paths = sorted(recording_files(folder, in_folders=True))
