@@ -73,7 +73,7 @@ def check(config: DictConfig) -> int:
         print(f"problem: {problem}")
     is_named = "named_recordings" in config.data._target_
     if is_named and config.data.manifest is None and (source.root / MANIFEST).exists():
-        print(f"warning: {MANIFEST} is not read; to read it, write manifest: {MANIFEST} under data:")
+        print(f"warning: {MANIFEST} is not read; write manifest: {MANIFEST} under data: to read it")
     alike: dict[str, list[Problem]] = {}
     for warning in warnings:
         alike.setdefault(_WITH_DIGITS.sub("#", warning.what), []).append(warning)
