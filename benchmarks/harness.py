@@ -34,6 +34,7 @@ from benchmarks.sources import digest
 from benchmarks.tables import Report, Table, by_unit, chart, is_barred, lines
 from benchmarks.trainings import say as say
 from benchmarks.trainings import write_text
+from tactslip_torch import __version__
 from tactslip_torch.commands.stopping import errors_in_one_line, stopping
 from tactslip_torch.report import style
 from tactslip_torch.runtime import whole_file
@@ -61,8 +62,9 @@ def _processor_name() -> str:
 
 def versions(more: Sequence[str] = ()) -> dict[str, str]:
     """Of the libraries that do the work, of more of them, and of the BLAS in them."""
-    names = ("torch", "numpy", "scipy", "scikit-learn", "tactslip_torch", *more)
+    names = ("torch", "numpy", "scipy", "scikit-learn", *more)
     found = {"python": platform.python_version()} | {name: metadata.version(name) for name in names}
+    found["tactslip_torch"] = __version__  # the sources that run, whatever was installed
     of_torch = re.search(r"BLAS_INFO=(\w+)", torch.__config__.show())
     blas = {
         f"{info['internal_api']} {info['version']}"
