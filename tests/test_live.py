@@ -864,9 +864,11 @@ def test_a_page_that_does_not_read_loses_samples_for_itself_alone(serve, detecto
     assert b"101" in peer.recv(100)
     block = Block(np.zeros((4000, 4)))
     time.sleep(0.1)
-    for number in range(400):  # nothing waits for the page
+    started_s = time.monotonic()
+    for number in range(400):
         server.samples(4000 * number, block)
         time.sleep(0.001)
+    assert time.monotonic() - started_s < 20  # nothing waited for the page
     server.event("ended", "no more")
     got, last = b"", None
     peer.settimeout(20)

@@ -11,10 +11,9 @@ from __future__ import annotations
 import io
 import itertools
 import json
-import math
 import sys
 from collections.abc import Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, save_config
 from tactslip_torch.commands.train import train
+from tactslip_torch.data.labels import whole_samples
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.pareto import (
@@ -106,10 +106,11 @@ def _whole_hops(hops_ms: Sequence[float], rate_hz: float) -> list[float]:
     Raises:
         ValueError: if none is.
     """
-    numbers = {hop: hop * rate_hz / 1000 for hop in hops_ms}
-    whole = [
-        hop for hop, num in numbers.items() if round(num) >= 1 and math.isclose(num, round(num))
-    ]
+    whole = []
+    for hop in hops_ms:
+        with suppress(ValueError):
+            whole_samples(hop, rate_hz, "hops_ms")
+            whole.append(hop)
     if left := [f"{hop:g}" for hop in hops_ms if hop not in whole]:
         what = f"hops_ms {', '.join(left)}: no whole number of samples at {rate_hz:g} Hz"
         if not whole:

@@ -64,19 +64,19 @@ def setup(
     width = max(len(finding.what) for finding in proposal.findings)
     for what, value, reason in proposal.findings:
         print(f"{what:{width}}  {value}  ({reason})")
-    before = {name: (folder / name).exists() for name in (HAND_FILE, MANIFEST)}
+    new = [path for name in (HAND_FILE, MANIFEST) if not (path := folder / name).exists()]
     if proposal.manifest:
         write_table(folder / MANIFEST, list(proposal.manifest[0]), proposal.manifest)
-        print(f"\n{folder / MANIFEST} lists the recordings with their intervals")
     (folder / HAND_FILE).write_text(_hand_yaml(proposal), encoding="utf-8")
-    print(f"\n{folder / HAND_FILE} says how the recordings are read; change what is wrong there")
     try:
         _draw(folder, proposal)
     except (ValueError, OSError):
-        for name, was_there in before.items():
-            if not was_there:  # so that setup can be started again, with what is corrected
-                (folder / name).unlink(missing_ok=True)
+        for path in new:  # so that setup can be started again, with what is corrected
+            path.unlink(missing_ok=True)
         raise
+    if proposal.manifest:
+        print(f"\n{folder / MANIFEST} lists the recordings with their intervals")
+    print(f"\n{folder / HAND_FILE} says how the recordings are read; change what is wrong there")
     return proposal
 
 

@@ -143,6 +143,7 @@ def test_detect_does_without_masked_channels(command, paper, recordings, tmp_pat
     masked = settings(masked_channels=["SG1", "PVDF2"], folder="run")
     command.well(tmp_path, "detect", *told, *masked)
     (one,) = read(tmp_path / "run" / names.ONSETS[0])["recordings"]
+    assert list((tmp_path / "run").glob("*.png"))
     assert [event["text"] for event in one["events"]] == ["channels lost: SG1, PVDF2"]
     assert one["decisions"]["number"] > 100
     assert one["decisions"]["invalid"] == 0  # the others are enough
